@@ -1,4 +1,4 @@
-"""The installed command `dpmjax`: one file a subcommand, and what commands share: options, run folders, exit codes."""
+"""The installed command `dpmjax`: one file for each subcommand, and common options, run folders and exit codes."""
 
 import lazy_loader as _lazy
 

@@ -1,4 +1,4 @@
-"""From a frozen dataclass of options and a `main` to a command: parsing, one-line errors, signals, exit codes."""
+"""Commands from a frozen dataclass of options and a `main`: parsing, one-line errors, signals, exit codes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Interrupted(KeyboardInterrupt):
     """A signal has stopped the run.
 
     Attributes:
-        exit_code: what a shell reports for a program ended by this signal: 130 for Ctrl-C, 143 for SIGTERM.
+        exit_code: exit code of a program that this signal has ended: 130 for Ctrl-C, 143 for SIGTERM.
     """
 
     def __init__(self, signal_number: int) -> None:
@@ -55,7 +55,7 @@ class StopFlag:
     flag is never set.
 
     Attributes:
-        received: the number of the signal, None where none came.
+        received: number of the signal; None before a signal.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ def check_least(config: Any, **least: float) -> None:
 
 
 def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
-    """Raises a ValueError where a name is not among those that are allowed, or none is given."""
+    """Raises a ValueError where a name is not allowed, or no name is given."""
     unknown = [name for name in names if name not in allowed]
     if unknown or not names:
         raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")
@@ -204,7 +204,7 @@ def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], N
         unit: unit of the numbers, with a space before it.
 
     Yields:
-        A callback that takes the number that is done and the number of all.
+        A callback with the number of finished items and the number of all.
     """
     with tqdm(desc=description, unit=unit, dynamic_ncols=True) as bar:
 

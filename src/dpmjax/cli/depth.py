@@ -9,7 +9,7 @@
 Depth is 16 bit, millimetres, 0 or 65535 for nothing. Where each image has a NAME.pose.txt, the result is measured by
 these poses. Results go to results/depth/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI
 and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png. A search gives the first
-poses and DeepMapping improves them; of both the one whose images agree better is kept, chosen without ground truth.
+poses and DeepMapping improves them; the poses of higher consistency are kept, chosen without ground truth.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 NAME = "depth"
 _NUM_SIMULATED = 8
-# Typical ranges by which a rotation counts in the alignment of poses: it decides what positions on a line leave open.
+# Typical ranges that a radian equals in the alignment of poses, for positions on a line.
 _LEVER = 0.1
 
 
@@ -64,7 +64,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads, registers, measures, writes; returns the content of `metrics.json`."""
+    """Registers depth images and writes the results; returns the content of `metrics.json`."""
     import jax
 
     from dpmjax import deepmapping, registration_rgbd
@@ -128,14 +128,14 @@ def depth_numbers(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
 
 
 def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, float]:
-    """Returns ATE, mean distance of map points, and the largest error of a turn between neighbours.
+    """Computes ATE, mean distance of map points, and the largest error of a turn between neighbours.
 
     Args:
         sequence: the images; their reference may be missing.
         T_world_camera: (n, 4, 4) poses, metres.
 
     Returns:
-        The numbers by name; nothing where there is no reference.
+        The numbers by name; empty without a reference.
     """
     from scipy.spatial.transform import Rotation
 

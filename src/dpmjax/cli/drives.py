@@ -1,4 +1,4 @@
-"""Input of the commands: drives of 3-D scans, from files or simulated, read ahead in a thread."""
+"""Input of the commands: drives of 3-D scans, from files or simulated, read in advance by a thread."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
 
     Args:
         data: folder of scans, a bag of ROS, or a file of poses along which a town is simulated; None for any town.
-        options: which scans of the drive; the seed is that of a simulated town.
+        options: selection of scans of the drive, and seed of a simulated town.
         sequence: name of the drive, where the folder holds several.
 
     Returns:
         The drive.
 
     Raises:
-        InputError: no such folder, drive or poses, a file that is missing or cut off, or a first scan that is bad.
+        InputError: no such folder, drive or poses, a file that is missing or truncated, or a damaged first scan.
     """
     from dpmjax.cli.route_drives import is_route, route_drive
 
@@ -80,7 +80,7 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
 
 
 def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
-    """Writes the notes on the input to the log, and prints those that are no doubts: the console shows doubts already.
+    """Logs the notes on the input, and prints those that are no doubts, because the console shows doubts already.
 
     Args:
         notes: notes of a drive.
@@ -136,7 +136,7 @@ class Source:
     town_mixture: simulation.SceneMixture | None = None
 
     def open(self) -> LidarSequence:
-        """Opens or simulates the drive; of one with reference poses, the scans that have one."""
+        """Opens or simulates the drive; scans without a pose of an existing reference are left out."""
         from dpmjax.cli.route_drives import is_route, route_drive
 
         if self.path is None:
@@ -152,11 +152,11 @@ class Source:
 def find_sources(
     data: Sequence[str], towns: Sequence[Source], sampling: deeppointmap.SamplingConfig | None = None
 ) -> list[Source]:
-    """Returns the drives of the entries of a command line, checked; those of the towns where an entry is `town`.
+    """Returns the checked drives of the entries of a command line, with those of the towns for the entry `town`.
 
     Args:
         data: folders or files of poses, or `town` for the towns.
-        towns: such as the seeds of the run give.
+        towns: towns of the seeds of the run.
         sampling: distances at which a drive must have pairs of scans; None takes the published ones.
 
     Returns:
@@ -187,12 +187,12 @@ TURN_S = 0.1
 
 
 class ScanReader:
-    """Reads scans, timed ones where they are deskewed.
+    """Reads scans, with point times for deskewing.
 
     Args:
         sequence: the drive.
-        is_deskewed: whether points get times, for deskewing.
-        jump: number of scans of the drive for each that is read, where it has no times.
+        is_deskewed: True for points with times.
+        jump: stride of the scans of the drive, for drives without times.
     """
 
     def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
@@ -219,7 +219,7 @@ class ScanReader:
                 yield done.result()
 
     def _offsets_by_times(self, index: int) -> np.ndarray | None:
-        """Returns the offsets by the times in the file; None where it has none that can be used."""
+        """Returns the offsets by the times in the file; None where it has no usable times."""
         times = None if self.sequence.read_times is None else self.sequence.read_times(index)
         if times is None:
             return None

@@ -67,7 +67,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> list[Row]:
-    """Makes the rows that are missing, and writes table, numbers and pictures."""
+    """Computes the missing rows, and writes table, numbers and pictures."""
     model = weights.load_model(config.weights)
     kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
     drives = open_evaluation_drives(config.data, evaluation_towns(config.num_towns, TOWN_LENGTH_M, kinds))
@@ -93,7 +93,7 @@ def main(config: Config) -> list[Row]:
 
 
 def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[Source]:
-    """Returns towns that no training has seen; the kinds of place take turns, None draws one."""
+    """Returns towns that no training uses, with the kinds of place in turn; None draws one."""
     return [
         Source(town_seed=FIRST_TOWN + number, town_length_m=length_m, town_kind=kinds[number % len(kinds)])
         for number in range(num_towns)

@@ -4,9 +4,9 @@
     dpmjax graph city.g2o --outlier-chi2 10       wrong edges are rejected (Geman-McClure)
     dpmjax graph edges.g2o --nearest-psd          mends information matrices that are not positive semidefinite
 
-The start is the poses of the file or the chordal relaxation, whichever has the lower cost; a file of edges alone starts
-along a spanning tree. Results go to results/graph/<time>/ (latest links to the newest): graph.g2o, trajectory_tum.txt
-(stamps are the numbers of the nodes), metrics.json and trajectory.png.
+The initial poses are those of the file or of the chordal relaxation, whichever have the lower cost; a file of edges
+alone gets poses along a spanning tree. Results go to results/graph/<time>/ (latest links to the newest): graph.g2o,
+trajectory_tum.txt (stamps are the numbers of the nodes), metrics.json and trajectory.png.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dpmjax.cli.run_folder import OutputOptions, open_run_folder, recording, wri
 from dpmjax.sequences import InputError
 
 NAME = "graph"
-# Edges below this weight count as rejected.
+# Edges below this weight are rejected.
 LET_GO = 0.5
 
 
@@ -50,7 +50,7 @@ class Config(OutputOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads, optimises, writes; returns the content of `metrics.json`."""
+    """Optimises a pose graph and writes the results; returns the content of `metrics.json`."""
     from dpmjax.io.g2o import read_g2o, write_g2o
 
     started = time.perf_counter()

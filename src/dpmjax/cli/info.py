@@ -20,7 +20,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Prints what this installation has."""
+    """Prints versions, devices, weights and extras of this installation."""
     import jax
 
     from dpmjax.compile_cache import enable_compile_cache
@@ -38,7 +38,7 @@ def main(config: Config) -> None:
 
 
 def unusable_packages() -> dict[str, list[str]]:
-    """Returns for each extra why packages of it cannot be imported; no reason where all can."""
+    """Returns the import errors of the packages of each extra; empty where all can be imported."""
     found: dict[str, list[str]] = {}
     for package, extra in EXTRAS.items():
         reasons = found.setdefault(extra, [])

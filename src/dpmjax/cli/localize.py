@@ -34,7 +34,7 @@ NAME = "localize"
 TABLE = "localizations.csv"
 POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
 COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "seconds", *POSE, "reason"]
-# Scans farther from all keyframes are not expected in the map.
+# Largest distance from a keyframe at which a scan is expected in the map.
 REACH_M = 15.0
 NUM_MAP_POINTS = 200_000
 
@@ -68,7 +68,7 @@ class Case(NamedTuple):
         slam_map: the map.
         drive: the scans.
         T_reference_keyframe: (k, 4, 4) reference poses of the keyframes; None without a reference.
-        is_calibrated: whether the probabilities are such; they are scores of the matches where it is false.
+        is_calibrated: True where the probabilities are calibrated; else they are scores of the matches.
     """
 
     slam_map: slam.KeyframeMap
@@ -78,7 +78,7 @@ class Case(NamedTuple):
 
 
 def main(config: Config) -> list[dict[str, str]]:
-    """Looks for the scans that are missing, and writes table, trajectory, numbers and picture."""
+    """Localises the remaining scans, and writes table, trajectory, numbers and picture."""
     model = weights.load_model(config.weights)
     slam_map = open_map(config.map, slam.make_methods(model, weights=config.weights))
     drive = open_drive(config.scans, config, config.sequence)
@@ -111,7 +111,7 @@ def main(config: Config) -> list[dict[str, str]]:
 
 
 def reference_of(config: Config, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
-    """Returns the reference poses of the keyframes; a `ValueError` says where they cannot be used."""
+    """Returns the reference poses of the keyframes; raises a `ValueError` where they cannot be used."""
     if config.map_poses is None:
         return None
     if drive.T_world_lidar is None:
@@ -179,7 +179,7 @@ def write_found(
 
 
 def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[str, Any], np.ndarray | None]:
-    """Returns the numbers of right and wrong scans, and which of those that were found are wrong.
+    """Returns the numbers of right and wrong scans, and True for each found scan with a wrong pose.
 
     Without a reference there are no numbers, and None.
     """

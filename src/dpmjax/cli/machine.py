@@ -1,4 +1,4 @@
-"""The machine under a command: versions, device, memory, cores, and packages of the extras that cannot be used."""
+"""The machine of a run: versions, device, memory, cores, and unusable packages of the extras."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
 
 
 def select_device(device: Literal["cpu", "gpu"] | None) -> None:
-    """Tells JAX which device to use; None leaves the choice to JAX.
+    """Selects the device of JAX; None leaves the choice to JAX.
 
     Raises:
         ValueError: there is no such device here.
     """
     if device is None:
         return
-    # JAX reads this when its first array is made, so the command may still decide after parsing its options.
+    # JAX reads this with its first array, so the device can be selected after the options are parsed.
     import jax
 
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
@@ -115,11 +115,11 @@ EXTRAS = {
     "rerun": "viewer",
     "torch": "torch",
 }
-"""The extra of dpmjax that brings a package."""
+"""Extra of dpmjax for each package."""
 
 
 def why_not_importable(module: str) -> str | None:
-    """Returns why a module cannot be imported; None where it can.
+    """Returns the reason why a module cannot be imported; None where it can.
 
     The module is imported, because an installed package may be broken. A missing library of the system, or a compiled
     part for another version of NumPy, raises an error at the import only, and of any kind.

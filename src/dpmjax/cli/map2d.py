@@ -114,7 +114,7 @@ class Config(RunOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads, registers, measures, writes; returns the content of `metrics.json`."""
+    """Registers planar scans and writes the results; returns the content of `metrics.json`."""
     started = time.perf_counter()
     sequence = read_scans(config)
     start = starting_poses(config, sequence)
@@ -135,7 +135,7 @@ def main(config: Config) -> dict[str, Any]:
             "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
         }
-        # Numbers first: a picture that fails must not cost them.
+        # Numbers first, so that they are written even if a picture fails.
         write_trajectories(folder, sequence, result.poses)
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         registered = registered_scans(sequence, result)
@@ -154,7 +154,7 @@ def main(config: Config) -> dict[str, Any]:
 def register_sequence(
     sequence: ScanSequence, start: str | Floats, config: Config, recorder: FitRecorder, stop: StopFlag
 ) -> RegisteredScans:
-    """Registers the scans, the fit by the recorder; prints each stage where it begins."""
+    """Registers the scans, with the recorder as engine of the fit, and prints each stage."""
     import jax
 
     from dpmjax.geometry import typical_range
@@ -209,7 +209,7 @@ def map_numbers(
 
 
 def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str], dict[str, float]]:
-    """Reads the further references that the result is measured by, beside its own.
+    """Reads further references of the scans.
 
     Args:
         config: options of the run.
@@ -250,7 +250,7 @@ def read_scans(config: Config) -> ScanSequence:
 
 
 def starting_poses(config: Config, sequence: ScanSequence) -> Any:
-    """Returns the word of a start, or the poses of the file that `--init` names, for all scans."""
+    """Returns the name of the initial poses, or the poses of the file that `--init` names, for all scans."""
     init = config.init
     if init == "odometry" and sequence.odometry_poses is None:
         raise ValueError(

@@ -15,21 +15,21 @@ from dpmjax.sequences import Relations, ScanSequence
 Floats = NDArray[np.float64]
 
 UNITS = ("m", "deg")
-# Spans of uncertain scans that are printed.
+# Largest number of printed spans of uncertain scans.
 _NUM_SPANS = 8
-# Scans that a recording and a corrected log of it must have in common.
+# Least number of common scans of a recording and its corrected log.
 _MIN_COMMON = 10
 
 
 def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
-    """Returns ATE, the error of the worst scan after the same alignment, and point distance, in the unit of the scans.
+    """Computes ATE, the largest error of a scan after the same alignment, and point distance, in the unit of the scans.
 
     Args:
         sequence: the scans.
         poses: (n, 3) T_world_scan.
 
     Returns:
-        The numbers by name; nothing where there is no reference.
+        The numbers by name; empty without a reference.
     """
     from dpmjax.geometry import se2
 
@@ -55,7 +55,7 @@ def ate_of(sequence: ScanSequence, unit: float) -> Callable[[Floats], float]:
 
 
 def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
-    """Returns errors of the kept poses and of the start; `success` is None where there is no reference."""
+    """Returns errors of the kept and of the initial poses; `success` is None without a reference."""
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
@@ -72,7 +72,7 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
 
 
 def relation_numbers(times: Floats, poses: Floats, relations: Relations, suffix: str = "") -> dict[str, float]:
-    """Returns the mean errors of the poses of all scans against hand-checked relations."""
+    """Computes the mean errors of the poses of all scans against hand-checked relations."""
     found = metrics.relation_errors(relations, times, poses)
     return {
         f"relations{suffix}_m": float(found.translation_m.mean()),
@@ -82,9 +82,9 @@ def relation_numbers(times: Floats, poses: Floats, relations: Relations, suffix:
 
 
 def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suffix: str = "") -> dict[str, float]:
-    """Returns the ATE at scans that a corrected log of the same drive has too, and errors from one to the next.
+    """Computes the ATE at the common scans of a corrected log of the same drive, and errors of its relations.
 
-    The latter are measured like hand-checked relations: the relative poses of successive scans of the corrected log.
+    The relations are the relative poses of successive scans of the corrected log.
 
     Args:
         times: of all scans.
@@ -120,7 +120,7 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
 
 
 def _trust_lines(assessment: Mapping[str, Any]) -> list[str]:
-    """Returns the verdict, the fault of the odometry, and the scans that are exempt."""
+    """Returns the lines on trust: the assessment, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     lines = [f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual"]

@@ -1,4 +1,4 @@
-"""A finished run of `dpmjax map2d`: its scans and its fit, read again from the folder."""
+"""A finished run of `dpmjax map2d`: scans and fit, read from the folder of the run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Map2dRun(NamedTuple):
 
     Attributes:
         sequence: the scans.
-        fitted: the fit, with its own poses: those that its map belongs to.
+        fitted: the fit, with the poses of the map.
         world: the built-in world; None where the scans were read from files.
     """
 

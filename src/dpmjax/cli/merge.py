@@ -46,7 +46,7 @@ class Config(OutputOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads the maps, merges them, writes; returns the content of `metrics.json`."""
+    """Merges maps and writes the results; returns the content of `metrics.json`."""
     started = time.perf_counter()
     if len(config.maps) < 2:
         raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
@@ -89,12 +89,12 @@ def map_name(part: int, num_parts: int) -> str:
 
 
 def short_name(path: Path) -> str:
-    """Returns the name of a map with its folder: most maps are called map.npz."""
+    """Returns the name of a map with its folder, because most maps are called map.npz."""
     return str(Path(*path.parts[-2:]))
 
 
 def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> dict[str, Any]:
-    """Returns the content of `metrics.json`: which maps have met, and the numbers of loops and keyframes."""
+    """Returns the content of `metrics.json`: connected maps, and the numbers of loops and keyframes."""
     accepted = [loop for loop in merged.loops if loop.status == "accepted"]
     map_of_row = (merged.joined.map_of_keyframe + 1).tolist()
     met = collections.Counter(tuple(sorted((map_of_row[loop.source], map_of_row[loop.target]))) for loop in accepted)

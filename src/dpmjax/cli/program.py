@@ -1,4 +1,4 @@
-"""The program `dpmjax`: finds the subcommand and hands it the remaining arguments; loads nothing else."""
+"""The program `dpmjax`: loads and runs the subcommand only."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMMANDS = {
     "evaluate": "weights and drives with poses: recall, errors, confidence",
     "info": "versions, devices, shipped weights",
 }
-"""What each subcommand takes and gives; it is the module of this name beside this file."""
+"""Description of each subcommand, the module of this name beside this file."""
 
 EXAMPLES = """examples:
   dpmjax map2d                          a simulated office, from its odometry

@@ -20,22 +20,22 @@ if TYPE_CHECKING:
 
     from dpmjax.deepmapping import Fit, Problem, Progress
 
-# Of the table; the error, named with its unit, comes last.
+# Columns of the table; the last one is the error, named with its unit.
 _COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 _SAVE_EVERY_S = 20.0
 
 
 class FitRecorder:
-    """Engine of a fit in a run folder (`engine=` of `fit_deepmapping`): it goes on where the checkpoints end.
+    """Engine of a fit in a run folder (`engine=` of `fit_deepmapping`), which resumes from the last checkpoint.
 
     `functools.partial(recorder, measure=...)` is the same engine with a column for the error.
 
     Attributes:
-        steps: steps done in all.
-        run_s: seconds of stepping, those of earlier runs too, compile time apart.
+        steps: number of steps of all runs.
+        run_s: seconds of stepping of all runs, without compilation.
         compile_s: seconds of compiling.
-        has_map: M-Net has been trained.
+        has_map: True where M-Net has been trained.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class FitRecorder:
         key: jax.Array,
         measure: Callable[[NDArray[np.float64]], float] = lambda _: math.nan,
     ) -> Fit:
-        """Fits, or continues where the checkpoints of the folder end; `measure` gives the ATE of its poses."""
+        """Fits, or resumes from the last checkpoint of the folder; `measure` computes the ATE of its poses."""
         from dpmjax.checkpoints import Checkpoints
         from dpmjax.deepmapping import init, resume
 
@@ -111,7 +111,7 @@ def _earlier_seconds(folder: RunFolder, step: int) -> float:
 
 
 def show_progress(bar: tqdm, text: str, done: float, run_s: float) -> None:
-    """Moves the bar to the share that is done, and writes the text and the seconds left."""
+    """Updates the bar to the share that is done, with the text and the remaining seconds."""
     done = min(1.0, done)
     left = run_s * (1.0 - done) / max(done, 1e-9)
     bar.set_postfix_str(f"{text}, {left:.0f} s left", refresh=False)

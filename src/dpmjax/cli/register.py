@@ -25,7 +25,7 @@ from dpmjax.cli.drives import report_notes
 from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
 
 NAME = "register"
-# Below this probability the motion is called uncertain; a score without calibration has no such limit.
+# Least calibrated probability of a certain motion.
 SURE = 0.9
 SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
 
@@ -51,7 +51,7 @@ class Config(OutputOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads both scans, registers them, writes; returns the content of `metrics.json`."""
+    """Registers two scans and writes the results; returns the content of `metrics.json`."""
     started = time.perf_counter()
     paths = (config.source, config.target)
     source, target = (io.read_lidar_file(path, bin_columns=config.columns) for path in paths)
@@ -100,7 +100,7 @@ def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
 
 
 def match_shares(verification: Any) -> dict[str, float]:
-    """Returns the shares of points that the confidence rests on; none where nothing was verified."""
+    """Returns the shares of points that the confidence is based on; empty without a verification."""
     names = () if verification is None else ("visible_share", "matched_share", "contradicted_share")
     return {name: float(getattr(verification, name)) for name in names}
 

@@ -1,4 +1,4 @@
-"""Result files: JSON and CSV that appear whole or not at all, notes on commits, a table that grows by the row."""
+"""Result files: atomically written JSON and CSV, notes on commits, and a table that grows row by row."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNKNOWN = "unknown"
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes dataclasses, paths, NumPy values as JSON; the file appears whole or not at all."""
+    """Writes dataclasses, paths and NumPy values as JSON, atomically."""
     write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
 
 
@@ -60,11 +60,11 @@ def as_json(value: Any) -> Any:
 
 
 def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str | None:
-    """Names the rows that another commit has made than the one that writes the file.
+    """Returns a note on rows of other commits than the one that writes the file.
 
     Args:
         rows: rows with `git_hash`, and `method` where there are several.
-        commit: commit of the program that writes the file, None where it is not known.
+        commit: commit of the program that writes the file; None where it is unknown.
 
     Returns:
         One sentence, or None where all rows are of `commit`.
@@ -88,7 +88,7 @@ def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str |
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes a CSV file; it appears whole or not at all."""
+    """Writes a CSV file atomically."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
@@ -97,7 +97,7 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, 
 
 
 class HistoryFile:
-    """The table of a run, one row a record, each on disk at once.
+    """The table of a run, one row for each record, written at once.
 
     Args:
         path: the CSV file; it is replaced, except for the rows to keep.

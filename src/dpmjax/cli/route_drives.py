@@ -17,22 +17,22 @@ from dpmjax.io import read_lidar_trajectory, write_atomically
 from dpmjax.sequences import InputError, LidarSequence, Note
 
 ROUTE_SUFFIXES = (".txt", ".tum")
-# A car of 10 m/s and a lidar of 10 turns a second, as in KITTI: a scan a metre; it turns by 3 degrees a scan at most.
+# A car of 10 m/s and a lidar of 10 turns a second, as in KITTI: one scan each metre, with up to 3 degrees of turn.
 ROUTE_SPEED_M_S, ROUTE_RATE_HZ, ROUTE_TURN_DEG_S = 10.0, 10.0, 30.0
 STEP_M = 2.0**-8
-"""Coordinates of kept scans are whole numbers of this: 16 bits reach 128 m."""
+"""Unit of the integer coordinates of kept scans: 16 bits reach 128 m."""
 
 
 def is_route(path: Path) -> bool:
-    """Returns whether a path is a file of poses, along which a town is simulated."""
+    """Returns True for a file of poses, along which a town is simulated."""
     return path.suffix.lower() in ROUTE_SUFFIXES and path.is_file()
 
 
 def route_drive(path: Path, seed: int) -> LidarSequence:
     """Simulates a town along a trajectory, and a drive through it; scans are simulated when they are first read.
 
-    Streets follow the trajectory, the ground its slopes; all passes of a place have one height. The car keeps its lane
-    at a steady speed, and tilts with the ground: rotations and times of the file do not count.
+    Streets follow the trajectory, and the ground its slopes; all passes of a place have one height. The car drives in
+    its lane at constant speed and tilts with the ground; rotations and times of the file are ignored.
 
     Args:
         path: poses of a lidar or of a camera as TUM or KITTI, metres.
@@ -59,7 +59,7 @@ def route_drive(path: Path, seed: int) -> LidarSequence:
 
 
 def keep_scans(drive: LidarSequence, folder: Path = RESULTS / "simulated") -> LidarSequence:
-    """Keeps the scans of a simulated drive on disk, each from its first reading on, rounded to 4 mm.
+    """Caches the scans of a simulated drive on disk at their first reading, rounded to 4 mm.
 
     Args:
         drive: the drive; points within 128 m.
@@ -82,7 +82,7 @@ def _read_kept(folder: Path, read_scan: Callable[[int], NDArray[np.float32]], in
 
 
 def _digest(drive: LidarSequence) -> str:
-    """Hashes the poses, the times and two scans, which tell towns, lidars and versions of the simulator apart."""
+    """Hashes the poses, the times and two scans, which differ between towns, lidars and versions of the simulator."""
     arrays = (drive.T_world_lidar, drive.times, drive.read_points(0), drive.read_points(len(drive) - 1))
     parts = (b"" if array is None else np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(b"".join(parts)).hexdigest()[:8]

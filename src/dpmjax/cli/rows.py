@@ -1,4 +1,4 @@
-"""Tables of results: one resumable row a case, a file each; then table.md, metrics.json and the pictures of all."""
+"""Tables of results: one resumable row and file for each case; then table.md, metrics.json and the pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TableRun(NamedTuple):
 
     Attributes:
         folder: folder of the run.
-        is_stopped: True after a signal: the work on a row then ends by `RowStopped`.
+        is_stopped: returns True after a signal; the work on a row then ends by `RowStopped`.
     """
 
     folder: RunFolder
@@ -64,7 +64,7 @@ def run_table(
     work: Callable[..., Row],
     report: Callable[[list[Row]], Summary],
 ) -> list[Row]:
-    """Makes the rows that the run folder lacks, and writes table.md, metrics.json and the pictures.
+    """Computes the missing rows of the run folder, and writes table.md, metrics.json and the pictures.
 
     Args:
         config: options of the run.
@@ -106,14 +106,14 @@ def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def cell_text(value: object, decimals: int = 2) -> str:
-    """Returns a cell: a float with its decimals, a dash for None and no finite number, other values as they print."""
+    """Returns the text of a cell: a float with its decimals, a dash for None, NaN and infinity, else the text."""
     if isinstance(value, float):
         return f"{value:.{decimals}f}" if math.isfinite(value) else "-"
     return "-" if value is None else str(value)
 
 
 def do_row(folder: Path, case: Row, work: Callable[[], Row], *, seed: int) -> Row:
-    """Makes one row of results, or reads it where an earlier, perhaps killed, run has made it.
+    """Computes one row of results, or reads it from an earlier run.
 
     Each row is a file of its own below `rows/`, written whole, and carries the commit, the versions and the seed that
     made it.
@@ -125,7 +125,7 @@ def do_row(folder: Path, case: Row, work: Callable[[], Row], *, seed: int) -> Ro
         seed: seed of the run.
 
     Returns:
-        The row. The commit of a row that carries none is "unknown".
+        The row. The commit of a row without one is "unknown".
     """
     path = row_path(folder, case)
     if path.exists():
@@ -144,14 +144,14 @@ def do_rows(
     seed: int,
     is_stopped: Callable[[], bool],
 ) -> list[Row]:
-    """Makes one row a case by `do_row`, under a progress bar.
+    """Computes one row for each case by `do_row`, with a progress bar.
 
     Args:
         folder: folder of the run.
-        cases: what identifies the rows.
+        cases: entries that identify the rows.
         work: makes the remaining entries of a row; it is called with the entries of the case as keywords.
         seed: seed of the run.
-        is_stopped: whether to end before the next row.
+        is_stopped: returns True to end before the next row.
 
     Returns:
         The rows so far, without one that ended by `RowStopped`.

@@ -1,4 +1,4 @@
-"""The folder of one run: the options of every command, what may be overwritten, and the log."""
+"""The folder of one run: options of every command, rules for overwriting, and the log."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dpmjax.sequences import InputError
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
 CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents", "drives"
-# --force removes these folders and kinds of files only: a mistyped -o must not cost a user anything else.
+# --force removes these folders and kinds of files only, so that a mistyped -o removes no other files.
 RESULT_FOLDERS = (CHECKPOINTS, BEST, AGENTS, DRIVES, "rows")
 RESULT_SUFFIXES = (".json", ".csv", ".txt", ".npy", ".npz", ".png", ".ply", ".g2o", ".rrd")
 LOGGERS = ("dpmjax", "experiments", "__main__")
@@ -54,7 +54,7 @@ class OutputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(OutputOptions):
-    """The same of every command that can be interrupted and resumed.
+    """Options of every command that can be interrupted and resumed.
 
     Attributes:
         may_change: options that a resumed run may change, besides those that do not affect the computation.
@@ -69,7 +69,7 @@ class RunOptions(OutputOptions):
 
 
 class RunFailedError(RuntimeError):
-    """A run broke off after its folder was made; `path` has the files written so far, and its log has the traceback."""
+    """A run failed after its folder was made; `path` has the files so far, and its log has the traceback."""
 
     def __init__(self, path: Path, error: Exception) -> None:
         is_input = isinstance(error, InputError)
@@ -83,7 +83,7 @@ class RunFolder:
 
     Attributes:
         path: the folder; it exists.
-        is_resumed: an earlier run is continued in it.
+        is_resumed: True where an earlier run is continued.
     """
 
     path: Path
@@ -93,7 +93,7 @@ class RunFolder:
         return self.path / name
 
     def part(self, kind: Literal["agents", "drives", "methods"], name: str) -> RunFolder:
-        """Makes the folder of one agent, drive or method; what an earlier run left there goes on."""
+        """Makes the folder of one agent, drive or method, or continues an earlier run in it."""
         path = self.path / kind / name
         path.mkdir(parents=True, exist_ok=True)
         return RunFolder(path, is_resumed=True)
@@ -135,15 +135,15 @@ def open_run_folder(config: Any, experiment: str) -> RunFolder:
 
 
 def check_run_folder(config: Any, experiment: str) -> None:
-    """Refuses what `open_run_folder` would refuse and changes nothing, so that a command can ask before any work.
+    """Raises the errors of `open_run_folder` before any work, without changes on disk.
 
     Args:
         config: the resolved options.
         experiment: name of the experiment.
 
     Raises:
-        ValueError: `output` holds something and neither `resume` nor `force` is given; there is nothing to resume; the
-            resumed run had other options; nothing can be written there.
+        ValueError: `output` is not empty, and neither `resume` nor `force` is given. Also if there is nothing to
+            resume, if the resumed run had other options, or if the folder cannot be written.
     """
     if getattr(config, "resume", False):
         if config.force:
@@ -173,7 +173,7 @@ def find_run(experiment: str, output: Path | None) -> Path:
 
 
 def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
-    """Reads the options of an earlier run; those that its file lacks, and such as `output`, get their defaults.
+    """Reads the options of an earlier run; missing options, and those such as `output`, get their defaults.
 
     Args:
         path: folder of the run.
@@ -222,7 +222,7 @@ def write_metrics(
 
 @contextmanager
 def recording(folder: RunFolder) -> Iterator[None]:
-    """Logs to `log.txt` what happens in the block, and the traceback if it fails.
+    """Logs the messages of the block to `log.txt`, and the traceback if it fails.
 
     Args:
         folder: folder of the run.
@@ -285,7 +285,7 @@ def _make_timestamped(parent: Path) -> Path:
 
 
 def _check_replaceable(path: Path, force: bool) -> None:
-    """Raises a ValueError where `path` is no folder, cannot be written, or holds what must not be replaced."""
+    """Raises a ValueError where `path` is no folder, cannot be written, or has files that must not be replaced."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ValueError(_cannot_write(path, f"{existing} is a file"))

@@ -6,7 +6,7 @@
     dpmjax slam drive.bag --topic /points               a bag of ROS 1 or 2 (.bag, .mcap, a folder; extra ros)
     dpmjax slam kitti/dataset --sequence 07 -n 500      the first 500 scans of a sequence
     dpmjax slam day2 --map results/slam/latest/map.npz  extend the map of an earlier run
-    dpmjax slam --resume                                go on where the last run stopped, or was killed
+    dpmjax slam --resume                                continue the latest run
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
 graph.g2o, keyframes.txt, map.npz, map.ply, trajectory.png, map.png and metrics.json. The tables scans.csv and loops.csv
@@ -73,7 +73,7 @@ class Config(DriveOptions):
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Reads, maps, writes; returns the content of `metrics.json`."""
+    """Maps a drive and writes the results; returns the content of `metrics.json`."""
     from dpmjax.cli.slam_run import find_beginning, live_viewer, run_scans
 
     if config.visualize:
@@ -110,12 +110,12 @@ def main(config: Config) -> dict[str, Any]:
 
 
 class MappedDrive(NamedTuple):
-    """The scans of a run, and where it begins in a map.
+    """The scans of a run, and the first scan and keyframe of the run in a map.
 
     Attributes:
         sequence: the scans.
         first_scan: number of the first scan in the map; 0 for a new one.
-        num_keyframes_before: keyframes of the map that is extended.
+        num_keyframes_before: number of keyframes of the extended map.
     """
 
     sequence: LidarSequence
@@ -154,7 +154,7 @@ def write_results(
     files.write_scans(folder / "scans.csv", result.reports, result.keyframes, sequence.sources)
     if len(slam_map):
         metrics |= files.write_map_file(folder / "map.npz", slam_map)
-    write_metrics(folder, metrics, seed=config.seed)  # numbers first: a picture that fails must not cost them
+    write_metrics(folder, metrics, seed=config.seed)  # numbers first, even if a picture fails
     cloud = files.gather_map(slam_map.T_world_keyframe, lambda row: drive.read_keyframe(slam_map, row))
     files.write_map(folder / "map.ply", cloud)
     files.draw_pictures(folder.path, sequence, result, cloud, drive.num_keyframes_before)
@@ -183,6 +183,6 @@ def refine_trajectory(
 
 
 def tell(text: str) -> None:
-    """Prints, and writes to the log."""
+    """Prints a text and writes it to the log."""
     print(text, flush=True)
     LOGGER.info("%s", text)

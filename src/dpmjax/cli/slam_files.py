@@ -1,4 +1,4 @@
-"""The files of a SLAM run: trajectories, graph, tables, maps, the pictures; and saved maps that are read again."""
+"""The files of a SLAM run: trajectories, graph, tables, maps and pictures; and the reading of saved maps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Cloud(NamedTuple):
 
     Attributes:
         points: (n, 3) in the world, m.
-        heights_m: (n,) above the lidar that saw the point.
+        heights_m: (n,) heights above the lidar that measured the point.
         voxel_m: one point was kept in each voxel of this side.
     """
 
@@ -58,7 +58,7 @@ def write_graph(folder: Path, result: slam.SlamResult) -> None:
 
 
 def write_loops(path: Path, loops: Sequence[slam.Loop], keyframes: Sequence[int] | np.ndarray) -> None:
-    """Writes every candidate of a loop, and what became of it."""
+    """Writes every candidate of a loop with its outcome."""
     ends = (
         {"scan": int(keyframes[loop.source]), "other_scan": int(keyframes[loop.target]), **loop_cells(loop)}
         for loop in loops
@@ -67,7 +67,7 @@ def write_loops(path: Path, loops: Sequence[slam.Loop], keyframes: Sequence[int]
 
 
 def loop_cells(loop: slam.Loop) -> dict[str, str]:
-    """Returns the cells of a loop candidate in a table: how it was found, its outcome and the numbers that decided."""
+    """Returns the cells of a loop candidate in a table: source, outcome and the numbers of the decision."""
     numbers = {"overlap": loop.overlap, "probability": loop.probability, "rmse_m": loop.rmse}
     cells = {name: _number(number) for name, number in numbers.items()}
     return {"found_by": loop.found_by, "status": loop.status, **cells}
@@ -76,7 +76,7 @@ def loop_cells(loop: slam.Loop) -> dict[str, str]:
 def write_scans(
     path: Path, reports: Sequence[slam.ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
 ) -> None:
-    """Writes how each scan was placed."""
+    """Writes the reports on the placed scans."""
     rows = [
         {
             "scan": report.scan,
@@ -105,7 +105,7 @@ def _number(value: float | None) -> str:
 
 
 def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray]) -> Cloud:
-    """Puts scans into the world, one point a voxel; voxels grow where the map gets too large.
+    """Transforms scans to the world frame with one point for each voxel; larger maps have larger voxels.
 
     Args:
         T_world_scan: (n, 4, 4) poses.
@@ -128,7 +128,7 @@ def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray])
         points = points[(ranges > MAP_RANGES_M[0]) & (ranges < MAP_RANGES_M[1])]
         turned = points[first_of_each_voxel(points, voxel_m)] @ T[:3, :3].T
         parts.append(np.column_stack([turned + T[:3, 3], turned[:, 2]]).astype(np.float32))
-        # The larger the map, the rarer it is thinned: the work grows with the map only.
+        # Larger maps are thinned less often, so that the work is linear in the size of the map.
         if sum(map(len, parts)) > 2 * num_thinned + 200_000:
             parts = [thinned()]
             while len(parts[0]) > MAX_MAP_POINTS:
@@ -140,7 +140,7 @@ def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray])
 
 
 def write_map_file(path: Path, slam_map: slam.KeyframeMap) -> dict[str, int]:
-    """Writes the map that later runs extend and scans are localised in; returns its size at each precision."""
+    """Writes the map for later runs and for localisation; returns its size at each precision."""
     saved_maps.save_map(path, slam_map)
     return {"map_bytes": path.stat().st_size, "map_bytes_int8": len(saved_maps.map_bytes(slam_map, "int8"))}
 

@@ -13,7 +13,7 @@ from dpmjax import geometry, metrics, slam
 from dpmjax.sequences import LidarSequence
 
 MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
-"""Errors up to which a localisation is right."""
+"""Largest errors of a right localisation."""
 
 
 class SlamRun(NamedTuple):
@@ -26,7 +26,7 @@ class SlamRun(NamedTuple):
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
         scan_s: seconds of each scan of this process, without compilation, reading and writing.
-        failure: what ended the run early; None where nothing did.
+        failure: error that ended the run early; None without an error.
     """
 
     state: slam.SlamState
@@ -69,7 +69,7 @@ def localization_errors(
 
     Args:
         found: results of n scans.
-        slam_map: the map that they were looked for in.
+        slam_map: the map.
         T_reference_keyframe: (k, 4, 4) reference poses of all keyframes.
         T_reference_scan: (n, 4, 4) reference poses of the scans, in the same world.
 
@@ -154,7 +154,7 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
 
 
 def why_failed(statuses: Mapping[str, int]) -> str | None:
-    """Returns why a run has no result, although it has come to its end; None where it has one.
+    """Returns the reason why a finished run has no result; None where it has one.
 
     Args:
         statuses: number of scans by status.
@@ -172,7 +172,7 @@ def why_failed(statuses: Mapping[str, int]) -> str | None:
 
 
 def run_status(numbers: Mapping[str, Any]) -> str:
-    """Returns how a run ended.
+    """Returns the status of a finished run.
 
     Args:
         numbers: of the run.

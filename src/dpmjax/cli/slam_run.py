@@ -1,4 +1,4 @@
-"""A SLAM run in its folder: progress, interim results, seconds of each stage, and the state from which it goes on."""
+"""A SLAM run in its folder: progress, interim results, seconds of each stage, and the state for a resumed run."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from dpmjax.saved_maps import RunState, load_state, save_state
 from dpmjax.sequences import LidarSequence
 
 STATE = "run_state.npz"
-# Seconds between writings of the state: a killed run repeats the scans since the last one.
+# Seconds between writings of the state; a killed run repeats the scans since the last one.
 SAVE_EVERY_S = 10.0
-# Seconds between interim results, for those who look at a run that goes on.
+# Seconds between interim results.
 FLUSH_EVERY_S = 30.0
 _STAGES = {
     "thin": "thinning",
@@ -35,7 +35,7 @@ _STAGES = {
 
 
 class Stopwatch:
-    """Seconds of stages, and of compilation, which belongs to none."""
+    """Seconds of stages, and of compilation, which is counted separately."""
 
     def __init__(self) -> None:
         self.stages_s: collections.defaultdict[str, float] = collections.defaultdict(float)
@@ -76,7 +76,7 @@ class Timed:
 
 
 def find_beginning(folder: RunFolder, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
-    """Reads how far a run has come that is resumed; a `ValueError` for one of other weights."""
+    """Reads the state of a resumed run; raises a `ValueError` for a run with other weights."""
     path = folder / STATE
     if not folder.is_resumed or not path.is_file():
         return RunState(start, ())
@@ -90,7 +90,7 @@ def find_beginning(folder: RunFolder, methods: slam.SlamMethods, start: slam.Sla
 def map_drive(
     folder: RunFolder, sequence: LidarSequence, methods: slam.SlamMethods, is_stopped: Callable[[], bool]
 ) -> tuple[SlamRun, slam.SlamResult]:
-    """Maps a drive from its beginning, or goes on from the state in its folder.
+    """Maps a drive from its beginning, or from the state in its folder.
 
     Args:
         folder: folder for the state and interim results.
@@ -119,7 +119,7 @@ def run_scans(
     is_stopped: Callable[[], bool],
     on_scan: Callable[[Any, slam.SlamState, slam.ScanReport], None] | None = None,
 ) -> SlamRun:
-    """Places the remaining scans; the result holds what ended it early, and the state of the last keyframe is saved.
+    """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
 
     Args:
         folder: folder for the state and interim results.
@@ -189,7 +189,7 @@ def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) 
 
 @contextmanager
 def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[Callable[..., None] | None]:
-    """Opens the viewer; yields what shows a scan, or None where the viewer is off."""
+    """Opens the viewer; yields a function that shows a scan, or None where the viewer is off."""
     if not is_on:
         yield None
         return

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 NAME = "train"
 MODEL = "model.safetensors"
-# More bad scans than this are counted only.
+# Largest number of listed damaged scans; further ones are only counted.
 MAX_LISTED = 10
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
@@ -152,7 +152,7 @@ def main(config: Config) -> None:
             "is_interrupted": stop.is_requested,
             "seed": config.seed,
         }
-        # Numbers first: a picture that fails must not cost them.
+        # Numbers first, so that they are written even if a picture fails.
         write_metrics(folder, metrics)
         write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
         draw_curves(folder)

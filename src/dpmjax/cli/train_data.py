@@ -41,7 +41,7 @@ class EvaluationSets(NamedTuple):
 
     Attributes:
         selection: pairs of towns of their own, by which the best model is chosen.
-        real: pairs of each folder of real scans that are measured beside; they choose nothing.
+        real: pairs of each folder of real scans, which are measured but not used for selection.
         held_out: pairs of another town, measured once at the end.
     """
 

@@ -85,7 +85,7 @@ class Records:
         return float(np.mean(of_kinds))
 
     def on_report(self, record: StepRecord, progress: TrainingProgress) -> None:
-        """Adds a row, updates the bar, and writes a checkpoint when it is time."""
+        """Adds a row, updates the bar, and writes a checkpoint every few minutes."""
         values = _values(record)
         if math.isfinite(record.score):
             values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
@@ -101,7 +101,7 @@ class Records:
             self._last_saved = time.perf_counter()
 
     def save(self, progress: TrainingProgress) -> None:
-        """Writes a checkpoint, and the best parameters where they are others than at the last one."""
+        """Writes a checkpoint, and the best parameters where they have changed since the last one."""
         if int(progress.best_step):
             self._best.save(int(progress.best_step), progress.best_params)
         self._checkpoints.save(int(progress.state.step), replace(progress, best_params={}))

@@ -1,7 +1,8 @@
-"""Scans of a step: all, blocks of neighbours in time, or windows that are registered alone and joined at shared scans.
+"""Scans of an optimisation step: all scans, blocks of neighbours in time, or windows that share one scan.
 
-Within a window all scans are near the first one, so that the Chamfer distance has its minimum within reach from zero
-poses. Over a whole walk L-Net has to unroll the chain at once, and may lay two rooms that look alike on each other.
+Windows are registered independently and joined at their shared scans. Within a window all scans are near the first one,
+so that zero poses are in the basin of convergence of the Chamfer distance. Over a whole trajectory L-Net would have to
+separate all scans at once, and may put two similar rooms on top of each other.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ _BLOCK = 32
 
 
 def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
-    """Neighbours in time that a step sees together.
+    """Returns the number of neighbours in time in one block of a step.
 
     Args:
         phase: phase of the fit.
         num_scans: number of scans of the set.
 
     Returns:
-        Their number.
+        Number of scans.
     """
     if phase.scans_per_window is not None:
         return min(num_scans, phase.scans_per_window)
@@ -41,16 +42,16 @@ def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
 def scans_of_step(
     phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array
 ) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
-    """Scans of a step: all windows, or all scans where they are few enough, else blocks of neighbours in time.
+    """Selects the scans of a step: all windows, or all scans if they are few, else random blocks of neighbours in time.
 
     Args:
         phase: phase of the fit.
         num_scans: number of scans of the set.
-        step: steps done in the phase.
+        step: number of steps done in the phase.
         key: key of the step.
 
     Returns:
-        Index of each scan in the set, and the block it belongs to.
+        Index of each scan in the set, and index of its block.
     """
     if phase.scans_per_window is not None:
         rows = window_rows(num_scans, phase.scans_per_window)
@@ -58,7 +59,7 @@ def scans_of_step(
     if num_scans <= phase.scans_per_step:
         return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
     if phase.is_sampled_as_published:
-        # The published order: batches follow each other in time, none is mixed. The last batch reaches back, so that
+        # The published order: batches follow each other in time. The last batch overlaps with the one before, so that
         # all have one length and no scan is left out.
         first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
         first = jnp.minimum(first, num_scans - phase.scans_per_step)
@@ -69,15 +70,15 @@ def scans_of_step(
 
 
 def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Array, " o"]:
-    """Distances in time of the scans that are compared: 1, so that neighbours always meet, and others at random.
+    """Draws the distances in time of the scans that are compared: always 1, and random others.
 
     Args:
         phase: phase of the fit; `num_offsets` and `max_offset` are clamped to the available scans.
-        furthest: the largest distance that there is.
+        furthest: largest available distance.
         key: key of this step.
 
     Returns:
-        Different whole numbers, 1 to `furthest`.
+        Distinct integers, 1 to `furthest`.
     """
     largest = max(1, min(phase.max_offset, furthest))
     count = min(phase.num_offsets, largest) - 1
@@ -86,14 +87,15 @@ def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Ar
 
 
 def window_rows(num_scans: int, scans_per_window: int) -> NDArray[np.intp]:
-    """The scans of each window; the last scan of a window is the first of the next.
+    """Returns the rows of each window; the last scan of a window is the first of the next one.
 
     Args:
         num_scans: number of scans of the set, in the order of time.
-        scans_per_window: scans of a window, at least 2.
+        scans_per_window: number of scans of a window, at least 2.
 
     Returns:
-        (w, m) indices, m the smaller of both numbers; the last window reaches back, so that all have one length.
+        (w, m) indices, where m is the smaller of both numbers. The last window overlaps with the one before, so that
+        all have one length.
     """
     length = min(scans_per_window, num_scans)
     count = max(1, -(-(num_scans - 1) // (length - 1))) if length > 1 else 1
@@ -102,14 +104,14 @@ def window_rows(num_scans: int, scans_per_window: int) -> NDArray[np.intp]:
 
 
 def join_windows(poses: Float[Array, "w m 3"], num_scans: int) -> Float[Array, "n 3"]:
-    """Poses of all scans in one world, that of the first window.
+    """Joins the poses of the windows in the frame of the first window.
 
     Args:
-        poses: poses of each window's scans, in a world of its own: x, y, heading.
+        poses: x, y, heading of the scans of each window, in the frame of the window.
         num_scans: number of scans of the set.
 
     Returns:
-        The poses; neighbours within a window keep their motion.
+        Poses; relative poses within a window are unchanged.
     """
     rows = window_rows(num_scans, poses.shape[1])
     # The last scan of the window before, as an index of this window.
@@ -127,7 +129,7 @@ def join_windows(poses: Float[Array, "w m 3"], num_scans: int) -> Float[Array, "
 
 
 def in_windows(array: Any, rows: NDArray[np.intp]) -> Any:
-    """The rows of an array side by side, as an array of windows.
+    """Reshapes rows of an array into windows.
 
     Args:
         array: (w * m, ...).

@@ -1,4 +1,4 @@
-"""Lidar scans as the fit of clouds has them: evenly thinned points with their planes, and who meets whom again."""
+"""Lidar scans for the fit of clouds: evenly thinned points with their planes, and pairs of scans at revisits."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from dpmjax.scans.preprocess import first_of_each_voxel
 # In typical ranges: nearest and farthest point, side of the voxels, and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
 _NUM_NEIGHBOURS = 24
-# Scans with more than this number of scans between them meet again, if they are nearer than this number of typical
-# ranges.
+# Two scans are a revisit if more than this number of scans lie between them, and they are nearer than this number of
+# typical ranges.
 _REVISIT_GAP, _REVISIT_DISTANCE = 8, 0.5
 _NUM_PARTNERS = 8
 
 
 @flax.struct.dataclass
 class CloudScans:
-    """Lidar scans of equal capacity; the rows of each are in random order, those that are not there at the end.
+    """Lidar scans of equal capacity; the points of each are in random order, invalid rows at the end.
 
     Attributes:
         points: points in the lidar frames, any unit; in typical ranges inside of the fit.
-        mask: False for rows that are not there.
-        normals: unit normals of the planes around the points, on the side of the lidar.
+        mask: False for invalid rows.
+        normals: unit normals of the planes around the points, towards the lidar.
         flatness: planarity of the neighbourhood, in [0, 1].
-        spacing: median distance of a point to the nearest other one of its scan.
-        partners: scans near in space, though not in time, at the poses to start from; -1: none.
+        spacing: median distance of a point to its nearest neighbour in the scan.
+        partners: indices of revisits at the initial poses, near in space and far in time; -1: none.
     """
 
     points: Float[Array, "n c 3"]
@@ -92,7 +92,7 @@ def _checked(scan: ArrayLike, number: int) -> NDArray[np.float32]:
 def _thinned(
     cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Points, normals, flatness and mask of one scan."""
+    """Computes points, normals, flatness and mask of one scan."""
     surface = scan_surface(cloud, config)
     if not len(surface.points):
         raise ValueError(f"scans: scan {number} has no point near the ranges of the others; leave it out")
@@ -103,13 +103,13 @@ def _thinned(
     points[:count], normals[:count], flatness[:count] = (
         surface.points[rows], surface.normals[rows], surface.flatness[rows]
     )  # fmt: skip
-    # Both sides of a wall are surfaces of their own: the lidar has seen the side that faces it.
+    # The two sides of a wall are different surfaces, so normals point to the lidar.
     normals[np.sum(normals * points, axis=1) > 0.0] *= -1.0
     return points, normals, flatness, mask
 
 
 def _spacing(points: NDArray[np.float32]) -> float:
-    """Median distance to the nearest other point; 0 of a single one."""
+    """Computes the median distance to the nearest neighbour; 0 for a single point."""
     if len(points) < 2:
         return 0.0
     distances, _ = cKDTree(points).query(points, 2)
@@ -117,7 +117,7 @@ def _spacing(points: NDArray[np.float32]) -> float:
 
 
 def _evenly(points: NDArray[np.float64], voxel: float, num_points: int) -> NDArray[np.int64]:
-    """Rows of one point for each of at most `num_points` voxels, whose side is as small as that allows."""
+    """Selects up to `num_points` points, one for each voxel, with the smallest possible voxels."""
     if len(points) <= num_points:
         return np.arange(len(points))
     low, high = voxel, voxel
@@ -136,14 +136,14 @@ def _evenly(points: NDArray[np.float64], voxel: float, num_points: int) -> NDArr
 
 
 def find_partners(T: NDArray[np.floating], unit: float) -> Int[Array, "n p"]:
-    """Scans that come near each other again, at given poses.
+    """Finds up to eight revisit partners of each scan: scans near in space and far apart in time.
 
     Args:
-        T: (n, 4, 4) poses.
-        unit: the typical range, unit of the poses.
+        T: (n, 4, 4) T_world_scan.
+        unit: typical range, in the unit of the poses.
 
     Returns:
-        Up to eight others of each scan, nearest first; -1 where there are fewer.
+        Indices of the partners, nearest first; -1 for missing ones.
     """
     count = len(T)
     partners = np.full((count, _NUM_PARTNERS), -1, np.int32)

@@ -1,7 +1,8 @@
 """Lidar clouds as a sensor of DeepMapping in SE(3): clouds are compared by planes or by the Chamfer distance.
 
-The rings of two lidar scans do not meet the same points. The nearest point of another scan lies on a ring, beside the
-surface between rings. The Chamfer distance pulls ring onto ring; a plane through the nearest point does not.
+The rings of two lidar scans hit different points of a surface. The nearest point of another scan lies on a ring, at
+some distance along the surface. So the Chamfer distance aligns rings; the distance to the plane of the nearest point
+does not.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from dpmjax.deepmapping.spatial import (
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import k_nearest
 
-# Reach of the search for a plane, in widths of the kernel and in spacings of the points; the larger of both.
+# Search radius of planes, in widths of the kernel and in spacings of the points; the larger of both.
 _REACH_WIDTHS, _REACH_SPACINGS = 5.0, 2.0
-# Planes whose normals have a smaller cosine do not match; the two sides of a wall do not either.
+# Planes whose normals have a smaller cosine do not match, so the two sides of a wall do not match.
 _MIN_COSINE = 0.3
 # Trajectories are compared by pairs of scans at these distances in time, and by this number of points of each scan.
 _JUDGED_OFFSETS, _JUDGED_POINTS = (1, 2, 4, 8), 512
@@ -46,12 +47,12 @@ class PlaneCloud(NamedTuple):
 
 
 def clouds_of(scans: CloudScans) -> PlaneCloud:
-    """The points of all scans with their planes."""
+    """Returns the points of all scans with their planes."""
     return PlaneCloud(scans.points, scans.mask, scans.normals, scans.flatness)
 
 
 def take_rows(cloud: PlaneCloud, rows: Int[Array, " m"]) -> PlaneCloud:
-    """Some of the scans."""
+    """Returns the scans of these rows."""
     return PlaneCloud(*(leaf[rows] for leaf in cloud))
 
 
@@ -62,20 +63,20 @@ def plane_misfit(
     width: Float[Array, ""] | float,
     spacing: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """Share of the source's planes that do not meet a plane of the target, softly: 0 all do, 1 none.
+    """Computes the soft share of the source's planes that match no plane of the target: 0 if all match, 1 if none.
 
     A point at the distance r from the plane through the nearest point of the target has the misfit r^2 / (r^2 +
-    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Flat neighbourhoods count more.
+    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Weights are the flatness of the points.
 
     Args:
-        T_target_source: maps the source's points into the frame of the target.
-        source: some points of a scan.
+        T_target_source: transform of source points into the frame of the target.
+        source: sampled points of a scan.
         target: scan with the planes.
         width: width of the kernel, unit of the points.
         spacing: typical distance of a point of the target to its neighbours.
 
     Returns:
-        The misfit; 1 where the source has no plane. Which plane is nearest has no derivative.
+        The misfit; 1 where the source has no plane. The choice of the nearest plane has no derivative.
     """
     moved = rigid.transform_points(T_target_source, source.points)
     reach = jnp.maximum(_REACH_WIDTHS * width, _REACH_SPACINGS * spacing)
@@ -102,15 +103,15 @@ def misfit_of_pairs(
     is_pair: Bool[Array, " p"],
     sizes: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
 ) -> Float[Array, ""]:
-    """Mean misfit of pairs of scans, in both directions.
+    """Computes the mean misfit of pairs of scans, in both directions.
 
     Args:
         T_world_scan: poses.
-        samples: some points of each scan.
+        samples: sampled points of each scan.
         scans: the scans.
         pairs: rows of the scans.
-        is_pair: False for pairs that do not count.
-        sizes: width and spacing, as of `plane_misfit`.
+        is_pair: False for invalid pairs.
+        sizes: width and spacing, as in `plane_misfit`.
 
     Returns:
         The mean; 0 without a pair.
@@ -128,15 +129,15 @@ def misfit_of_pairs(
 def trajectory_misfit(
     scans: CloudScans, T_world_scan: Float[Array, "n 4 4"], width: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Mean misfit of each scan with those 1, 2, 4 and 8 later, and with its partners: compares trajectories.
+    """Computes the mean misfit of each scan with those 1, 2, 4 and 8 later and with its partners, without ground truth.
 
     Args:
         scans: the scans.
-        T_world_scan: their poses, unit of the points.
+        T_world_scan: poses of the scans, unit of the points.
         width: width of the kernel, unit of the points.
 
     Returns:
-        0 (all planes meet) to 1 (none does); no reference is needed.
+        0 (all planes match) to 1 (no plane matches).
     """
     count = scans.mask.shape[0]
     first = jnp.arange(count)
@@ -156,7 +157,7 @@ def trajectory_misfit(
 
 
 def _draw_points(scans: PlaneCloud, count: int, *, key: jax.Array) -> PlaneCloud:
-    """Other points of each scan in every step."""
+    """Draws a random run of the shuffled points of each scan."""
     num_scans, capacity = scans.mask.shape
     if count >= capacity:
         return scans
@@ -166,7 +167,7 @@ def _draw_points(scans: PlaneCloud, count: int, *, key: jax.Array) -> PlaneCloud
 
 
 def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:
-    """Scans near in space of each scan; -1: none."""
+    """Draws revisit partners of each scan; -1: none."""
     columns = jax.random.choice(key, scans.partners.shape[1], (count,), replace=False)
     return scans.partners[rows][:, columns].T
 
@@ -179,7 +180,7 @@ def _loss(
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """DeepMapping eq. 6 of a batch of scans and points; scans are compared by planes or by the Chamfer distance."""
+    """Computes DeepMapping eq. 6 of a batch of scans and points, compared by planes or by the Chamfer distance."""
     row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]

@@ -12,11 +12,11 @@ from dpmjax.nets.occupancy import OccupancyConfig
 
 @dataclass(frozen=True)
 class ChamferComparison:
-    """Pairs of scans are compared by the Chamfer distance (DeepMapping eq. 7).
+    """Comparison of pairs of scans by the Chamfer distance (DeepMapping eq. 7).
 
     Attributes:
-        limit: larger distances count as this one, at the start and at the end of the phase, so that points that only
-            one scan has seen do not pull; None: no limit.
+        limit: largest distance, to which larger ones are clipped, at the start and at the end of the phase, so that
+            points outside the overlap have no gradient; None: no limit.
     """
 
     limit: tuple[float, float] | None = None
@@ -24,10 +24,10 @@ class ChamferComparison:
 
 @dataclass(frozen=True)
 class ProjectiveComparison:
-    """Pairs of depth images are compared by projection; the first images follow the last, so that any two can meet.
+    """Comparison of pairs of depth images by projection; offsets in time wrap around at the end of the sequence.
 
     Attributes:
-        tolerance: share of the depth by which matching points may differ, at the start and at the end of the phase.
+        tolerance: tolerance of matching points as a share of the depth, at the start and at the end of the phase.
     """
 
     tolerance: tuple[float, float]
@@ -35,7 +35,7 @@ class ProjectiveComparison:
 
 @dataclass(frozen=True)
 class PlaneComparison:
-    """Pairs of lidar clouds are compared by the distances of points to planes.
+    """Comparison of pairs of lidar clouds by the distances of points to planes.
 
     Attributes:
         width: width of the robust kernel, at the start and at the end of the phase.
@@ -60,23 +60,23 @@ class PhaseConfig:
         num_steps: number of steps of Adam.
         occupancy_weight: gamma in gamma BCE + (1 - gamma) comparison; 0 leaves M-Net out.
         learning_rate: learning rate of L-Net or of the poses.
-        final_learning_rate: learning rate at the end as a share of the first one; it falls by a cosine.
+        final_learning_rate: learning rate at the end as a share of the first one, with a cosine schedule.
         adam_decay: Adam's decay rates of both moments, for the poses or L-Net.
         scans_per_step: number of scans in a step, in blocks of neighbours in time.
         beams_per_step: number of beams, or pixels of a depth image, of each scan in a step.
         num_offsets: number of later scans that each scan is compared to.
         max_offset: the largest distance in time of two scans that are compared; neighbours are always compared.
         num_free: number of free samples on each beam, drawn between sensor and hit.
-        is_sampled_as_published: sampling as in the published program: a free sample lies at the same share of every
-            beam, and batches follow each other in time. Otherwise each beam has samples of its own, and batches are
-            random.
+        is_sampled_as_published: True for the sampling of the published program: a free sample lies at the same share
+            of every beam, and batches follow each other in time. Otherwise the samples of each beam and the batches
+            are random.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
         comparison: method that compares pairs of scans. Only depth images can be compared by projection, and only
             clouds by planes.
-        scans_per_window: for planar scans. The set is cut into windows of this number of neighbours in time. Each
-            window has an L-Net (or free poses) of its own, and windows are joined at the scans that they share. A step
-            holds all windows. None: one L-Net for the whole set.
+        scans_per_window: for planar scans, number of neighbours in time in a window. Each window has its own L-Net (or
+            free poses), and windows are joined at the scans that they share. A step has all windows. None: one L-Net
+            for the whole set.
     """
 
     name: str
@@ -120,7 +120,7 @@ LOCALIZE = PhaseConfig(
     max_offset=8,
     scans_per_window=17,
 )
-"""Cold start: an L-Net a window moves its poses together; the map comes later, it would freeze the first bad guess."""
+"""Cold start: one L-Net for each window, without M-Net, because a map of wrong poses would be a local minimum."""
 
 REFINE = PhaseConfig(
     name="free poses",
@@ -138,7 +138,7 @@ REFINE = PhaseConfig(
 
 @dataclass(frozen=True)
 class DeepMappingConfig:
-    """Settings of a fit: by default of planar scans; `depth_preset` and `cloud_preset` make those in space.
+    """Settings of a fit, by default of planar scans; `preset` has those of depth images and clouds.
 
     Attributes:
         cold_phases: phases of a fit from zero poses.
@@ -187,7 +187,7 @@ def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
 
     Args:
         config: settings of a fit.
-        num_steps: steps of all phases together.
+        num_steps: number of steps of all phases together.
 
     Returns:
         The settings.

@@ -1,6 +1,6 @@
 """Depth images as a sensor of DeepMapping (section 4.2): images are compared by the Chamfer distance or by projection.
 
-`spatial` has the poses.
+The poses are those of `spatial`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
 
 
 def _draw_pixels(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
-    """Other pixels from each image: equal ones would pull equal rays together."""
+    """Draws different pixels from each image, because equal pixels would favour equal rays in the Chamfer distance."""
     num_scans, height, width = scans.mask.shape
     points, mask = scans.points.reshape(num_scans, -1, 3), scans.mask.reshape(num_scans, -1)
     if count >= height * width:
@@ -39,7 +39,7 @@ def _loss(
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """DeepMapping eq. 6 of a batch of pixels; images are compared by the Chamfer distance or by projection."""
+    """Computes DeepMapping eq. 6 of a batch of pixels, compared by the Chamfer distance or by projection."""
     batch_key, loss_key = jax.random.split(key)
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]

@@ -1,9 +1,9 @@
-"""The engine: `init` a state, `step` it, `resume` it to the end. Training a problem's parameters is the registration.
+"""Optimisation of the parameters of a `Problem`: `init` a state, `step` it, `resume` it to the end.
 
-A state is one pytree of arrays: written to disk after any call, it goes on exactly. The data are arguments of the
-compiled step, so that another set of the same shape compiles nothing. Several starts are one more leading axis.
-`init`, `begin_phase`, `step` and `solve` are pure functions of arrays, for `jit` and `vmap`. `fit` and `resume` run
-the same steps from the host, with progress and a stop.
+A state is one pytree of arrays; a run that is resumed from a saved state equals an unbroken one. The data are arguments
+of the compiled step, so that another set of the same shape compiles nothing. Several starts, with different keys, have
+one more leading axis. `init`, `begin_phase`, `step` and `solve` are pure functions of arrays, for `jit` and `vmap`.
+`fit` and `resume` run the same steps from the host, with progress and a stop.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from dpmjax.deepmapping.problem import Problem
 
 @flax.struct.dataclass
 class FitState:
-    """Everything that a fit needs to go on; of several starts every leaf has a leading axis.
+    """Complete state of a fit; for several starts every leaf has a leading axis.
 
     Attributes:
         params: trained parameters of the problem.
         optimizer: state of the optimiser.
         key: key of the start; step k uses `fold_in(key, k)`, so that a resumed run equals an unbroken one.
         phase: index of the phase.
-        phase_step: steps done in it.
-        step: steps done in all.
+        phase_step: number of steps done in the phase.
+        step: number of steps done in all phases.
     """
 
     params: Any
@@ -46,7 +46,7 @@ class FitState:
 
 
 class Report(NamedTuple):
-    """Result of one call of the step; of several starts every leaf has a leading axis.
+    """Result of one call of the step; for several starts every leaf has a leading axis.
 
     Attributes:
         losses: losses of each step of the call.
@@ -65,13 +65,13 @@ class Report(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """A call of the step, as `on_report` gets it.
+    """Argument of `on_report`, after a call of the step.
 
     Attributes:
         phase: settings of the phase.
-        state: after the call.
+        state: state after the call.
         report: report of the call.
-        share: steps done of all steps, 0 to 1.
+        share: share of all steps that are done, 0 to 1.
         run_s: seconds of stepping so far, of this `fit`.
         compile_s: seconds of compiling so far.
     """
@@ -89,7 +89,7 @@ class Fit(NamedTuple):
 
     Attributes:
         state: state at the end, or where it was stopped.
-        poses: poses of the whole data set, as the state has them.
+        poses: poses of the whole data set at this state.
         report: report of the last call; None if no step was done.
         run_s: seconds of stepping.
         compile_s: seconds of compiling.
@@ -123,14 +123,14 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
 
 
 def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = None) -> tuple[FitState, Report]:
-    """Does one call of steps.
+    """Runs one call of steps.
 
     Args:
         problem: problem to fit; static under `jit`.
         state: state from `init` or from an earlier call.
         data: data of the problem.
         phase: index of the phase of the state, static under `jit`; `begin_phase` enters the next one. None: the
-            index is read from the state on the host, and a phase that is over is left first.
+            index is read from the state on the host, and the next phase begins where the phase is over.
 
     Returns:
         The state after the call, and its report.
@@ -172,7 +172,7 @@ def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> 
 
 @partial(jax.jit, static_argnums=0)
 def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Report]:
-    """Steps a fresh state through all phases, as `fit` does, as one pure function.
+    """Runs all phases from a fresh state as one pure function.
 
     Several data sets of equal shapes: `jax.vmap(lambda data, key: solve(problem, data, key=key))(data, keys)`.
 
@@ -198,14 +198,14 @@ def _scanned_step(problem: Problem, data: Any, phase: int, state: FitState, _: N
 
 
 def is_finished(problem: Problem, state: FitState) -> bool:
-    """Tells whether all steps of the last phase are done.
+    """Returns True if all steps of the last phase are done.
 
     Args:
         problem: fitted problem.
         state: state of the fit.
 
     Returns:
-        True if no step is left.
+        True if no step remains.
     """
     phase = _scalar(state.phase)
     return phase == len(problem.phases) - 1 and _scalar(state.phase_step) >= problem.phases[phase].num_steps
@@ -220,11 +220,11 @@ def fit(
     on_report: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Fit:
-    """Steps a fresh state through all phases.
+    """Runs all phases from a fresh state.
 
     Args:
         problem: problem to fit.
-        data: data of the problem, with the poses to start from where it has some.
+        data: data of the problem, with initial poses where there are some.
         key: key of the run.
         num_starts: number of starts that advance side by side.
         on_report: called after each call of the step.
@@ -245,7 +245,7 @@ def resume(
     on_report: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Fit:
-    """Steps a state through the remaining phases; a second fit of the same shapes compiles nothing.
+    """Runs the remaining phases of a state; a second fit of the same shapes compiles nothing.
 
     Args:
         problem: problem to fit.
@@ -280,7 +280,7 @@ def _scalar(count: Array) -> int:
 
 
 def num_calls(problem: Problem, phase: Any) -> int:
-    """Counts the calls of the step that a phase takes.
+    """Returns the number of calls of the step in a phase.
 
     Args:
         problem: fitted problem.
@@ -293,7 +293,7 @@ def num_calls(problem: Problem, phase: Any) -> int:
 
 
 def steps_per_call(problem: Problem, phase: Any) -> int:
-    """Counts the steps of one call: the calls share those of the phase evenly; the last one hardly goes beyond.
+    """Returns the steps of the phase divided by its number of calls, rounded up.
 
     Args:
         problem: fitted problem.
@@ -317,7 +317,7 @@ def _init(problem: Problem, data: Any, key: Array) -> FitState:
 
 
 def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
-    """Returns the state at the start of the next phase if its phase is over and not the last; else the same state."""
+    """Returns the state at the start of the next phase if the phase is over and not the last; else the same state."""
     phase = _scalar(state.phase)
     if phase + 1 == len(problem.phases) or _scalar(state.phase_step) < problem.phases[phase].num_steps:
         return state
@@ -336,7 +336,7 @@ def _current_poses(problem: Problem, phase: int, state: FitState, data: Any) -> 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> tuple[FitState, Report]:
-    """Does one call of steps of a phase."""
+    """Runs one call of steps of a phase."""
     phase = problem.phases[phase_index]
     optimizer = problem.optimizer(problem.config, phase)
 

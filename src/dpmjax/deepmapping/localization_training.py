@@ -1,4 +1,4 @@
-"""Training of L-Net on the poses of a fit: scans that are turned, shifted and partly hidden, and rendered ones."""
+"""Training of L-Net on the poses of a fit, with scans that are turned, shifted, masked or rendered from the map."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from dpmjax.deepmapping.planar import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
-# Learning rate of Adam at the start; it falls to a hundredth by a cosine.
+# Learning rate of Adam at the start; a cosine schedule reduces it to a hundredth.
 _LEARNING_RATE = 2e-3
-# Scans are turned to random headings up to this: `relocalize` tries all turns, and L-Net needs only one of them.
+# Largest random heading of a scan; `relocalize` tries all turns, so L-Net needs only a range of headings.
 _MAX_TURN_DEG = 20.0
-# Scans are re-projected to points around their own (`shift_scan`), up to this distance in typical ranges, so that L-Net
-# learns the surroundings of the trajectory.
+# Largest distance, in typical ranges, to which scans are re-projected (`shift_scan`), so that L-Net learns the
+# surroundings of the trajectory.
 _MAX_SHIFT = 0.2
-# Scans of a step, drawn with replacement. Scans that are rendered from the map at random free places: they make up half
-# of each step, so that L-Net learns places that the trajectory has seen but not passed.
+# Number of scans of a step, drawn with replacement. Number of scans rendered from the map at random free positions;
+# half of each step are rendered scans, so that L-Net learns observed places off the trajectory.
 _SCANS_PER_STEP, _NUM_RENDERED = 64, 4096
-# Largest share of the beams that is hidden from L-Net; the share differs from scan to scan.
+# Largest share of masked beams of a scan.
 _LARGEST_DROP = 0.2
 
 
@@ -49,10 +49,10 @@ def has_windows(fitted: Fitted) -> bool:
 
 
 def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps: int = 5000, key: jax.Array) -> Fitted:
-    """Trains L-Net on the poses that the fit has found, so that `relocalize` answers in the same world.
+    """Trains L-Net on the poses of the fit, for `relocalize` in the same world frame.
 
-    The labels are the fit's own: no ground truth enters. Scans are turned, shifted and partly hidden, and others are
-    rendered from the map of M-Net at places where none was taken.
+    The labels are the poses of the fit, not ground truth. Scans are turned, shifted and partly masked. Further scans
+    are rendered from the map of M-Net at positions off the trajectory.
 
     Args:
         fitted: any fit, also from given poses.
@@ -122,7 +122,7 @@ def _draw_training_batch(
     *,
     key: jax.Array,
 ) -> tuple[ScanSet, Float[Array, "m 3"]]:
-    """Scans turned, shifted and partly hidden, and their poses."""
+    """Draws scans that are turned, shifted and partly masked, and their poses."""
     row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)
     num_scans, num_beams = scans.mask.shape
     rows = jax.random.randint(row_key, (count,), 0, num_scans)
@@ -136,13 +136,13 @@ def _draw_training_batch(
     points = jax.vmap(turn_scan)(points, turn)
     share = _LARGEST_DROP * jax.random.uniform(share_key, (*rows.shape, 1))
     hidden = jax.random.uniform(drop_key, mask.shape) < share
-    # A scan of one beam must keep it.
+    # At least one beam of a scan remains.
     seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
     return ScanSet(points, seen), poses[rows] + jnp.concatenate([moved, turn[:, None]], axis=-1)
 
 
 def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 2"]:
-    """Shifts of random sides and lengths; half of the scans stay where they are, which are the only true ones."""
+    """Draws shifts of random direction and length; half of them are zero, because shifted scans are approximate."""
     length_key, side_key = jax.random.split(key)
     length = largest * jax.random.uniform(length_key, (count,), minval=-1.0).clip(0.0)
     side = jax.random.uniform(side_key, (count,), maxval=2.0 * jnp.pi)
@@ -150,7 +150,7 @@ def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 
 
 
 def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Array, "b 2"]:
-    """The scan of a sensor whose heading is larger by `turn`: every point turned back by it.
+    """Simulates the scan of a sensor whose heading is larger by `turn`, by turning all points back.
 
     Args:
         points: points in the sensor frame.
@@ -164,17 +164,17 @@ def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Arra
 
 
 def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Float[Array, " 2"]) -> Float[Array, "b 2"]:
-    """An approximate scan of a sensor nearby, at the same angles.
+    """Approximates the scan of a sensor nearby, at the same angles.
 
     Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
 
     Args:
         points: points in the sensor frame.
-        mask: True for beams with a measurement; other beams keep their points.
+        mask: True for valid beams; other beams keep their points.
         shift: position of the new sensor in the frame of the old one.
 
     Returns:
-        Points in the frame of the new sensor; without a shift the points themselves.
+        Points in the frame of the new sensor; unchanged without a shift.
     """
     safe = jnp.where(mask[:, None], points, 1.0)
     moved = safe - shift

@@ -1,4 +1,4 @@
-"""Rasters of M-Net: for scans rendered at places where none was taken, and as a picture (DeepMapping figure 5)."""
+"""Rasters of M-Net: for rendered scans, and as a picture (DeepMapping figure 5)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
 NUM_NODES = 513
-"""Nodes of the raster along each side of the map's frame."""
-# Log odds beyond which a node counts as seen, free or occupied; M-Net is zero at places that no beam has reached.
+"""Number of nodes of the raster along each side of the map's frame."""
+# Absolute log odds above which a node is observed, free or occupied; M-Net is zero where no beam has passed.
 _SEEN = 0.3
-# Nodes on the way of a rendered beam that may be unseen, as a share of all.
+# Largest share of unobserved nodes along a rendered beam.
 _MAX_UNSEEN = 0.1
 # Longest rendered beam in nodes.
 _MAX_NODES = 400
-# Smallest share of the beams of a rendered scan that must hit the map.
+# Least share of the beams of a rendered scan that hit the map.
 _LEAST_BEAMS = 0.5
 
 
@@ -34,7 +34,7 @@ class MapRaster(NamedTuple):
 
     Attributes:
         logits: rows along x, columns along y.
-        frame: frame of the map, which the raster fills.
+        frame: frame of the map, equal to that of the raster.
     """
 
     logits: Float[Array, "r r"]
@@ -64,14 +64,14 @@ def make_raster(params: Params, config: DeepMappingConfig) -> MapRaster:
 
 
 def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
-    """Finds the nodes that points lie at.
+    """Finds the nearest nodes of points.
 
     Args:
         frame: frame of the map.
         points: points in the world, typical ranges.
 
     Returns:
-        Index of the nearest node in the flat raster, and whether the point is inside of it.
+        Index of the nearest node in the flat raster, and True where the point is inside the raster.
     """
     position = (0.5 * (points - frame.centre) / frame.half_side + 0.5) * (NUM_NODES - 1)
     index = jnp.clip(jnp.round(position).astype(jnp.int32), 0, NUM_NODES - 1)
@@ -86,12 +86,12 @@ def render_scans(
 
     Args:
         raster: raster of the map.
-        scans: (n, b, 2) in typical ranges; rendered scans have their beams.
-        count: places that are tried.
-        key: key of the places.
+        scans: (n, b, 2) in typical ranges; rendered scans have the same bearings.
+        count: number of positions that are tried.
+        key: key of the positions.
 
     Returns:
-        Scans and poses; of the places those where enough beams meet something that M-Net knows.
+        Scans and poses at the positions where enough beams hit occupied nodes of M-Net.
     """
     place_key, row_key = jax.random.split(key)
     free = np.flatnonzero(np.asarray(raster.logits) < -_SEEN)
@@ -112,7 +112,7 @@ def render_scans(
 def _follow_beams(
     raster: MapRaster, places: Float[Array, "m 2"], towards: Float[Array, "m b 2"]
 ) -> tuple[Float[Array, "m b"], Bool[Array, "m b"]]:
-    """Ranges to the first occupied node towards points of the sensor frame, and whether there is one that is known."""
+    """Computes ranges to the first occupied node towards points of the sensor frame, and True for valid ranges."""
     ranges = raster.spacing * jnp.arange(1, _MAX_NODES + 1)
 
     def follow(beams: tuple[Float[Array, " 2"], Float[Array, "b 2"]]) -> tuple[Array, Array]:
@@ -128,7 +128,7 @@ def _follow_beams(
     return jax.lax.map(follow, (places, towards), batch_size=16)
 
 
-# Samples on a beam for what counts as explored.
+# Number of samples on a beam that mark cells as explored.
 _SAMPLES = 64
 
 
@@ -136,8 +136,8 @@ class MapPicture(NamedTuple):
     """A raster of the world; row 0 has the smallest y.
 
     Attributes:
-        probability: (h, w) of being occupied.
-        explored: (h, w) a beam has passed or ended there.
+        probability: (h, w) occupancy probability.
+        explored: (h, w) True where a beam has passed or ended.
         extent: x_min, x_max, y_min, y_max in the unit of the points.
     """
 
@@ -149,12 +149,12 @@ class MapPicture(NamedTuple):
 def map_picture(
     fitted: Fitted, points: NDArray[np.floating], mask: NDArray[np.bool_], *, num_cells: int = 500
 ) -> MapPicture:
-    """Evaluates M-Net wherever a beam has been.
+    """Evaluates M-Net on a raster over all hits, with the explored cells.
 
     Args:
         fitted: the fit.
-        points: (n, b, 2) its scans in the sensor frames, unit of the poses.
-        mask: (n, b) False for beams that measured nothing.
+        points: (n, b, 2) scans of the fit in the sensor frames, unit of the poses.
+        mask: (n, b) False for invalid beams.
         num_cells: number of cells along the longer side.
 
     Returns:
@@ -182,7 +182,7 @@ def map_picture(
 
 
 def _close_gaps(explored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Between two beams that pass on either side a cell counts as explored too."""
+    """Marks cells between two neighbouring beams as explored."""
     from scipy.ndimage import binary_closing
 
     return binary_closing(explored, iterations=2) | explored

@@ -1,4 +1,4 @@
-"""DeepMapping of scans of any sensor: the problem, `fit_deepmapping` around the engine, and the choice of fit or start.
+"""DeepMapping of scans of any sensor: `fit_deepmapping`, and the choice between the fit and its initial poses.
 
 The type of the scans chooses the sensor: a ScanSet is planar, DepthScans are depth images, CloudScans lidar clouds.
 """
@@ -31,7 +31,7 @@ from dpmjax.registration_rgbd.projective_consistency import projective_consisten
 from dpmjax.types import ScanSet
 
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}
-# Kernel width, in typical ranges, of the misfit by which a start and the fit of clouds are compared.
+# Kernel width, in typical ranges, of the misfit that compares the fit of clouds with its initial poses.
 _MISFIT_KERNEL_WIDTH = 0.004
 
 Scans = ScanSet | DepthScans | CloudScans
@@ -44,9 +44,9 @@ class Fitted(NamedTuple):
         poses: float64, unit of the points: (n, 3) x, y, heading of planar scans, else (n, 4, 4) T_world_scan.
         params: parameters of L-Net and M-Net.
         report: report of the last call of the step.
-        unit: the length that the parameters count in, unit of the points.
+        unit: unit of length of the parameters, in the unit of the points.
         config: settings of the fit.
-        num_steps: steps done in all, those of a resumed run too; with 0, the networks are untrained.
+        num_steps: number of steps, with those before a resumed run; with 0, the networks are untrained.
     """
 
     poses: NDArray[np.float64]
@@ -58,7 +58,7 @@ class Fitted(NamedTuple):
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
-        """(n, 3, 3) or (n, 4, 4) the poses as matrices; the frame of a depth image is that of its camera."""
+        """Poses as matrices (n, 3, 3) or (n, 4, 4); the frame of a depth image is that of the camera."""
         return self.poses if self.poses.ndim == 3 else se2.to_matrix(self.poses)
 
 
@@ -66,12 +66,12 @@ class Registered(NamedTuple):
     """Result of `register_depth` and of `register_clouds`.
 
     Attributes:
-        T_world_scan: (n, 4, 4) float64, unit of the points: of the fit, or the start where that fits better.
-        kept: source of the poses, the fit or the start.
-        misfit: disagreement of the scans at the poses of the fit, 0 or more. Of depth images 1 less their
-            `projective_consistency`; of clouds the share of planes that do not meet planes of other scans.
-        start_misfit: the same at the start; None after a cold start.
-        start: (n, 4, 4) poses that the fit started from; None after a cold start.
+        T_world_scan: (n, 4, 4) float64, unit of the points: the poses of the smaller misfit.
+        kept: source of the poses, the fit or the initial poses ("start").
+        misfit: disagreement of the scans at the poses of the fit, 0 or more: 1 less the `projective_consistency` of
+            depth images, or the `trajectory_misfit` of clouds.
+        start_misfit: misfit at the initial poses; None after a cold start.
+        start: (n, 4, 4) initial poses; None after a cold start.
         fitted: DeepMapping of the scans.
     """
 
@@ -88,11 +88,11 @@ def mapping_data(scans: Scans | ArrayLike, start: ArrayLike | None = None) -> tu
 
     Args:
         scans: DepthScans, CloudScans, or planar scans as `as_scan_set` takes them.
-        start: poses to start from: (n, 3) x, y, heading or (n, 3, 3) matrices of planar scans, else (n, 4, 4)
+        start: initial poses: (n, 3) x, y, heading or (n, 3, 3) matrices of planar scans, else (n, 4, 4)
             T_world_scan; None: cold start.
 
     Returns:
-        The data as the problem takes them, and the typical range in the unit of the scans.
+        Data of the problem, and the typical range in the unit of the scans.
 
     Raises:
         ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
@@ -108,14 +108,14 @@ def mapping_data(scans: Scans | ArrayLike, start: ArrayLike | None = None) -> tu
 
 
 def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
-    """States DeepMapping of scans as a problem of the engine.
+    """Makes the optimisation problem of DeepMapping for scans.
 
     Args:
         config: settings of the fit.
         data: data of `mapping_data`.
 
     Returns:
-        The problem; its poses are those of `Fitted`, in typical ranges.
+        The problem; poses are as in `Fitted`, in typical ranges.
 
     Raises:
         ValueError: clouds move in the plane by these settings.
@@ -144,8 +144,8 @@ def fit_deepmapping(
             ScanSet, DepthScans (section 4.2) or CloudScans.
         config: settings; None: the fast preset of planar scans; `preset` has those of other sensors.
         key: key of the whole run.
-        start: poses to start from, as `mapping_data` takes them; None: cold start from zero.
-        engine: what trains, called as `engine(problem, data, key=key)`;
+        start: initial poses, as `mapping_data` takes them; None: cold start from zero.
+        engine: training function, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
     Returns:
@@ -169,16 +169,16 @@ def register_depth(
     start: ArrayLike | None = None,
     engine: Callable[..., Fit] = fit,
 ) -> Registered:
-    """Registers depth images: a search for first poses, DeepMapping from them (section 4.2), and of both the better.
+    """Registers depth images by a search of initial poses and DeepMapping (section 4.2), and keeps the better poses.
 
-    They are compared by `projective_consistency`, without ground truth.
+    Initial poses and fit are compared by `projective_consistency`, without ground truth.
 
     Args:
         images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), or DepthScans; metres, or any
             unit where a start is given.
-        config: settings of the fit; None: `preset("fast", "depth")`. Its `motion` holds for the search, too.
+        config: settings of the fit, and `motion` of the search; None: `preset("fast", "depth")`.
         key: key of the search and of the fit.
-        start: (n, 4, 4) T_world_camera to start from; None: `initialize_depth` searches first poses.
+        start: (n, 4, 4) initial T_world_camera; None: `initialize_depth` searches them.
         engine: engine of the fit, as in `fit_deepmapping`.
 
     Returns:
@@ -191,8 +191,7 @@ def register_depth(
     scans = images if isinstance(images, DepthScans) else as_depth_scans(images)
     if start is None:
         start = initialize_depth(scans, depth_search(config.motion), key=key)
-    # Search and fit share the key: a fit from given poses gives the same as one from the same poses, found here. The
-    # published numbers rest on it.
+    # Search and fit share the key, so that a fit from found poses equals a fit from the same poses, given as `start`.
     fitted = fit_deepmapping(scans, config, key=key, start=start, engine=engine)
     return _keep_better(fitted, start, lambda T: 1.0 - float(projective_consistency(scans, T)))
 
@@ -207,13 +206,13 @@ def register_clouds(
 ) -> Registered:
     """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
 
-    The fit replaces a given start only if its planes meet better than those of the start; no ground truth is used.
+    The fit replaces given initial poses only if it has the smaller misfit, computed without ground truth.
 
     Args:
         scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
         config: settings; None: `preset("fast", "clouds")`.
         key: key of the whole run.
-        start: (n, 4, 4) T_world_scan to start from; None: cold start.
+        start: (n, 4, 4) initial T_world_scan; None: cold start.
         engine: engine of the fit, as in `fit_deepmapping`.
 
     Returns:
@@ -234,13 +233,13 @@ def register_clouds(
 
 
 def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..., float]) -> Registered:
-    """Returns the poses of the fit or of its start, those of the smaller misfit."""
+    """Returns the poses of the fit or the initial poses, those of the smaller misfit."""
     T, misfit = fitted.T_world_scan, misfit_of(fitted.T_world_scan)
     if start is None:
         return Registered(T, "fit", misfit, None, None, fitted)
     T_start = np.asarray(start, np.float64)
     start_misfit = misfit_of(T_start)
-    # A fit that is not finite is not better.
+    # False for a misfit that is not finite.
     if misfit < start_misfit:
         return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
     return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)

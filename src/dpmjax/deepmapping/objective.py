@@ -1,4 +1,4 @@
-"""The terms of DeepMapping's loss, of scans in the world (sections 3.2 and 3.4).
+"""Terms of DeepMapping's loss for scans in the world frame (sections 3.2 and 3.4).
 
 `occupancy_term` compares M-Net with the hits (occupied) and with samples on the beams (free). `chamfer_term` compares
 each scan with later ones.
@@ -22,14 +22,14 @@ MapLogits = Callable[[Float[Array, "n d"]], Float[Array, " n"]]
 
 
 class WorldBatch(NamedTuple):
-    """The scans of one step in the world, neighbours in time side by side; lengths in typical ranges.
+    """Scans of one step in the world frame, in the order of time; lengths in typical ranges.
 
     Attributes:
         points: (m, b, d) hits.
         sensors: (m, d) centres of the sensors.
         mask: (m, b) False for beams that measured nothing.
         rows: (m,) index of each scan in the set; consecutive within a block.
-        block: (m,) which block each belongs to.
+        block: (m,) index of the block of each scan.
         progress: progress of the phase, 0 at its start, 1 at its end.
     """
 
@@ -42,12 +42,12 @@ class WorldBatch(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """The parts of the loss before they are weighted.
+    """Terms of the loss before weighting.
 
     Attributes:
         occupancy: eq. 4, in nats.
-        chamfer: eq. 7 divided by the number of pairs, in typical ranges; of images compared by projection, 1 less
-            their projective consistency.
+        chamfer: eq. 7 divided by the number of pairs, in typical ranges; for images compared by projection, 1 less
+            the projective consistency; for clouds compared by planes, the misfit.
     """
 
     occupancy: Float[Array, ""]
@@ -55,7 +55,7 @@ class Terms(NamedTuple):
 
 
 def interpolate_log(ends: tuple[float, float], progress: Float[Array, ""]) -> Float[Array, ""]:
-    """A value that goes from the first to the last end, evenly in its logarithm.
+    """Interpolates between two values linearly in the logarithm.
 
     Args:
         ends: values at the start and at the end, above 0.
@@ -70,7 +70,7 @@ def interpolate_log(ends: tuple[float, float], progress: Float[Array, ""]) -> Fl
 def free_factors(
     world: WorldBatch, phase: PhaseConfig, surface_distance: Float[Array, ""] | None, *, key: jax.Array
 ) -> Float[Array, "m b s"]:
-    """Places of the free samples on each beam: 0 at the sensor, 1 at the hit.
+    """Draws the positions of the free samples on each beam: 0 at the sensor, 1 at the hit.
 
     Args:
         world: the scans.
@@ -97,12 +97,12 @@ def free_factors(
 
 
 def occupancy_term(world: WorldBatch, map_logits: MapLogits, factors: Float[Array, "m b s"]) -> Float[Array, ""]:
-    """DeepMapping eq. 4: hits are occupied, samples on the beams are free; both means have the same weight.
+    """Computes DeepMapping eq. 4: hits are occupied, samples on the beams are free; both means have the same weight.
 
     Args:
         world: the scans.
         map_logits: M-Net with its parameters.
-        factors: places of the free samples.
+        factors: positions of the free samples.
 
     Returns:
         The binary cross entropy, in nats.
@@ -117,7 +117,7 @@ def occupancy_term(world: WorldBatch, map_logits: MapLogits, factors: Float[Arra
 
 
 def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Comparison = CHAMFER) -> Float[Array, ""]:
-    """DeepMapping eq. 7: mean Chamfer distance between each scan and the scans `offsets` later in its block.
+    """Computes DeepMapping eq. 7: mean Chamfer distance of each scan to the scans `offsets` later in the block.
 
     Args:
         world: the scans.
@@ -128,7 +128,7 @@ def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Compa
         The mean over all pairs, in typical ranges; 0 without a pair.
 
     Raises:
-        ValueError: the comparison is of other scans.
+        ValueError: the comparison is of another type.
     """
     if not isinstance(comparison, ChamferComparison):
         raise ValueError(f"comparison: expected a ChamferComparison of these scans, got {comparison}")

@@ -1,4 +1,4 @@
-"""Planar scans as a sensor of DeepMapping: poses x, y, heading, by one L-Net or by one for each window of the walk."""
+"""Planar scans as a sensor of DeepMapping: poses x, y, heading, by one L-Net or by one for each window."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from dpmjax.types import ScanSet
 
 
 def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
-    """Checked scans; beams with coordinates that are not finite, or both zero, measured nothing.
+    """Checks scans; beams with coordinates that are not finite, or both zero, are invalid.
 
     Args:
         scans: (n, b, 2) in the sensor frames, any unit; or a ScanSet.
         min_scans: the smallest number of scans.
 
     Returns:
-        The scans, zeros where nothing was measured.
+        The scans, zeros at invalid beams.
 
     Raises:
         ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or a valid beam of a
@@ -56,7 +56,7 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
 def localize_scans(
     params: Any, points: Float[Array, "m b 2"], mask: Bool[Array, "m b"], config: DeepMappingConfig
 ) -> Float[Array, "m 3"]:
-    """L-Net's outputs for scans.
+    """Computes L-Net's outputs for scans.
 
     Args:
         params: weights of L-Net.
@@ -71,12 +71,12 @@ def localize_scans(
 
 
 def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int = 0) -> Int[Array, " c"]:
-    """Indices of evenly spaced beams, about `beams_per_step` of them.
+    """Selects about `beams_per_step` evenly spaced beams.
 
     Args:
         num_beams: number of beams of a scan.
         phase: phase of the fit.
-        first: shifts all beams, by less than their spacing.
+        first: offset of the first beam, modulo the spacing.
 
     Returns:
         The indices.
@@ -106,20 +106,20 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Param
 
 
 def _choose_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array, "n 3"]) -> MapFrame:
-    """The square that the scans cover at these poses."""
+    """Computes the square that the scans cover at these poses, with the margin of the map."""
     if config.occupancy.kind == "mlp":
         return MapFrame(centre=jnp.zeros(2), half_side=jnp.ones(()))
     return choose_frame(se2.transform_points(poses, scans.points), scans.mask, config.map_margin)
 
 
 def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
-    """Free poses take over where L-Net is, in a map frame around them."""
+    """Starts the next phase from L-Net's poses, and re-centres the map frame."""
     poses = _poses(config, phase, params, data)
     return replace(params, poses=poses, frame=_choose_frame(config, data.scans, poses))
 
 
 def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Float[Array, "n 3"]:
-    """Poses of all scans; L-Net sees the same number of beams as in training."""
+    """Computes the poses of all scans, from the same number of beams as in training."""
     scans, count = data.scans, data.scans.mask.shape[0]
     rows = np.arange(count) if phase.scans_per_window is None else window_rows(count, phase.scans_per_window)
     poses = params.poses
@@ -133,7 +133,7 @@ def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: 
 def _localize(
     config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet, rows: Array | NDArray[np.intp]
 ) -> Float[Array, "m 3"]:
-    """Poses of the scans `rows` by L-Net, or by the L-Net of each window, of which `rows` has all."""
+    """Computes the poses of the scans `rows` by L-Net, or of all windows by the L-Net of each window."""
     points, mask = scans.points[rows], scans.mask[rows]
     if phase.scans_per_window is None:
         outputs = localize_scans(params.localization, points, mask, config)
@@ -152,7 +152,7 @@ def _loss(
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """DeepMapping eq. 6 of a batch of scans and beams."""
+    """Computes DeepMapping eq. 6 of a batch of scans and beams."""
     scans, progress = data.scans, step / phase.num_steps
     batch_key, loss_key = jax.random.split(key)
     beam_key, row_key = jax.random.split(batch_key)

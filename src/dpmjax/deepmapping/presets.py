@@ -33,7 +33,7 @@ JOINT = PhaseConfig(
     num_free=19,
     is_sampled_as_published=True,
 )
-"""The paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4 scans."""
+"""Phase of the paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4."""
 
 LOCALIZE_DEPTH = replace(
     LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None
@@ -49,7 +49,7 @@ UNROLL_DEPTH = replace(
     final_learning_rate=0.02,
     comparison=ChamferComparison(limit=(0.5, 0.05)),
 )
-"""The Chamfer distance pulls views of low overlap onto each other; with its falling limit, that pull vanishes."""
+"""Free poses of depth images; the decreasing limit of the Chamfer distance removes its bias at low overlap."""
 
 REFINE_DEPTH = replace(
     REFINE,
@@ -63,13 +63,13 @@ REFINE_DEPTH = replace(
     surface_distance=(0.05, 0.01),
     comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
 )
-"""Free poses and a map that sharpens from coarse to fine. The nearest point of another image is some centimetres beside
-the surface between its pixels, and it pulls points that only one image has seen; a projection does neither."""
+"""Free poses and a map that sharpens from coarse to fine. The Chamfer distance is biased by the spacing of the pixels
+and by points that only one image has observed; the comparison by projection is not."""
 
 JOINT_DEPTH = replace(
     JOINT, num_steps=3000, occupancy_weight=0.9, scans_per_step=256, num_offsets=1, max_offset=1, num_free=35
 )
-"""The paper: all pixels, 35 free samples a ray, gamma 0.9, windows of 2."""
+"""Phase of the paper for depth images: all pixels, 35 free samples on each ray, gamma 0.9, comparison of neighbours."""
 
 LOCALIZE_CLOUDS = replace(
     LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3, scans_per_window=None
@@ -77,7 +77,7 @@ LOCALIZE_CLOUDS = replace(
 """Cold start of clouds."""
 
 UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)
-"""The same of clouds."""
+"""Free poses of clouds, as `UNROLL_DEPTH`."""
 
 REFINE_CLOUDS = replace(
     REFINE,
@@ -93,11 +93,11 @@ REFINE_CLOUDS = replace(
     surface_distance=(0.05, 0.01),
     comparison=PlaneComparison(width=(0.04, 0.002), num_revisits=1),
 )
-"""Free poses, planes and a map that sharpens. The Chamfer distance pulls the sparse rings of two scans onto each other;
-the distance to the plane between the rings does not."""
+"""Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
+scans; the distance to the plane between the rings does not."""
 
 JOINT_CLOUDS = replace(JOINT, num_steps=3000, scans_per_step=64, beams_per_step=2048)
-"""The paper's losses and sampling, in 3-D."""
+"""Losses and sampling of the paper, for clouds."""
 
 
 _FAST: dict[str, DeepMappingConfig] = {
@@ -124,7 +124,7 @@ _PAPER = {
     "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)),
     "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point")),
 }
-"""The only phase, and L-Net, of each sensor in the paper."""
+"""Phase and L-Net of the paper for each sensor."""
 
 
 def preset(
@@ -158,7 +158,7 @@ def preset(
         config = replace(config, cold_phases=(phase,), warm_phases=(phase,), steps_per_call=1)
         config = replace(config, localization=net, occupancy=OccupancyConfig())
     elif sensor == "depth" and motion == "full":
-        # Real depth images in SE(3) do not agree to half a percent of the depth, and their first poses are rougher.
+        # Real depth images in SE(3) do not agree to half a percent of the depth, and initial poses are less accurate.
         refine = replace(REFINE_DEPTH, comparison=ProjectiveComparison(tolerance=(0.1, 0.02)))
         config = replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
     if not is_organised:

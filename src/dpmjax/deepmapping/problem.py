@@ -1,6 +1,4 @@
-"""A problem for the engine: a record of pure functions; and the parts that problems with an L-Net and an M-Net
-share.
-"""
+"""A `Problem` for the engine, and the parts that problems with an L-Net and an M-Net share."""
 
 from __future__ import annotations
 
@@ -20,28 +18,28 @@ from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
 from dpmjax.nets.occupancy import make_map_net
 
-# Points that M-Net's hidden layers hold at once when it is an MLP: 16 MB a layer of 512.
+# Number of points that an MLP as M-Net evaluates at once: 16 MB for each layer of 512.
 _MLP_CHUNK = 1 << 13
-# Learning rates of M-Net: a step changes few nodes of a grid, and all weights of an MLP.
+# Learning rates of M-Net; a step changes few nodes of a grid and all weights of an MLP.
 _MAP_LEARNING_RATE = {"grid": 0.1, "mlp": 1e-3}
 # Weight of the mean square of a grid's nodes.
 _GRID_DECAY = 1e-3
-# Share of a phase with free poses after which all levels of a grid are on.
+# Share of a phase with free poses after which all levels of a grid have weight 1.
 _ANNEAL_UNTIL = 0.7
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem whose parameters are trained on one data set; training them is the registration.
+    """Functions and settings of an optimisation of parameters on one data set.
 
     The functions are pure and belong to a module, so that problems of equal settings are equal. A Problem is a static
     argument of the compiled step; the data are not part of it.
 
     Attributes:
         config: settings, given to every function as its first argument; hashable.
-        phases: settings of each phase; each has a `name` and `num_steps`. A function of a phase gets them second.
-        init: (config, key, data) -> Params; the data hold the poses to start from where there are some.
-        optimizer: (config, phase) -> what changes the parameters; its state has the same structure in all phases.
+        phases: settings of each phase, with `name` and `num_steps`; second argument of the functions of a phase.
+        init: (config, key, data) -> Params; the data have the initial poses where there are some.
+        optimizer: (config, phase) -> optax optimiser, whose state has the same structure in all phases.
         loss: (config, phase, params, data, step, key) -> (scalar, terms); `step` counts from 0 within the phase.
         poses: (config, phase, params, data) -> poses of the whole data set.
         next_phase: (config, phase, params, data) -> Params at the start of the phase after `phase`.
@@ -63,7 +61,7 @@ class MappingData(NamedTuple):
 
     Attributes:
         scans: ScanSet, DepthScans or CloudScans.
-        start: poses to start from, as the problem has them; None: cold start.
+        start: initial poses in the parametrisation of the sensor; None: cold start.
     """
 
     scans: Any
@@ -71,13 +69,13 @@ class MappingData(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """The parts of DeepMapping that depend on the sensor: its scans, its poses, and how pairs of scans are compared.
+    """Functions of DeepMapping that depend on the sensor: poses, and comparison of pairs of scans.
 
     Attributes:
         scaled_start: (start, number of scans, unit) -> checked poses in typical ranges.
         unscaled: (poses, unit) -> float64 poses in the unit of the points.
         init: as in Problem.
-        loss: as in Problem; it ends with `mapping_loss`.
+        loss: as in Problem.
         poses: as in Problem.
         next_phase: as in Problem.
     """
@@ -92,7 +90,7 @@ class Sensor(NamedTuple):
 
 @flax.struct.dataclass
 class MapFrame:
-    """The square of the world, or the cube, that M-Net sees as [-1, 1]^d; in typical ranges."""
+    """Square or cube of the world that maps to [-1, 1]^d, the domain of M-Net; in typical ranges."""
 
     centre: Float[Array, " d"]
     half_side: Float[Array, ""]
@@ -103,8 +101,8 @@ class Params:
     """Parameters of a fit; lengths in typical ranges, angles in radians.
 
     Attributes:
-        localization: weights of L-Net; with windows, of one for each along a leading axis.
-        poses: free poses, or free motions after `start`; in a phase of windows with free poses, of each window.
+        localization: weights of L-Net; with windows, a leading axis has one L-Net for each window.
+        poses: free poses, or free motions relative to `start`; for each window where windows have free poses.
         occupancy: weights of M-Net.
         start: poses that L-Net's outputs are relative to; not trained.
         frame: frame of the map; not trained.
@@ -118,11 +116,11 @@ class Params:
 
 
 def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig, ...]:
-    """The phases of a fit: from zero or from given poses.
+    """Returns the phases of a fit: cold from zero poses, or warm from given poses.
 
     Args:
         config: settings of the fit.
-        data: data with the start, or without.
+        data: data with initial poses, or without.
 
     Returns:
         The phases.
@@ -131,7 +129,7 @@ def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig
 
 
 def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
-    """Returns Adam for the parameters of a phase; other parameters stay, and so do their moments.
+    """Returns Adam for the trained parameters of a phase; other parameters and their moments are constant.
 
     Args:
         config: settings of the fit.
@@ -157,7 +155,7 @@ def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.Gradi
 
 
 def _frozen(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
-    """The same state, but nothing moves: so that the states of all phases have one structure."""
+    """Returns an optimiser with the same state and zero updates, so that all phases have one state structure."""
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
         del params
@@ -167,12 +165,12 @@ def _frozen(optimizer: optax.GradientTransformation) -> optax.GradientTransforma
 
 
 def choose_frame(points_world: Float[Array, "... d"], mask: Array, margin: float) -> MapFrame:
-    """The square or cube around points, with a margin.
+    """Computes the square or cube around points, with a margin.
 
     Args:
         points_world: (..., d).
-        mask: (...) False for points that are not there.
-        margin: side of the frame over the largest extent of the points.
+        mask: (...) False for invalid points.
+        margin: ratio of the side of the frame to the largest extent of the points.
 
     Returns:
         MapFrame.
@@ -184,12 +182,12 @@ def choose_frame(points_world: Float[Array, "... d"], mask: Array, margin: float
 
 
 def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Array, " l"] | None = None) -> MapLogits:
-    """M-Net as a function of points in the world, in typical ranges.
+    """Returns M-Net as a function of points in the world frame, in typical ranges.
 
     Args:
         params: parameters of the fit.
         config: settings of the fit.
-        level_weights: 0 (off) to 1 for each level of a grid; None: all on.
+        level_weights: weights of the levels of a grid, 0 (off) to 1; None: all 1.
 
     Returns:
         The function: points (n, d) -> logits (n,).
@@ -202,7 +200,8 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
         local = (points - params.frame.centre) / params.frame.half_side
         if occupancy.kind == "grid" or len(points) <= _MLP_CHUNK:
             return apply(params.occupancy, local, weights)
-        # The hidden layers of all samples at once would take gigabytes: a part at a time, again on the way back.
+        # The hidden layers of all samples would take gigabytes, so parts are evaluated in turn and re-evaluated in the
+        # backward pass.
         count = -(-len(points) // _MLP_CHUNK)
         parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
         logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params.occupancy, part, weights)), parts)
@@ -212,7 +211,7 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
 
 
 def level_weights(phase: PhaseConfig, num_levels: int, progress: Float[Array, ""]) -> Float[Array, " l"]:
-    """Weights of the levels of the map: where the poses are free, coarse levels first.
+    """Computes the weights of the levels of the map; in phases with free poses, coarse levels start first.
 
     Args:
         phase: phase of the fit.
@@ -236,18 +235,18 @@ def mapping_loss(
     *,
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """DeepMapping eq. 6 in the convex form gamma BCE + (1 - gamma) * (comparison of pairs).
+    """Computes DeepMapping eq. 6 in the convex form gamma BCE + (1 - gamma) * (comparison of pairs).
 
     Args:
         config: settings of the fit.
         phase: phase of the fit.
         params: parameters with M-Net and its frame.
-        world: the scans of the batch in the world.
+        world: scans of the batch in the world frame.
         pair_term: eq. 7, or another comparison of pairs of scans.
         key: key of the free samples.
 
     Returns:
-        The loss with the decay of the map, and its terms before weighting.
+        The loss with weight decay of the map, and the terms before weighting.
     """
     gamma, loss, occupancy = phase.occupancy_weight, pair_term, jnp.zeros(())
     if gamma > 0.0:

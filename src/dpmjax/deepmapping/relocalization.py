@@ -1,7 +1,8 @@
-"""Re-localisation of scans that a fit has not seen: L-Net proposes poses, M-Net chooses (DeepMapping figure 7).
+"""Re-localisation of new scans in the map of a fit: L-Net proposes poses, M-Net scores them (DeepMapping figure 7).
 
-L-Net knows the headings of the walk only. So each scan is turned all round, L-Net proposes a pose for every turn, and
-the one stays around which the map of M-Net explains the scan best. What the map explains badly was never seen.
+L-Net is trained on the headings of the trajectory only. So each scan is turned in steps over the full circle, and L-Net
+proposes a pose for each turn. A search around these poses minimises the cost of the scan in the map of M-Net. A high
+cost means that the place is not in the map.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ from dpmjax.types import ScanSet
 
 # Step of the coarsest grid of poses, along x and y in typical ranges, and in radians of heading; each level halves it.
 _FIRST_STEP, _NUM_LEVELS = 0.08, 5
-# Hypotheses that are kept after the first level, and the largest number of beams that are compared.
+# Number of hypotheses that are kept after the first level, and largest number of beams that are compared.
 _NUM_KEPT, _NUM_BEAMS = 6, 64
-# Headings at which L-Net sees each scan, evenly all round.
+# Number of headings of each scan for L-Net, evenly spaced.
 _NUM_TURNS = 24
-# Scans that L-Net sees at once where there are many.
+# Largest number of scans of a batch.
 _CHUNK = 1024
-# Places on a beam at which the map must be free: shares of its length.
+# Positions on a beam at which the map must be free, as shares of the length.
 _FREE_SHARES = (0.3, 0.6, 0.85)
-# The most that one hit or one free sample can cost, nats: people and noise must not decide.
+# Largest cost of one hit or one free sample, nats, for robustness to people and noise.
 _MAX_NATS = 3.0
-# Offsets of a grid of poses in its steps, the pose itself first: of equal poses the first is taken.
+# Offsets of a grid of poses in steps of the grid, the centre first, so that it is chosen among equal costs.
 _OFFSETS = np.array(sorted(product(range(-2, 3), repeat=3), key=np.linalg.norm))
 
 
 class MapFields(NamedTuple):
-    """Costs of hits and of free samples at the nodes of a raster over the frame of the map, one raster a level.
+    """Costs of hits and of free samples at the nodes of a raster over the frame of the map, one raster for each level.
 
     Attributes:
         hit: nats of a hit.
@@ -60,8 +61,8 @@ class FoundPoses(NamedTuple):
 
     Attributes:
         poses: x, y, heading in typical ranges and radians.
-        nats: mean cost of a beam: of its hit, plus the mean of its free samples. Beams are weighted by the root of the
-            range, because near beams end on some surface everywhere. log 4 where the map is unknown.
+        nats: mean cost of a beam: cost of the hit plus mean cost of the free samples; log 4 where the map is unknown.
+            Beams are weighted by the root of the range, because near beams end on some surface everywhere.
     """
 
     poses: Float[Array, "m 3"]
@@ -78,7 +79,7 @@ def map_fields(raster: MapRaster) -> MapFields:
     Returns:
         MapFields.
     """
-    # A hit on a surface lies between a free and an occupied node, so one node is the least.
+    # A hit on a surface lies between a free and an occupied node, so the least radius is one node.
     radii = jnp.maximum(0.5 * _FIRST_STEP * 0.5 ** np.arange(_NUM_LEVELS) / raster.spacing, 1.0)
     highest = jnp.stack([largest_nearby(raster.logits, radius) for radius in radii])
     lowest = -jnp.stack([largest_nearby(-raster.logits, radius) for radius in radii])
@@ -87,11 +88,11 @@ def map_fields(raster: MapRaster) -> MapFields:
 
 
 def largest_nearby(values: Float[Array, "r r"], radius: Float[Array, ""]) -> Float[Array, "r r"]:
-    """The largest value in the square around each node, by doubling; the raster is closed at its ends.
+    """Computes the largest value in the square around each node, by doubling; the raster is periodic.
 
     Args:
         values: values at the nodes.
-        radius: radius of the square in nodes; one less than a power of two, or the next smaller of these.
+        radius: radius of the square in nodes, rounded down to one less than a power of two.
 
     Returns:
         The maxima.
@@ -107,7 +108,7 @@ def largest_nearby(values: Float[Array, "r r"], radius: Float[Array, ""]) -> Flo
 def _nats(
     scan: ScanSet, pose: Float[Array, " 3"], hit: Float[Array, "r r"], free: Float[Array, "r r"], frame: MapFrame
 ) -> Array:
-    """Mean cost of a beam of one scan at one pose."""
+    """Computes the mean cost of a beam of one scan at one pose."""
     shares = jnp.asarray((1.0, *_FREE_SHARES))[:, None, None]
     world = se2.transform_points(pose, (shares * scan.points).reshape(-1, 2)).reshape(len(shares), -1, 2)
     row, inside = nearest_nodes(frame, world)
@@ -124,7 +125,7 @@ def search_map(scans: ScanSet, proposals: Float[Array, "m p 3"], fields: MapFiel
 
     Args:
         scans: (m, b, 2) in typical ranges.
-        proposals: poses to begin at.
+        proposals: initial poses.
         fields: costs of hits and free samples in the map.
 
     Returns:
@@ -156,8 +157,7 @@ class Relocalized(NamedTuple):
         pose: (3,) or (m, 3) x, y, heading in (-pi, pi], unit of the points.
         nats: () or (m,) mean cost of a beam at this pose: 0 where M-Net explains it fully, log 4 where the map is
             unknown.
-        is_known: () or (m,) False where the map does not explain the scan: its view was never seen, or the pose is
-            wrong.
+        is_known: () or (m,) False where the cost is too high: the place is not in the map, or the pose is wrong.
     """
 
     pose: NDArray[np.float64]
@@ -166,26 +166,26 @@ class Relocalized(NamedTuple):
 
     @property
     def T_world_scan(self) -> NDArray[np.float64]:
-        """(3, 3), or (m, 3, 3) for m scans: the poses as matrices."""
+        """Poses as matrices (3, 3), or (m, 3, 3) for m scans."""
         return se2.to_matrix(self.pose)
 
 
 def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0.4) -> Relocalized:
-    """Estimates poses of new scans, and finds those outside of the mapped places (DeepMapping section 4.1, figure 7).
+    """Estimates poses of new scans, and detects scans outside of the map (DeepMapping section 4.1, figure 7).
 
-    The heading may be any. L-Net proposes a pose for each of several turns of the scan; a search around the proposals
-    takes the pose at which M-Net explains the scan best. After the free poses of the fast preset L-Net lags behind the
-    poses; `train_localization` brings it back to them.
+    The heading is arbitrary. L-Net proposes a pose for each of several turns of the scan; a search around the proposals
+    finds the pose of the least cost in the map of M-Net. In the phases with free poses of the fast preset L-Net is not
+    trained; `train_localization` trains it on the final poses.
 
     Args:
-        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`;
-            M-Net must have been trained, as all presets do, or no scan is known.
+        fitted: result of `fit_deepmapping` from zero poses with one L-Net for all scans, or of `train_localization`,
+            with a trained M-Net.
         scan: (b, 2) one scan, or (m, b, 2), in the sensor frame; unit and order of the beams as in the fit. Beams with
-            coordinates that are not finite, or both zero, measured nothing.
-        max_nats: a scan whose beams cost more at its best pose is not known.
+            coordinates that are not finite, or both zero, are invalid.
+        max_nats: largest mean cost of a known scan.
 
     Returns:
-        Relocalized, in the world of the fit's own poses.
+        Relocalized, in the world frame of the fit.
 
     Raises:
         ValueError: the shape is another one, a scan has no valid beam, the fit has several L-Nets, L-Net's outputs
@@ -218,16 +218,16 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
 def propose_poses(
     params: Any, scans: ScanSet, *, num_turns: int, fit_config: DeepMappingConfig
 ) -> Float[Array, "m t 3"]:
-    """L-Net's poses of scans, one for each turn of the scan.
+    """Computes L-Net's poses of scans, one for each turn of the scan.
 
     Args:
         params: weights of L-Net.
         scans: (m, b, 2) in typical ranges.
-        num_turns: evenly all round; the first is none.
+        num_turns: number of evenly spaced turns; the first is zero.
         fit_config: settings of the fit.
 
     Returns:
-        x, y, heading of the scans that are not turned, in typical ranges and radians.
+        x, y, heading of the scans before the turn, in typical ranges and radians.
     """
     beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
     mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns

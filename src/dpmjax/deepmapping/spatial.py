@@ -1,6 +1,6 @@
-"""Poses in space, of depth images and lidar clouds: T_start @ motion, their start, their map frame.
+"""Poses of depth images and lidar clouds in SE(3): T_start @ motion.
 
-The given start does not change; L-Net's output, or the free parameter, is a motion after it.
+T_start is constant in a phase; the motion is L-Net's output or a free parameter.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _ALL = slice(None)
 
 
 def scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
-    """Checked poses to start from.
+    """Checks initial poses and scales them to typical ranges.
 
     Args:
         poses: (n, 4, 4), unit of the points.
-        num_scans: how many there must be.
-        unit: the typical range.
+        num_scans: required number of poses.
+        unit: typical range, in the unit of the points.
 
     Returns:
         The poses in typical ranges.
@@ -49,11 +49,11 @@ def scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, 
 
 
 def unscaled_poses(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
-    """Poses in the unit of the points.
+    """Scales poses to the unit of the points.
 
     Args:
         poses: (n, 4, 4) in typical ranges.
-        unit: the typical range.
+        unit: typical range, in the unit of the points.
 
     Returns:
         (n, 4, 4) rigid motions.
@@ -83,17 +83,17 @@ def poses_of_scans(
     scans: SpatialScans,
     rows: Int[Array, " m"] | slice = _ALL,
 ) -> Float[Array, "m 4 4"]:
-    """Poses of some scans.
+    """Computes the poses of these scans.
 
     Args:
         config: settings of the fit.
-        phase: phase of the fit; L-Net gives the motions, or they are free.
+        phase: phase of the fit, with motions by L-Net or free motions.
         params: parameters of the fit.
         scans: all scans.
         rows: indices of the scans.
 
     Returns:
-        T_start @ motion of each, in typical ranges.
+        T_start @ motion of each scan, in typical ranges.
     """
     return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, scans, rows)))
 
@@ -101,19 +101,19 @@ def poses_of_scans(
 def spatial_poses(
     config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData
 ) -> Float[Array, "n 4 4"]:
-    """Poses of all scans, as a Problem has them."""
+    """Computes the poses of all scans (`Problem.poses`)."""
     return poses_of_scans(config, phase, params, data.scans)
 
 
 def _choose_frame(config: DeepMappingConfig, scans: SpatialScans, T: Float[Array, "n 4 4"]) -> MapFrame:
-    """The cube that the scans cover at these poses."""
+    """Computes the cube that the scans cover at these poses, with the margin of the map."""
     count = scans.mask.shape[0]
     world = rigid.transform_points(T, scans.points.reshape(count, -1, 3))
     return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
 
 
 def init_spatial(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
-    """Fresh parameters, as a Problem has them; without a start all sensors are at one place."""
+    """Makes initial parameters (`Problem.init`); without initial poses all poses are the identity."""
     net_key, map_key = jax.random.split(key)
     scans, start = data
     count, net = scans.mask.shape[0], _net(config)
@@ -128,12 +128,12 @@ def init_spatial(config: DeepMappingConfig, key: jax.Array, data: MappingData) -
     )
     first = config.cold_phases[0]
     if first.poses == "free" and start is None:
-        # The paper's direct baseline starts where L-Net's first forward pass puts the sensors.
+        # The paper's direct baseline starts from the output of an untrained L-Net.
         params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans, _ALL))
     return params
 
 
 def next_spatial_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
-    """The poses reached are the new start, in a map frame around them; as a Problem has it."""
+    """Starts the next phase from the estimated poses, resets the motions to zero, and re-centres the map frame."""
     T = spatial_poses(config, phase, params, data)
     return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))

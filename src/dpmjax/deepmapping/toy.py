@@ -1,7 +1,7 @@
 """Optimisation of a network instead of its output, in one dimension (DeepMapping supplement D, figure 14).
 
-The same function is minimised twice by plain gradient descent from the same start: over x, and over the weights and
-the input of a network whose output is x. Both are problems of the engine; many seeds are many starts.
+The same function is minimised twice by plain gradient descent from the same initial value. The first variable is x. The
+second is the weights and the input of a network with the output x. Both are problems of the engine.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dpmjax.types import AnyArray
 
 @dataclass(frozen=True)
 class ToyConfig:
-    """Settings of the example; the defaults are the paper's. It is its own only phase.
+    """Settings of the example and of its only phase; the defaults are the paper's.
 
     Attributes:
-        form: "network": weights and input of the network are optimised; "direct": x itself, from the network's first
-            output, so that both forms start alike.
-        net: the network.
+        form: "network": weights and input of the network are optimised; "direct": x is optimised, from the output of
+            the untrained network, so that both forms have the same initial value.
+        net: shape of the network.
         learning_rate: learning rate of gradient descent.
         num_steps: number of steps of gradient descent.
     """
@@ -61,7 +61,7 @@ class ToyParams:
 
 
 def toy_loss(x: Float[AnyArray, "..."]) -> Float[Array, "..."]:
-    """L(x) = x^2 / 2 + 5 sin 10x + 20 sin x (supplement D)."""
+    """Computes L(x) = x^2 / 2 + 5 sin 10x + 20 sin x (supplement D)."""
     x = jnp.asarray(x)
     return 0.5 * x**2 + 5.0 * jnp.sin(10.0 * x) + 20.0 * jnp.sin(x)
 
@@ -84,7 +84,7 @@ def global_minimum() -> tuple[float, float]:
 
 
 def toy_problem(config: ToyConfig) -> Problem:
-    """The example as a problem of the engine: no data (None), no start, one phase in one call.
+    """Makes the problem of the example for the engine: no data (None), one phase in one call.
 
     The terms of a report are x before each step of the call; the poses are x after the call.
 
@@ -98,7 +98,7 @@ def toy_problem(config: ToyConfig) -> Problem:
 
 
 def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
-    """The output of the network f(z).
+    """Computes the output of the network f(z).
 
     Args:
         config: settings.

@@ -43,12 +43,12 @@ class _Place(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Returns whether a path is a bag of ROS: a file .bag, .mcap or .db3, or a folder of these."""
+    """Returns True for a bag of ROS: a file .bag, .mcap or .db3, or a folder of these."""
     return path.suffix.lower() in _SUFFIXES if path.is_file() else path.is_dir() and bool(_bag_files(path))
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """The files of a bag; the folder itself where it has ROS 2's metadata.yaml."""
+    """Lists the files of a bag; the folder itself where it has ROS 2's metadata.yaml."""
     if not path.is_dir():
         return [path]
     if (path / "metadata.yaml").is_file() and any(path.glob("*.mcap*")) | any(path.glob("*.db3*")):
@@ -60,7 +60,7 @@ def _bag_files(path: Path) -> list[Path]:
 
 
 class Bag:
-    """An open bag; it is closed when nothing refers to it any more.
+    """An open bag, which is closed with its last reference.
 
     Args:
         path: a file .bag, .mcap or .db3, a folder of the parts of a bag, or a folder with metadata.yaml.
@@ -94,7 +94,7 @@ class Bag:
 
         Args:
             kinds: types of messages that are read.
-            topic: the name that the user gives; None takes the only one of these types.
+            topic: name given by the user; None: the only topic of these types.
             what: word for such messages.
 
         Returns:
@@ -119,11 +119,11 @@ class Bag:
         return fitting[0]
 
     def of_kinds(self, *kinds: str) -> list[Topic]:
-        """Finds the topics of some types that hold messages."""
+        """Finds the topics of these types that have messages."""
         return [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
 
     def stamps(self, topic: str) -> NDArray[np.int64]:
-        """Reads when the messages were taken.
+        """Reads the times of the messages.
 
         Args:
             topic: topic of messages that begin with a header.
@@ -179,7 +179,7 @@ class Bag:
         return [each for each in self._reader.connections if each.topic == topic]
 
     def _find_places(self, topic: str) -> list[_Place]:
-        """All messages by the time of their headers."""
+        """Returns all messages in the order of the times of their headers."""
         places: list[_Place] = []
         with self._lock, _refusing(self.path):
             seen: dict[int, int] = {}
@@ -192,7 +192,7 @@ class Bag:
         return sorted(places)
 
     def _stamp(self, content: bytes) -> int:
-        """Time of the header in front of a message: after a number (ROS 1), or after the encoding (ROS 2)."""
+        """Reads the time of the header of a message: after a number (ROS 1), or after the encoding (ROS 2)."""
         start, order = (4, "big" if content[1] == 0 else "little") if self._reader.is2 else (4, "little")
         words = (content[start : start + 4], content[start + 4 : start + 8])
         seconds, nanoseconds = (int.from_bytes(word, order) for word in words)  # type: ignore[arg-type]

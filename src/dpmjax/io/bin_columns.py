@@ -15,11 +15,11 @@ from dpmjax.sequences import InputError, Note, require
 LAYOUTS = (3, 4, 5, 6)
 USUAL_COLUMNS = 4
 _NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
-# Values that are looked at, bins of their histogram, and values that each bin needs.
+# Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
 _MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
-# The information that the column gives about a value: the least of the best layout, bits, and its ratio to the next.
+# Mutual information of column and value: least value of the best layout, bits, and least ratio to the next layout.
 _LEAST_BITS, _LEAST_RATIO = 0.05, 1.3
-# Six columns repeat the order of three: they must tell more by this ratio.
+# Six columns repeat the order of three, so their information must be larger by this ratio.
 _SIX_RATIO = 1.1
 
 
@@ -27,8 +27,8 @@ class Columns(NamedTuple):
     """The layout of raw files.
 
     Attributes:
-        num_columns: numbers that each point has, x, y and z first.
-        note: how it was inferred, or None for the four columns of KITTI.
+        num_columns: number of values of each point, x, y and z first.
+        note: source of the layout, or None for the four columns of KITTI.
     """
 
     num_columns: int
@@ -38,9 +38,9 @@ class Columns(NamedTuple):
 def find_columns(path: Path, content: bytes) -> Columns:
     """Infers the columns of a raw file.
 
-    The right layout has values of one kind in each column, a wrong one mixes them: so the layout is taken under which
-    the column tells most about the value. `.pcd.bin` files, as those of nuScenes, have five columns unless the values
-    say otherwise.
+    The correct layout has values of one kind in each column, and a wrong one mixes them. So the layout with the largest
+    mutual information of column and value is taken. `.pcd.bin` files, as those of nuScenes, have five columns unless
+    the values contradict.
 
     Args:
         path: the file.
@@ -75,10 +75,10 @@ def check_size(path: str | Path, size: int, columns: int) -> None:
     Args:
         path: the file.
         size: its bytes.
-        columns: numbers of a point.
+        columns: number of values of a point.
 
     Raises:
-        InputError: it has no whole number of points.
+        InputError: the size is no whole number of points.
     """
     require(size % (4 * columns) == 0, path, *_no_whole_number(size, columns))
 
@@ -88,7 +88,7 @@ def read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
 
     Args:
         path: the file.
-        columns: numbers of a point; None infers it from the values.
+        columns: number of values of a point; None: inferred from the values.
 
     Returns:
         (n, 3).
@@ -131,7 +131,7 @@ def _no_whole_number(size: int, columns: int) -> tuple[str, str]:
 
 
 def _columns_by_values(values: NDArray[np.float32]) -> int | None:
-    """The layout under which the column tells most about the value; None where no layout stands out."""
+    """Finds the layout of the largest mutual information of column and value; None where no layout stands out."""
     values = values[:_MOST_VALUES]
     num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(LAYOUTS)))
     if num_bins < 4:
@@ -148,7 +148,7 @@ def _columns_by_values(values: NDArray[np.float32]) -> int | None:
 
 
 def _information_bits(bins: NDArray[np.int64], columns: int, num_bins: int) -> float:
-    """Mutual information of value and column, without the bias of few samples (Miller and Madow 1955)."""
+    """Computes the mutual information of value and column, corrected for few samples (Miller and Madow 1955)."""
     rows = bins[: len(bins) // columns * columns].reshape(-1, columns)
     counts = np.stack([np.bincount(column, minlength=num_bins) for column in rows.T]).astype(np.float64)
     joint = counts / counts.sum()

@@ -1,4 +1,4 @@
-"""CARMEN logs: planar scans of a front laser, the robot's odometry, and the poses that a SLAM program gave them.
+"""CARMEN logs: planar scans of a front laser, the robot's odometry, and poses by a SLAM program.
 
 A scan has two poses. A log as recorded has both at the places of its ODOM lines: they are the raw
 odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
@@ -38,7 +38,7 @@ class ScanLine(NamedTuple):
         angles: directions of the beams, radians, counter-clockwise from straight ahead.
         pose: x, y, theta of the laser.
         odometry: x, y, theta of the robot by its wheels.
-        time: when it was measured (ipc_timestamp); 0 where the line does not tell.
+        time: time of the measurement (ipc_timestamp); 0 where the line has none.
     """
 
     ranges: FloatArray
@@ -53,9 +53,9 @@ class CarmenLines(NamedTuple):
 
     Attributes:
         scans: scans in the order of the file.
-        is_newer: the scans are ROBOTLASER1 lines.
+        is_newer: True where the scans are ROBOTLASER1 lines.
         odometry: (m, 4) time, x, y, theta of the ODOM lines.
-        is_of_slam: there are NEFF lines, which the SLAM program GMapping writes: the poses are its own.
+        is_of_slam: True where there are NEFF lines of the SLAM program GMapping, so that the poses are its result.
     """
 
     scans: list[ScanLine]
@@ -94,7 +94,7 @@ def read_carmen_lines(path: str | Path) -> CarmenLines:
 
 
 def scan_angles(num_beams: int) -> FloatArray:
-    """Directions of the beams of a scan over 180 degrees, from right to left.
+    """Returns the directions of the beams of a scan over 180 degrees, from right to left.
 
     An odd number of beams (181, 361) includes both ends; an even one (180, 360) has the step 180 / n and leaves out the
     left end. Consecutive scans of real logs agree best this way.
@@ -136,7 +136,7 @@ def _parse_newer(words: list[str], source: str) -> ScanLine:
 
 
 def _parse_odometry(words: list[str]) -> list[float] | None:
-    """Time and pose; None for a damaged line, for the scans have the odometry that is needed."""
+    """Parses time and pose; None for a damaged line, because scans have odometry of their own."""
     try:
         values = [float(words[7]), *map(float, words[1:4])]
     except (ValueError, IndexError):
@@ -149,9 +149,9 @@ def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> 
     require(is_good, source, "NaN, infinite or huge values", "remove the line")
 
 
-_SHORTEST_SCALE_M = 7.9  # No laser of these logs has a shorter scale: a log that ends before has no code for "no echo".
+_SHORTEST_SCALE_M = 7.9  # Least range of the code for "no echo" of the lasers of these logs.
 _LONGEST_RANGE_M = 1e6
-# Poses of a log as recorded are those of its ODOM lines, within the way from one such line to the next.
+# Poses of a log as recorded are those of its ODOM lines, within the distance from one such line to the next.
 _SAME_PLACE_M = 0.5
 # Equal poses, metres and radians.
 _SAME_POSE = 1e-4

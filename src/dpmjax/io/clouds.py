@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dpmjax.io.files import unpack_rows
 
 PADDING = "_"
-"""Name of fields that hold no values, as the Point Cloud Library writes them."""
-# Columns in which lidar drivers and data sets write when a point was measured.
+"""Name of padding fields of the Point Cloud Library."""
+# Names of columns of point times of lidar drivers and data sets.
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "time_offset", "offset_time", "gps_time")
 
 
@@ -38,21 +38,21 @@ class CloudLayout(NamedTuple):
 
     @property
     def widths(self) -> list[int]:
-        """Numbers of each field."""
+        """Number of values of each field."""
         return [math.prod(self.layout[index].shape) for index in range(len(self.fields))]
 
     @property
     def wanted(self) -> list[int]:
-        """Places of the fields that hold values."""
+        """Indices of the fields with values."""
         return [i for i, width in enumerate(self.widths) if width > 0 and self.fields[i] != PADDING]
 
 
 class TimedCloud(NamedTuple):
-    """The points of a file, and when each was measured.
+    """Points of a file and their times.
 
     Attributes:
         points: (m, 3) float32 x, y, z in the file's unit; NaN where the file has it.
-        times: (m,) in the unit and from the start that the file has; None where it has no column of a known name.
+        times: (m,) in the unit and from the origin of the file; None without a column of a known name.
     """
 
     points: NDArray[np.float32]
@@ -91,7 +91,7 @@ def times_of(columns: dict[str, NDArray[np.generic]]) -> NDArray[np.float64] | N
 
 
 def find_time_field(names: Iterable[str]) -> str | None:
-    """Finds the field in which a driver writes when a point was measured.
+    """Finds the field of point times.
 
     Args:
         names: names of the fields.

@@ -63,7 +63,7 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
 
 
 def _list_files(path: Path) -> dict[str, bytes]:
-    """The PCD and MAT files by name; archives are read in memory and never unpacked."""
+    """Reads the PCD and MAT files by name; archives are read in memory and never unpacked."""
     if path.is_dir():
         chosen = [file for file in path.iterdir() if file.suffix.lower() in _SUFFIXES]
         return {file.name: read_bytes(file) for file in chosen if file.is_file()}
@@ -77,7 +77,7 @@ def _list_files(path: Path) -> dict[str, bytes]:
 
 
 def _read_poses(content: bytes, source: str, num_scans: int) -> FloatArray:
-    """The (n, 3) array `pose` of a MATLAB file."""
+    """Reads the (n, 3) array `pose` of a MATLAB file."""
     variables = parse_mat(content, source)
     found = f"variables are {', '.join(variables) or 'none'}"
     require("pose" in variables, source, found, "the file needs a variable 'pose'")

@@ -67,8 +67,7 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
 def read_active_vision(
     path: str | Path, num_views: int = 16, *, seed: int = 0, height: int = 27, width: int = 48, max_depth_m: float = 7.0
 ) -> DepthSequence:
-    """Reads one random trajectory through a scene (DeepMapping section 4.2); every second step is a move, every other
-    one a turn.
+    """Reads one random trajectory through a scene (DeepMapping section 4.2), with moves and turns in alternation.
 
     Args:
         path: folder of the scene.
@@ -116,18 +115,18 @@ def is_active_vision(path: Path) -> bool:
 def back_project(
     depth_m: NDArray[np.floating], camera: Camera, *, height: int, width: int, max_depth_m: float
 ) -> tuple[NDArray[np.float32], BoolArray]:
-    """An organised cloud out of a depth image, thinned to `height` x `width` of its pixels.
+    """Makes an organised cloud from a depth image, thinned to `height` x `width` of its pixels.
 
     Args:
-        depth_m: (rows, columns) depth along z, metres; zero, negative or not finite: nothing measured.
-        camera: that took it; its size is that of the image.
+        depth_m: (rows, columns) depth along z, metres; zero, negative or not finite: invalid.
+        camera: camera of the image, with the size of the image.
         height: rows of the cloud.
         width: columns of the cloud.
         max_depth_m: deeper pixels are masked.
 
     Returns:
         points: (height, width, 3) in the camera frame, zero where masked.
-        mask: (height, width) True where something was measured.
+        mask: (height, width) True for valid pixels.
 
     Raises:
         ValueError: the image has another size than the camera, or is smaller than the cloud.
@@ -146,7 +145,7 @@ def back_project(
 def _read_clouds(
     images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
 ) -> tuple[NDArray[np.float32], BoolArray]:
-    """Points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres."""
+    """Reads points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres."""
     clouds = []
     for image in images:
         depth_mm = read_depth_png(image)
@@ -165,7 +164,7 @@ def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
 
 
 def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float]) -> Camera:
-    """The camera of fx, fy, cx, cy."""
+    """Makes the camera of fx, fy, cx, cy."""
     values = [float(value) for value in intrinsics]
     if min(values[:2]) < 0.0:
         axis = "x" if values[0] < 0.0 else "y"
@@ -176,7 +175,7 @@ def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float
 
 
 def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
-    """Names of the images; where no move is known, a turn is taken, and the reverse."""
+    """Draws the names of the images of a walk; a turn replaces an unavailable move, and the reverse."""
     is_known = set(known)
 
     def reachable(name: str, kinds: tuple[str, ...]) -> list[str]:
@@ -194,7 +193,7 @@ def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.rando
 
 
 def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
-    """T_world_camera of every image that the reconstruction has placed, metres."""
+    """Reads T_world_camera of every image with a pose of the reconstruction, metres."""
     poses = {}
     variables = parse_mat(read_bytes(path), path)
     found, advice = "not the dataset's pose file ({kind})", "copy image_structs.mat of the scene"
@@ -216,7 +215,7 @@ def _read_links(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _read_colmap_camera(path: Path) -> Camera:
-    """Size and pinhole part of a COLMAP camera; the dataset's usual one where the file is missing."""
+    """Reads size and pinhole part of a COLMAP camera; the dataset's usual one where the file is missing."""
     if not path.is_file():
         return ACTIVE_VISION
     for line in read_lines(path):

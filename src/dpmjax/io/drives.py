@@ -1,4 +1,4 @@
-"""The files of a drive of 3-D scans with their poses and times; plain folders; reading on."""
+"""Files of a drive of 3-D scans with poses and times, plain folders, and iteration over scans."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
     """Lists the scans of a folder in the order of their numbers: the files of the most frequent ending.
 
     Args:
-        folder: where to look, not deeper.
+        folder: searched folder, without its subfolders.
         suffixes: endings of scans.
 
     Returns:
@@ -60,7 +60,7 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
 
 
 def stray_note(folder: Path) -> Note | None:
-    """Names the files of a folder that are no scans although they have the ending of scans, such as map.pcd.
+    """Lists the files of a folder that have the ending of scans but are no scans, such as map.pcd.
 
     Args:
         folder: folder of the scans.
@@ -76,7 +76,7 @@ def stray_note(folder: Path) -> Note | None:
 
 
 def _of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The files of the most frequent ending, unsorted."""
+    """Returns the files of the most frequent ending, unsorted."""
     if not folder.is_dir():
         return []
     files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in POSE_FILES]
@@ -87,7 +87,7 @@ def find_pose_file(*homes: Path) -> Path | None:
     """Finds a file of reference poses by the usual names.
 
     Args:
-        *homes: folders where it may lie.
+        *homes: searched folders.
 
     Returns:
         The first one; None where there is none.
@@ -96,7 +96,7 @@ def find_pose_file(*homes: Path) -> Path | None:
 
 
 def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
-    """A folder of scans in the order of their numbers, with a pose file and times.txt beside or above them.
+    """Lists a folder of scans in the order of their numbers, with a pose file and times.txt beside or above them.
 
     Args:
         folder: the scans.
@@ -125,7 +125,7 @@ def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
 
 
 def read_learned_folder(folder: Path) -> Drive3D:
-    """Folders of N.npz with lidar_pcd, ego_rotation and ego_translation (as DeepPointMap's published data).
+    """Lists a folder of N.npz with lidar_pcd, ego_rotation and ego_translation (DeepPointMap's published data).
 
     Args:
         folder: the agent's folder that holds the files.
@@ -143,7 +143,7 @@ def read_learned_folder(folder: Path) -> Drive3D:
     for file in files:
         try:
             table = load_arrays(file, keys)
-        except InputError:  # The scan is bad too, and is named when it is read.
+        except InputError:  # The scan is damaged, too, and a warning names it when it is read.
             poses.append(poses[-1] if poses else None)
             continue
         parts = [table.get(key, np.zeros(0)) for key in keys]
@@ -189,16 +189,16 @@ class IndexedScan(NamedTuple):
 
 
 def iterate_scans(sequence: LidarSequence) -> Iterator[IndexedScan]:
-    """Reads scan after scan and leaves out the bad ones; a warning names them at the end.
+    """Reads scan after scan and leaves out damaged ones; a warning names them at the end.
 
     Args:
         sequence: the scans.
 
     Yields:
-        The good scans with their numbers.
+        The readable scans with their numbers.
 
     Raises:
-        InputError: not one scan is good.
+        InputError: no scan is readable.
     """
     bad: list[str] = []
     for index, source in enumerate(sequence.sources):

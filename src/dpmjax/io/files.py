@@ -1,4 +1,4 @@
-"""Files as a whole: read with one-line errors, written completely or not at all, sorted by their numbers."""
+"""Whole files: read with one-line errors, written completely or not at all, sorted by their numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LARGEST_COMPRESSION = 1100
 
 @contextmanager
 def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exception], ...]) -> Iterator[None]:
-    """Turns errors of a parser into an `InputError`.
+    """Converts errors of a parser to an `InputError`.
 
     Args:
         source: see `InputError`.
@@ -60,7 +60,7 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
         The path.
 
     Raises:
-        BaseException: what stopped the writing, such as an OSError; an existing file is then untouched.
+        BaseException: error of the writing, such as an OSError; an existing file is then unchanged.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -78,14 +78,14 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
 
 
 def _umask() -> int:
-    """The process's umask, which can only be read by setting it."""
+    """Returns the umask of the process, which can only be read by setting it."""
     mask = os.umask(0)
     os.umask(mask)
     return mask
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key under which scan_2 comes before scan_10.
+    """Returns a sort key under which scan_2 comes before scan_10.
 
     Args:
         name: a file name or path.
@@ -235,13 +235,13 @@ def split_rows(body: bytes, width: int, count: int, source: str | Path, *, num_l
 
 
 def to_float32(values: ArrayLike) -> NDArray[np.float32]:
-    """The values as float32; those beyond its range become infinite, without a warning."""
+    """Converts values to float32; values beyond its range become infinite, without a warning."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(values).astype(np.float32)
 
 
 def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str, NDArray[np.generic]]:
-    """Reads a NumPy file; never allocates more than the file can hold, whatever its header says.
+    """Reads a NumPy file; never allocates more than the size of the file allows.
 
     Args:
         path: `.npy` or `.npz`; the first bytes decide.
@@ -267,14 +267,14 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """The bytes of a member; a ValueError where it claims more than its packed size can hold."""
+    """Unpacks a member; raises a ValueError where its stated size exceeds the limit of its packed size."""
     if member.file_size > LARGEST_COMPRESSION * (member.compress_size + 64):
         raise ValueError(f"{member.filename} claims {member.file_size} bytes, packed into {member.compress_size}")
     return archive.read(member)
 
 
 def _parse_npy(content: bytes) -> NDArray[np.generic]:
-    """The array of the bytes of an `.npy`."""
+    """Parses the bytes of an `.npy`."""
     stream = io.BytesIO(content)
     version = npy_format.read_magic(stream)
     read_header = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0

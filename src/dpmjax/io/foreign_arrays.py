@@ -44,7 +44,7 @@ def parse_mat(content: bytes, source: str | Path) -> dict[str, Any]:
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Type and content of each data element, unpacked; a ValueError where one is longer than what holds it."""
+    """Yields type and content of each data element, unpacked; raises a ValueError where one exceeds its container."""
     while len(data):
         kind, size = struct.unpack(f"{order}II", data[:8])
         start, end = 8, 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
@@ -61,7 +61,7 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _parse_matrix(data: bytes, order: str) -> tuple[str, Any]:
-    """Name and value of a matrix element."""
+    """Parses name and value of a matrix element."""
     if not data:
         return "", np.zeros(0)
     (_, flags), (_, size), (_, name), *parts = _elements(data, order)
@@ -116,7 +116,7 @@ def read_depth_png(path: str | Path) -> NDArray[np.int64]:
 
 
 def _read_png(path: str | Path) -> tuple[FloatArray, int]:
-    """The picture with values in [0, 1], and the bits of a channel."""
+    """Reads the picture with values in [0, 1], and the number of bits of a channel."""
     from matplotlib.image import imread
 
     content = read_bytes(path)

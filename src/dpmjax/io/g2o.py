@@ -73,7 +73,7 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
-    """Writes a pose graph, with all digits, so that it is read again as it was.
+    """Writes a pose graph with all digits, so that reading it gives the same graph.
 
     Args:
         path: file to write, atomically; missing folders are made.
@@ -98,7 +98,7 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
 
 
 def _read_lines(path: str | Path) -> tuple[list[_Line], list[str]]:
-    """Vertices and edges in the order of the file, and the nodes after FIX."""
+    """Reads vertices and edges in the order of the file, and the nodes after FIX."""
     lines: list[_Line] = []
     fixed: list[str] = []
     for number, text in enumerate(read_lines(path), 1):
@@ -119,7 +119,7 @@ def _read_lines(path: str | Path) -> tuple[list[_Line], list[str]]:
 
 
 def _parse(source: str, number: int, words: list[str]) -> _Line:
-    """A vertex or an edge out of its words."""
+    """Parses a vertex or an edge from its words."""
     tag = TAGS[words[0]]
     count = tag.num_nodes + tag.num_values
     found = f"{len(words) - 1} values after {words[0]}"
@@ -150,7 +150,7 @@ def _is_number(kind: type[int | float], word: str) -> bool:
 
 
 def _rows_of(path: str | Path, lines: list[_Line], row_of: dict[int, int], end: int) -> NDArray[np.int64]:
-    """Rows of the first or the second node of each edge."""
+    """Returns the rows of the first or the second node of each edge."""
     for line in lines:
         is_known = line.nodes[end] in row_of
         require(is_known, f"{path}: line {line.number}", f"node {line.nodes[end]} has no vertex", "add its VERTEX line")
@@ -158,14 +158,14 @@ def _rows_of(path: str | Path, lines: list[_Line], row_of: dict[int, int], end: 
 
 
 def _by_tag(lines: list[_Line]) -> Iterable[tuple[str, list[int], FloatArray]]:
-    """Numbers of the lines of each tag, with their places among all lines."""
+    """Yields the numbers of the lines of each tag, with their indices among all lines."""
     for tag in dict.fromkeys(line.tag for line in lines):
         places = [place for place, line in enumerate(lines) if line.tag == tag]
         yield tag, places, np.array([lines[place].values for place in places]).reshape(len(places), -1)
 
 
 def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
-    """Poses of vertices or edges, in the order of the file."""
+    """Returns the poses of vertices or edges, in the order of the file."""
     poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
     for tag, places, values in _by_tag(lines):
         numbers = values[:, : TAGS[tag].pose_size]
@@ -186,7 +186,7 @@ def _is_pose(numbers: FloatArray) -> bool:
 
 
 def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray:
-    """Information matrices in the order of the file."""
+    """Returns the information matrices in the order of the file."""
     matrices = np.zeros((len(lines), size, size))
     for tag, places, values in _by_tag(lines):
         matrices[places] = information_of(TAGS[tag], values[:, TAGS[tag].pose_size :])
@@ -208,7 +208,7 @@ def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: b
 
 
 def _numbers(poses: FloatArray) -> FloatArray:
-    """Numbers of the file from poses of the graph."""
+    """Converts poses of the graph to numbers of the file."""
     if poses.ndim == 2 or not len(poses):
         return poses if poses.ndim == 2 else np.zeros((0, 7))
     return np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])

@@ -27,7 +27,7 @@ class Tag(NamedTuple):
 
     @property
     def num_values(self) -> int:
-        """Numbers after the nodes."""
+        """Number of values after the nodes."""
         return self.pose_size + len(self.triangle[0])
 
     @property
@@ -53,7 +53,7 @@ TAGS = {
     "EDGE2": Tag(2, 3, _TORO_TRIANGLE),
     "EDGE3": Tag(2, 6, _upper(6)),
 }
-"""What is read: the first four are lines of g2o, the others of TORO; an edge `a b` holds `T_a_b` in all of them."""
+"""Supported tags: the first four are of g2o, the others of TORO; an edge `a b` has `T_a_b` in all of them."""
 # EQUIV marks nodes that TORO may collapse on request; their edges stand in the file, too.
 IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET", "EQUIV")
 _READ = "give VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO)"
@@ -74,7 +74,7 @@ _KINDS: tuple[tuple[Callable[[str], bool], str], ...] = (
 
 
 def advice_of(tag: str) -> str:
-    """Returns what to do about a line of another tag."""
+    """Returns the advice for a line of an unsupported tag."""
     return next((advice for is_kind, advice in _KINDS if is_kind(tag)), _READ)
 
 

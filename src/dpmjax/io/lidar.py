@@ -1,4 +1,4 @@
-"""The entrance for drives of 3-D scans: folders of any known layout and bags of ROS, opened to be read lazily."""
+"""Drives of 3-D scans: folders of any known layout and bags of ROS, opened for lazy reading."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ def open_lidar_sequence(
     bin_columns: int | None = None,
     topic: str | None = None,
 ) -> LidarSequence:
-    """Opens a drive of 3-D scans, whatever of the known layouts it is in; scans are read when they are wanted.
+    """Opens a drive of 3-D scans in any of the known layouts; scans are read on demand.
 
     The notes of the sequence hold the decisions about the files; doubts are logged as warnings.
 
     Args:
         path: the folder of a drive, the root of a data set that holds several, or a bag of ROS.
-        sequence: which drive of a root, like "00"; may be left out where there is only one.
+        sequence: name of a drive of a root, like "00"; None: the only one.
         poses: a pose file in the lidar's frame (KITTI or TUM rows, `.npy`) instead of the data set's own.
         selection: start, stop and stride in scans.
-        bin_columns: numbers a point has in `.bin` files; None infers it from the first one.
-        topic: topic of a bag: which clouds; may be left out where there is one topic of clouds.
+        bin_columns: number of values of a point in `.bin` files; None: inferred from the first file.
+        topic: topic of clouds of a bag; None: the only one.
 
     Returns:
         The sequence, with poses in the lidar's frame and times where the source has them.
@@ -77,7 +77,7 @@ def open_lidar_sequence(
 
 
 def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
-    """The scans of one drive in files."""
+    """Opens one drive in files."""
     drive = _read(path, poses)
     require(len(drive.files) > 0, path, "a folder without scans", f"give {_FORMATS}")
     notes: list[Note | None] = [stray_note(drive.files[0].parent), *drive.notes]
@@ -98,7 +98,7 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
-    """The clouds of a bag, with poses of a file, or of one of the usual names beside the bag that has their times."""
+    """Opens the clouds of a bag, with poses of a given file or of one with a usual name and matching times."""
     sequence = open_lidar_bag(path, topic)
     beside = find_pose_file(path if path.is_dir() else path.resolve().parent) if poses is None else poses
     if beside is None:
@@ -114,11 +114,11 @@ def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequenc
 
 
 def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = None) -> None:
-    """Refuses a drive with a file that is missing or cut off, as far as its length shows it.
+    """Refuses a drive with a file that is missing, or truncated by its length.
 
     Args:
         sequence: the drive.
-        bin_columns: numbers a point has in `.bin` files; None infers it from the first one.
+        bin_columns: number of values of a point in `.bin` files; None: inferred from the first file.
 
     Raises:
         InputError: names the first such file.
@@ -134,7 +134,7 @@ def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = No
 
 
 def list_lidar_sequences(path: str | Path) -> list[str]:
-    """The drives below the root of a data set.
+    """Lists the drives below the root of a data set.
 
     Args:
         path: a folder with sequences/NN, data_3d_raw/DRIVE, scene/agent/N.npz, or drives right in it.
@@ -147,7 +147,7 @@ def list_lidar_sequences(path: str | Path) -> list[str]:
 
 
 def _read_scan(files: list[Path], bin_columns: int, index: int) -> NDArray[np.float32]:
-    """Scan `index`; the first one stands for all in the warning of a wrong unit."""
+    """Reads scan `index`; only the first one is checked for a wrong unit."""
     points = read_points(files[index], bin_columns=bin_columns)
     if index == 0 and (note := unit_note(points, files[index])) is not None:
         log_notes([note])
@@ -155,7 +155,7 @@ def _read_scan(files: list[Path], bin_columns: int, index: int) -> NDArray[np.fl
 
 
 def _choose(path: Path, sequence: str | None) -> Path:
-    """The folder of the drive that is meant."""
+    """Returns the folder of the selected drive."""
     require(path.exists(), path, "no such file or folder", "check the path")
     capture = _CAPTURES.get(path.suffix.lower())
     converter = "convert it to a bag or to .pcd files with ouster-cli (Ouster) or velodyne-decoder (Velodyne)"
@@ -179,7 +179,7 @@ def _choose(path: Path, sequence: str | None) -> Path:
 
 
 def _drives(path: Path) -> dict[str, Path]:
-    """Drives below a root, by name: two levels at most."""
+    """Finds the drives up to two levels below a root, by name."""
     for below in ("sequences", "dataset/sequences", "data_3d_raw"):
         if (path / below).is_dir():
             return _drives(path / below)
@@ -189,7 +189,7 @@ def _drives(path: Path) -> dict[str, Path]:
     return found or {f"{folder.parent.name}/{folder.name}": folder for folder in deeper if _kind(folder) is not None}
 
 
-# How a kind of drive is read, and which of its folders holds the scans.
+# Reader of each kind of drive, and its folder of scans.
 _LAYOUTS: dict[str, tuple[Callable[[Path], Drive3D], str]] = {
     "kitti_carla": (read_kitti_carla, "generated/frames"),
     "mulran": (read_mulran, "Ouster"),
@@ -203,7 +203,7 @@ _LAYOUTS: dict[str, tuple[Callable[[Path], Drive3D], str]] = {
 
 
 def _read_plain(path: Path, scans: str, poses: Path | None) -> Drive3D:
-    """A plain folder of scans below that of the drive."""
+    """Lists a plain folder of scans below that of the drive."""
     return read_plain_folder(path / scans, poses=poses)._replace(name=path.resolve().name)
 
 
@@ -223,7 +223,7 @@ def _kind(path: Path) -> str | None:
 
 
 def _read(path: Path, poses: Path | None) -> Drive3D:
-    """The drive in a folder; a given pose file replaces that of the data set."""
+    """Lists the drive in a folder; a given pose file replaces that of the data set."""
     kind = _kind(path) or "plain"
     read, scans = _LAYOUTS[kind]
     return read(path) if poses is None else _read_plain(path, scans, poses)

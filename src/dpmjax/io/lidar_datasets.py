@@ -1,4 +1,4 @@
-"""Drives of the data sets as they lie on disk: KITTI odometry, KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
+"""Drives of data sets in their published layouts: KITTI odometry, KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
 
 
 def read_kitti_raw(folder: Path) -> Drive3D:
-    """KITTI raw: velodyne_points/data, oxts/data, and calib_imu_to_velo.txt in the folder of the day.
+    """Lists a drive of KITTI raw: velodyne_points/data, oxts/data, and calib_imu_to_velo.txt in the folder of the day.
 
     Args:
         folder: DAY_drive_NNNN_sync.
@@ -85,10 +85,10 @@ def read_kitti_raw(folder: Path) -> Drive3D:
 
 
 def read_kitti_360(folder: Path) -> Drive3D:
-    """KITTI-360: data_3d_raw/DRIVE/velodyne_points/data, data_poses/DRIVE/poses.txt and calibration/.
+    """Lists a drive of KITTI-360: data_3d_raw/DRIVE/velodyne_points/data, data_poses/DRIVE/poses.txt, calibration/.
 
-    The car has no pose where it stands: such scans are interpolated; scans before the first and after the last pose are
-    left out.
+    The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
+    after the last pose are left out.
 
     Args:
         folder: the drive's folder in data_3d_raw.
@@ -118,13 +118,14 @@ def read_kitti_360(folder: Path) -> Drive3D:
 
 
 def read_kitti_carla(folder: Path) -> Drive3D:
-    """KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt (12 numbers and a time).
+    """Lists a drive of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
 
     Args:
         folder: TownNN, or its generated/.
 
     Returns:
-        The drive. Frame i has pose 100 i. Frames keep the motion of the car during a turn.
+        The drive. Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the
+        motion of the car during a turn.
 
     Raises:
         InputError: broken files, or fewer poses than frames.
@@ -143,7 +144,7 @@ def read_kitti_carla(folder: Path) -> Drive3D:
 
 
 def read_mulran(folder: Path) -> Drive3D:
-    """MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
+    """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
     Args:
         folder: the folder that holds Ouster/ or sensor_data/Ouster/.
@@ -176,7 +177,7 @@ def read_mulran(folder: Path) -> Drive3D:
 def _interpolate(
     drive: Drive3D, wanted: FloatArray, times: FloatArray, poses: FloatArray, path: Path, *, slack: float = 0.0
 ) -> Drive3D:
-    """The scans less than `slack` beyond the times of the poses, with interpolated poses from the first on."""
+    """Selects the scans within `slack` of the times of the poses, with interpolated poses relative to the first."""
     times, first = np.unique(times, return_index=True)
     kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
     require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
@@ -194,14 +195,14 @@ def _require_numbers(files: list[Path]) -> list[int]:
 
 
 def _first_row(path: Path, width: int) -> FloatArray:
-    """(1, width) first numbers of a file."""
+    """Reads the first numbers (1, width) of a file."""
     rows = read_table(path)
     require(rows.shape[1] >= width, path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
     return rows[:1, :width]
 
 
 def _read_rows(path: Path, layout: str) -> FloatArray:
-    """(n, 13) numbers of a pose file, all finite."""
+    """Reads the finite numbers (n, 13) of a pose file."""
     rows = read_table(path)
     is_good = rows.shape[1] == 13 and np.isfinite(rows).all()
     require(is_good, path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
@@ -209,7 +210,7 @@ def _read_rows(path: Path, layout: str) -> FloatArray:
 
 
 def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
-    """KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337) as seconds from the first; None if it does not fit."""
+    """Reads KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337), s from the first; None if it does not fit."""
     try:
         lines = [line.strip() for line in read_lines(path) if line.strip()]
         if not all(re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", line) for line in lines):
@@ -222,7 +223,7 @@ def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
 
 
 def _read_imu_calibration(path: Path) -> FloatArray:
-    """(4, 4) out of KITTI raw's `R:` and `T:` lines."""
+    """Reads a matrix (4, 4) from KITTI raw's `R:` and `T:` lines."""
     entries = read_labelled_numbers(path)
     turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
     is_good = len(turn) == 9 and len(shift) == 3
@@ -231,7 +232,7 @@ def _read_imu_calibration(path: Path) -> FloatArray:
 
 
 def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
-    """GPS/IMU records as poses, by the Mercator projection (Geiger et al. 2013, section III).
+    """Converts GPS/IMU records to poses by the Mercator projection (Geiger et al. 2013, section III).
 
     Args:
         records: (n, 6) latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians).

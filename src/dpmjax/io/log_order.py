@@ -1,8 +1,8 @@
 """The order of the lines of a log by their time stamps.
 
-Some published logs have lines with the scan, time stamp and odometry of another moment, while their corrected poses are
-in order. There the time stamps are out of order, and the odometry jumps by metres and back. These scans are put where
-they belong by their time.
+Some published logs have lines with the scan, time stamp and odometry of another time, while their corrected poses are
+in order. There the time stamps are out of order, and the odometry jumps by metres and back. These scans are sorted by
+time.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from dpmjax.geometry import se2
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence
 
 _log = logging.getLogger(__name__)
-# A line is moved where its time stamp puts it if that shortens the detour of its odometry to this share.
+# A line is moved to the position of its time stamp if that shortens the detour of its odometry to this share.
 _SHORTER_WAY = 0.5
 
 
 def in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
-    """Puts scans of another moment where their time belongs.
+    """Moves scans of another time to the positions of their time stamps.
 
     Args:
         sequence: scans in the order of the lines, with their time stamps.
@@ -61,7 +61,7 @@ def in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
 
 
 def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArray[np.int64]) -> FloatArray:
-    """Returns odometry that is interpolated between the ordered lines wherever it is not known."""
+    """Interpolates unknown odometry between the ordered lines."""
     pose = odometry[ordered].copy()
     pose[:, 2] = np.unwrap(pose[:, 2])
     between = np.column_stack([np.interp(np.arange(len(odometry)), ordered, column) for column in pose.T])
@@ -71,7 +71,7 @@ def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArr
 
 
 def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.int64], keys: FloatArray) -> FloatArray:
-    """Returns how much longer the way of the ordered lines becomes with each late one, where these keys put it."""
+    """Computes the increase of the path length by each late line, inserted at the position of its key."""
     after = np.searchsorted(keys[ordered], keys[late])
     before, after = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
 
@@ -83,7 +83,7 @@ def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.
 
 
 def _carry_reference(sequence: ScanSequence, moved: BoolArray) -> ScanSequence:
-    """Moves the reference on by the odometry to the scans that were moved: theirs is that of the line, not the scan."""
+    """Computes the reference of moved scans from the reference before and the odometry."""
     reference, odometry = sequence.reference_poses, sequence.odometry_poses
     if reference is None or odometry is None or not moved.any():
         return sequence
@@ -95,7 +95,7 @@ def _carry_reference(sequence: ScanSequence, moved: BoolArray) -> ScanSequence:
 
 
 def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
-    """Indices of the longest subsequence that strictly increases (patience sorting)."""
+    """Finds the indices of the longest strictly increasing subsequence (patience sorting)."""
     tails: list[float] = []
     ends: list[int] = []
     before = np.full(len(values), -1)

@@ -35,7 +35,7 @@ def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
         The module.
 
     Raises:
-        InputError: it cannot be imported.
+        InputError: the module cannot be imported.
     """
     try:
         return importlib.import_module(module)

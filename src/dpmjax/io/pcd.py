@@ -14,7 +14,7 @@ from dpmjax.io.files import refusing, split_rows, to_float32, write_atomically
 from dpmjax.sequences import InputError, require
 
 MOST_EXPANSION = 88
-"""Three packed bytes unpack to 264 at most."""
+"""Largest ratio of unpacked to packed size: three packed bytes unpack to up to 264."""
 
 
 def unpack_lzf(packed: bytes, size: int) -> bytes:
@@ -151,7 +151,7 @@ def _parse_header(content: bytes, source: str) -> CloudLayout:
 
 
 def _aligned(layout: np.dtype[np.void], fields: list[str]) -> np.dtype[np.void]:
-    """The layout with the padding that was meant, where fields are aligned under it and not under the header's."""
+    """Returns the layout with corrected padding, where fields are aligned under it and not under the header's."""
     # The Point Cloud Library counts the padding before a field as if the field before the padding had its size.
     names = [f"{i}" for i in range(len(fields))]
     kinds, starts = [layout[name] for name in names], [layout.fields[name][1] for name in names]  # type: ignore[index]
@@ -180,7 +180,7 @@ def _aligned(layout: np.dtype[np.void], fields: list[str]) -> np.dtype[np.void]:
 
 
 def _ascii_columns(body: bytes, header: CloudLayout, source: str) -> dict[str, NDArray[np.generic]]:
-    """The first number of each field; rows may have numbers for the padding, or leave it out."""
+    """Parses the first number of each field; rows may have numbers for the padding, or leave it out."""
     first = next((line.split() for line in body.split(b"\n") if line.strip()), [])
     is_padded = len(first) == sum(header.widths) or PADDING not in header.fields
     places = range(len(header.fields)) if is_padded else header.wanted
@@ -200,7 +200,7 @@ def _ascii_columns(body: bytes, header: CloudLayout, source: str) -> dict[str, N
 
 
 def _rows_with_characters(body: bytes, header: CloudLayout, places: list[int]) -> dict[str, NDArray[np.generic]] | None:
-    """The fields of more than one byte, of rows whose other fields are characters; None where the rows are others."""
+    """Parses the fields of more than one byte, of rows whose other fields are characters; None for other rows."""
     if sum(header.widths) > _MOST_COLUMNS:
         return None
     is_number = [header.layout[place].base.itemsize > 1 for place in places for _ in range(header.widths[place])]
@@ -223,7 +223,7 @@ def _rows_with_characters(body: bytes, header: CloudLayout, places: list[int]) -
 
 
 def _compressed_columns(body: bytes, header: CloudLayout, source: str) -> dict[str, NDArray[np.generic]]:
-    """The first number of each field out of compressed columns; the padding is there, or is left out."""
+    """Reads the first number of each field from compressed columns, with or without the padding."""
     require(len(body) >= 8, source, "truncated: no sizes of the compressed body", "copy the file again")
     packed_size, size = np.frombuffer(body, "<u4", 2).tolist()
     found = f"truncated: the compressed body has {packed_size} bytes, {len(body) - 8} are there"

@@ -24,7 +24,7 @@ _LARGEST_TILT_DEG = 10.0
 
 
 def read_poses(path: str | Path) -> FloatArray:
-    """Reads poses as they stand in the file, whatever frame they are in.
+    """Reads poses in the frame of the file.
 
     Args:
         path: text with rows of x y theta, TUM or KITTI; or `.npy` of (n, 3), (n, 3, 3), (n, 4, 4) or (n, 12).
@@ -43,7 +43,7 @@ class StampedPoses(NamedTuple):
 
     Attributes:
         poses: (n, 4, 4).
-        stamps: (n,) as they stand in the file, in any unit; None where it has none.
+        stamps: (n,) in the unit of the file; None where it has none.
     """
 
     poses: FloatArray
@@ -51,13 +51,13 @@ class StampedPoses(NamedTuple):
 
 
 def read_stamped_poses(path: str | Path) -> StampedPoses:
-    """Reads poses and, out of TUM files, their time stamps.
+    """Reads poses, and the time stamps of TUM files.
 
     Args:
         path: see `read_poses`.
 
     Returns:
-        The poses, in whatever frame they are.
+        The poses, in the frame of the file.
 
     Raises:
         InputError: see `read_poses`.
@@ -71,7 +71,7 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
 
     Args:
         path: see `read_poses`.
-        num_scans: how many poses there must be.
+        num_scans: required number of poses.
         unit: unit of the scans; a text file whose comment names a different unit is refused.
 
     Returns:
@@ -107,9 +107,9 @@ def write_tum(
     Args:
         path: file to write, atomically.
         poses: (n, 3) x, y, heading, or (n, 4, 4).
-        times: (n,) seconds; the number of the scan where None.
+        times: (n,) seconds; None: the number of the scan.
         unit: unit of the translations, for the comment.
-        frame: the transform that the poses are, for the comment.
+        frame: name of the transform, for the comment.
 
     Returns:
         The path.
@@ -127,7 +127,7 @@ def write_tum(
 
 
 def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
-    """Writes 12 numbers a row: the first three rows of `T_world_scan`, row-major; no header, as its readers know none.
+    """Writes 12 numbers for each pose, the first three rows of `T_world_scan`, row-major, without a header.
 
     Args:
         path: file to write, atomically.
@@ -162,7 +162,7 @@ def write_poses_npy(path: str | Path, poses: ArrayLike) -> Path:
 
 
 def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
-    """Homogeneous matrices of their parts.
+    """Builds homogeneous matrices.
 
     Args:
         rotations: (..., 3, 3).
@@ -177,7 +177,7 @@ def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
 
 
 def planar_to_homogeneous(poses: FloatArray) -> FloatArray:
-    """Puts planar poses into space.
+    """Converts planar poses to homogeneous matrices in space.
 
     Args:
         poses: (n, 3) x, y, heading in radians.
@@ -191,7 +191,7 @@ def planar_to_homogeneous(poses: FloatArray) -> FloatArray:
 
 
 def from_rows(rows: FloatArray, source: str | Path) -> FloatArray:
-    """Checked matrices of KITTI rows.
+    """Converts KITTI rows to checked matrices.
 
     Args:
         rows: (n, 12) or (12,), the first three rows of each matrix, row-major.
@@ -235,12 +235,12 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
 
 
 def interpolate_poses(times: FloatArray, poses: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Poses at other times: positions linear, rotations on the shortest arc.
+    """Interpolates poses: positions linearly, rotations on the shortest arc.
 
     Args:
         times: (n,) increasing.
         poses: (n, 4, 4).
-        wanted: (m,) times; beyond the ends, the first and the last pose are held.
+        wanted: (m,) times; beyond the ends, the first or the last pose.
 
     Returns:
         (m, 4, 4).
@@ -261,7 +261,7 @@ def _write_table(path: str | Path, values: FloatArray, form: str | list[str], he
 
 
 def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
-    """Checked poses of a file, planar (n, 3), or (n, 4, 4); and the stamps of TUM's rows."""
+    """Reads checked poses of a file, planar (n, 3) or (n, 4, 4), and the stamps of TUM's rows."""
     if path.suffix.lower() == ".npy":
         array = load_arrays(path).get("points", np.zeros(0))
         require(array.dtype.kind in "fiu", path, f"an array of {array.dtype}", f"give {_LAYOUTS}")
@@ -290,14 +290,14 @@ def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
 
 
 def _to_quaternions(rotations: FloatArray) -> FloatArray:
-    """(n, 4) x y z w with w >= 0."""
+    """Converts rotations to quaternions (n, 4) x y z w with w >= 0."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
 def _as_matrices(poses: ArrayLike) -> FloatArray:
-    """(n, 4, 4) out of (n, 3) or (n, 4, 4)."""
+    """Converts (n, 3) or (n, 4, 4) to (n, 4, 4)."""
     values = np.asarray(poses, np.float64)
     if not (values.ndim == 2 and values.shape[1] == 3) and values.shape[1:] != (4, 4):
         raise ValueError(f"poses must be (n, 3) or (n, 4, 4), got {values.shape}")

@@ -14,13 +14,13 @@ from dpmjax.io.poses import StampedPoses, interpolate_poses
 from dpmjax.io.scan_names import stamps_in_names, stem_of
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, require
 
-# The pose nearest in time may be this far from the scan: half the step of the poses, and never more than this, s.
+# Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.
 _LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
 # Stamps since 1970 and steps of stamps from 0, of which these are the smallest, in nano-, micro- and milliseconds.
 _UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
 # Nanoseconds since 1970 are below this for three thousand years.
 _LARGEST_STAMP = 1e20
-# A lidar moves along its x axis, a camera along its z axis: share of the squared way, and the shortest way, m.
+# A lidar moves along its x axis, a camera along its z axis: least share of the squared distance, and least distance, m.
 _CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
 
 
@@ -29,7 +29,7 @@ class Reference(NamedTuple):
 
     Attributes:
         T_world_lidar: (n, 4, 4); NaN for scans without one.
-        notes: how they were matched.
+        notes: method of the matching.
     """
 
     T_world_lidar: FloatArray
@@ -37,11 +37,11 @@ class Reference(NamedTuple):
 
 
 def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
-    """The numbers that are the names of files.
+    """Returns the numbers in the names of files.
 
     Args:
         files: the scans.
-        largest: no number may be above this.
+        largest: largest valid number.
 
     Returns:
         One number a file, or None where a name is no number or too large.
@@ -66,7 +66,7 @@ def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None
 
 
 def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatArray:
-    """The pose of each scan, see `match_rows`.
+    """Returns the pose of each scan, see `match_rows`.
 
     Args:
         poses: (m, 4, 4).
@@ -113,7 +113,7 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     """Finds the times of the scans of a folder: times.txt, or the time stamps that are their names.
 
     Args:
-        homes: folders where times.txt may lie.
+        homes: folders that may have times.txt.
         files: the n scans.
 
     Returns:
@@ -135,7 +135,7 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
 
 
 def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
-    """The times of the scans of a data set out of times.txt, see `match_rows`; a file that does not fit is ignored.
+    """Reads the times of the scans of a data set, see `match_rows`; a file that does not fit is ignored.
 
     Args:
         path: path of times.txt.
@@ -152,7 +152,7 @@ def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
 
 
 def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path) -> Reference:
-    """Gives each scan its reference pose.
+    """Matches scans with reference poses.
 
     If poses and scans have times, poses are interpolated at the times of the scans. The nearest pose must lie within
     the tolerance: half the step of the poses, at most 0.1 s. Stamps may also be the numbers of the scans. Without times
@@ -219,7 +219,7 @@ def _are_times(stamps: FloatArray) -> bool:
 
 
 def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -> bool:
-    """Returns whether stamps are numbers of scans: whole, no times of the scans, none beyond the last scan."""
+    """Returns True if stamps are numbers of scans: integers up to the last scan, and no times of the scans."""
     is_whole = bool((stamps == np.round(stamps)).all() and len(np.unique(stamps)) == len(stamps))
     if not is_whole or stamps.min() < 0 or stamps.max() >= num_scans or len(stamps) < 1:
         return False
@@ -231,7 +231,7 @@ def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -
 
 
 def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[FloatArray, float]:
-    """Poses at the times of the scans, NaN where none is near; and the tolerance."""
+    """Interpolates poses at the times of the scans, NaN where no pose is near; and returns the tolerance."""
     stamps, first = np.unique(stamps, return_index=True)
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     tolerance_s = max(min(0.5 * step, _LARGEST_TOLERANCE_S), _SMALLEST_TOLERANCE_S)

@@ -1,4 +1,4 @@
-"""Messages of ROS as arrays: clouds, planar scans and poses, by the conventions of any driver."""
+"""Messages of ROS as arrays: clouds, planar scans and poses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class LaserBeams(NamedTuple):
     """The beams of a planar scan.
 
     Attributes:
-        ranges: (b,) m; NaN where a beam met nothing.
+        ranges: (b,) m; NaN for beams without a hit.
         angles: (b,) radians, in the frame of the laser.
     """
 
@@ -63,7 +63,7 @@ def cloud_of(message: Any, kind: str) -> TimedCloud:
 
 
 def _records(message: Any) -> NDArray[Any]:
-    """The points of a PointCloud2 as records of their fields."""
+    """Reads the points of a PointCloud2 as records of their fields."""
     step, width, height = int(message.point_step), int(message.width), int(message.height)
     order = ">" if message.is_bigendian else "<"
     fields = {f.name: (order + _TYPES[f.datatype], int(f.offset)) for f in message.fields if f.datatype in _TYPES}
@@ -71,7 +71,7 @@ def _records(message: Any) -> NDArray[Any]:
     layout = np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": step})
     data = np.ascontiguousarray(message.data, np.uint8)
     row = width * step
-    # A row may have a tail; drivers that write no cloud of rows leave row_step unset.
+    # A row may have a tail; drivers leave row_step unset for clouds of one row.
     row_step = int(message.row_step) if height > 1 and int(message.row_step) > row else row
     needed = row_step * (height - 1) + row if height else 0
     if len(data) < needed or step < 1:

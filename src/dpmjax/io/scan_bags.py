@@ -47,11 +47,11 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
     """Reads the planar scans of a bag.
 
     The odometry is that of the transforms (/tf) up to the odometry frame, or of the only topic of Odometry. A laser
-    whose place on the robot is in /tf_static gets its own poses. Beams of one that is mounted upside down are mirrored.
+    with a pose on the robot in /tf_static gets its own poses. Beams of a laser mounted upside down are mirrored.
 
     Args:
         path: a bag, see `Bag`.
-        topic: which scans; None takes the only topic of LaserScan or MultiEchoLaserScan.
+        topic: topic of the scans; None: the only one of LaserScan or MultiEchoLaserScan.
 
     Returns:
         The scans in the order of their headers, in metres, with times in seconds since 1970 and odometry where the bag
@@ -85,7 +85,7 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
 
 
 def _points(scans: list[LaserBeams]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """End points (n, b, 2) and mask (n, b); scans of fewer beams end with masked ones."""
+    """Computes end points (n, b, 2) and mask (n, b); scans of fewer beams are padded with masked ones."""
     num_beams = max(len(beams.ranges) for beams in scans)
     points = np.zeros((len(scans), num_beams, 2), np.float32)
     mask = np.zeros((len(scans), num_beams), bool)
@@ -97,7 +97,7 @@ def _points(scans: list[LaserBeams]) -> tuple[NDArray[np.float32], NDArray[np.bo
 
 
 def _transforms(bag: Bag) -> dict[str, tuple[str, _Motions]]:
-    """The parent of each frame, and its motion in it, of /tf and /tf_static."""
+    """Reads the parent of each frame, and the pose of the frame in the parent, from /tf and /tf_static."""
     rows: dict[tuple[str, str], list[tuple[float, FloatArray]]] = {}
     for topic in bag.of_kinds(*TRANSFORMS):
         for message in bag.messages(topic.name):
@@ -118,7 +118,7 @@ def _as_motions(rows: list[tuple[float, FloatArray]]) -> _Motions:
 def _odometry(
     bag: Bag, edges: dict[str, tuple[str, _Motions]], frame: str, times: FloatArray
 ) -> tuple[FloatArray | None, Note | None]:
-    """`T_odom_laser` at the times of the scans, None where the bag has no odometry for them; and where it is from."""
+    """Returns `T_odom_laser` at the times of the scans, None where the bag has no odometry, and a note on it."""
     T, moving, seen = np.tile(np.eye(4), (len(times), 1, 1)), False, {frame}
     top = frame
     while top in edges and edges[top][0] not in (*_MAP_FRAMES, *seen):
@@ -146,7 +146,7 @@ def _odometry(
     if not _covers(motions.times, times):
         text = f"{bag.path}: the odometry of {name} is not of the times of the scans; it is not used"
         return None, Note(text, is_doubt=True)
-    # The transforms that were walked are fixed: the place of the laser on the robot.
+    # The traversed transforms are constant: the pose of the laser on the robot.
     T_odom_base = interpolate_poses(motions.times, motions.T_parent_child, times)
     return np.asarray(T_odom_base @ T), Note(f"{bag.path}: odometry of {name}")
 
@@ -157,20 +157,20 @@ def _covers(times: FloatArray, wanted: FloatArray) -> bool:
 
 
 def _is_upside_down(edges: dict[str, tuple[str, _Motions]], frame: str, T_odom_laser: FloatArray | None) -> bool:
-    """Returns whether the z axis of the laser points down, in the odometry or on the robot."""
+    """Returns True if the z axis of the laser points down, in the odometry or on the robot."""
     if T_odom_laser is not None:
         return bool(np.median(T_odom_laser[:, 2, 2]) < 0)
     return frame in edges and bool(np.median(edges[frame][1].T_parent_child[:, 2, 2]) < 0)
 
 
 def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
-    """Opens the clouds of a bag; a scan is read when it is wanted.
+    """Opens the clouds of a bag; a scan is read on demand.
 
     The bag is read through once for the times of the clouds.
 
     Args:
         path: a bag, see `Bag`.
-        topic: which clouds; None takes the only topic of PointCloud2 or Livox's CustomMsg.
+        topic: topic of the clouds; None: the only one of PointCloud2 or Livox's CustomMsg.
 
     Returns:
         The sequence in the order of the headers' times, with times in seconds since 1970 and times of points.

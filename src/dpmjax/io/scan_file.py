@@ -1,4 +1,4 @@
-"""One 3-D scan of a file of any kind, checked: metres, in the lidar's own frame, without beams that met nothing."""
+"""One checked 3-D scan of a file of any kind: metres, in the lidar's frame, without beams that have no hit."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, requi
 
 _NPZ_KEYS = ("lidar_pcd", "points", "xyz", "arr_0")
 _NPZ_TIMES = "times"
-# No lidar on the ground measures outside of these, in metres; nearly all points of a scan lie within the usual range.
+# Least range, usual range and largest range of lidars on the ground, m; nearly all points are within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
 _LEAST_USUAL_SHARE = 0.05
-# Points on a map lie this many times nearer to their middle than to the origin.
+# Points in map coordinates are nearer to their middle than to the origin by this factor.
 _MAP_RATIO = 5.0
 
 
@@ -38,8 +38,7 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
             infers it from the values.
 
     Returns:
-        (n, 3) float32 x, y, z in the lidar's frame, m, without beams that met nothing: points at the origin, and points
-        that are not finite.
+        (n, 3) float32 x, y, z in the lidar's frame, m, without points at the origin and points that are not finite.
 
     Raises:
         InputError: names the file and the fault: missing, truncated, wrong columns, no points, no point in range,
@@ -56,7 +55,7 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
     Args:
         path: the file.
         points: (n, 3) points of the file, m.
-        bin_columns: as they were given for reading it.
+        bin_columns: value for the reader.
 
     Returns:
         Notes on the columns and on the unit.
@@ -87,15 +86,15 @@ def read_points(path: str | Path, *, bin_columns: int | None = None) -> NDArray[
 
 
 def read_point_times(path: str | Path) -> FloatArray | None:
-    """Reads when each point of a scan was measured.
+    """Reads the times of the points of a scan.
 
     Args:
         path: a `.pcd` or `.ply` with a column t, time, timestamp, timestamps, time_stamp, time_offset or offset_time,
             a `.las` or `.laz` with GPS times, or a `.npz` with an array `times`.
 
     Returns:
-        (n,) one for each point of `read_points`, in the unit and from the start that the file has; None where it has
-        none, as all other kinds of files.
+        (n,) times of the points of `read_points`, in the unit and from the origin of the file; None where it has none,
+        and for all other kinds of files.
 
     Raises:
         InputError: see `read_lidar_file`.
@@ -131,7 +130,7 @@ def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
 
 
 def _read_arrays(path: Path) -> TimedCloud:
-    """Points and times of a NumPy file."""
+    """Reads points and times of a NumPy file."""
     table = load_arrays(path, None if path.suffix.lower() == ".npy" else (*_NPZ_KEYS, _NPZ_TIMES))
     values = next((table[key] for key in _NPZ_KEYS if key in table), None)
     if values is None:
@@ -161,7 +160,7 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
         The points, float32, that are finite and not at the origin, with their times.
 
     Raises:
-        EmptyScanError: no beam met anything.
+        EmptyScanError: no beam has a hit.
         InputError: see `read_lidar_file`.
     """
     points, times = cloud
@@ -179,7 +178,7 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
 
 
 def _why_too_far(points: FloatArray, median: float) -> tuple[str, str]:
-    """Texts for a scan whose median range is too large: map coordinates, another unit, or garbage."""
+    """Returns finding and advice for a too large median range: map coordinates, another unit, or garbage."""
     middle = np.median(points, axis=0)
     spread = float(np.median(np.linalg.norm(points - middle, axis=1)))
     found = f"the median range is {median:.4g} m"
@@ -192,7 +191,7 @@ def _why_too_far(points: FloatArray, median: float) -> tuple[str, str]:
 
 
 def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
-    """Doubts the unit where hardly any point is as near as lidars measure.
+    """Returns a note on a doubtful unit where hardly any point is within the usual range.
 
     Args:
         points: (n, 3), m.

@@ -1,4 +1,4 @@
-"""Names of scan files: their order, the times in them, and files among scans that are none."""
+"""Names of scan files: order, times in names, and files among scans that are no scans."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
 
 
 def _decimal_key(stem: str) -> tuple[tuple[int, float, str], ...]:
-    """Sort key under which numbers, with their fractions, compare as numbers and come before text."""
+    """Returns a sort key under which numbers, with their fractions, compare as numbers and come before text."""
     texts, numbers = _NUMBER.split(stem), _NUMBER.findall(stem)
     key: list[tuple[int, float, str]] = []
     for text, number in zip(texts, [*numbers, ""], strict=True):

@@ -1,4 +1,4 @@
-"""The entrance for planar scans: finds out what a path holds, reads it, and refuses what cannot be registered."""
+"""Sequences of planar scans: detection of the format, reading, and checks of the scans."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_sequence(
     max_range: float | None = None,
     topic: str | None = None,
 ) -> ScanSequence:
-    """Reads a sequence of planar scans, whatever of the known formats it is in.
+    """Reads a sequence of planar scans in any of the known formats.
 
     Args:
         path: a folder or tar archive of PCD files (`read_deepmapping_folder`), a CARMEN log (`read_carmen_log`), a
@@ -56,15 +56,15 @@ def read_sequence(
             arrays as metres. CARMEN logs are in metres.
         max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader, and
             masks the beams of the largest range where many have exactly this one.
-        topic: topic of a bag: which scans; may be left out where there is one topic of planar scans.
+        topic: topic of planar scans of a bag; None: the only one.
 
     Returns:
-        The sequence: two scans at least of 17 beams at least, each with one valid beam at least.
+        The sequence: at least two scans of at least 17 beams, each with at least one valid beam.
 
     Raises:
-        InputError: one line with the file, the finding and the advice: no such file, an unknown format, damage, too few
-            scans or beams, a scan without a valid beam, scans of a single point, impossible lengths, or arguments out
-            of range.
+        InputError: one line with the file, the finding and the advice. The file is missing, of an unknown format or
+            damaged, or an argument is out of range. Also for too few scans or beams, a scan without a valid beam, scans
+            of a single point, or impossible lengths.
     """
     path = Path(path)
     start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
@@ -131,7 +131,7 @@ def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
 
 
 def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
-    """Masks the beams at the largest range of all, where many have exactly this one: no echo within reach."""
+    """Masks the beams at the largest range, where many have exactly this range, the code for no echo."""
     if not sequence.mask.any():
         return sequence
     ranges = np.where(sequence.mask, np.linalg.norm(sequence.points.astype(np.float64), axis=2), 0.0)
@@ -164,7 +164,7 @@ def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) ->
 
 
 def _check_unit(sequence: ScanSequence, path: Path) -> list[Note]:
-    """Refuses lengths that no such unit explains; a note doubts those that another unit explains better."""
+    """Refuses lengths that are impossible in the unit; returns a note on lengths that fit another unit better."""
     ranges = np.linalg.norm(sequence.points[sequence.mask].astype(np.float64), axis=1)
     median = float(np.median(ranges))
     low, high = _PLAUSIBLE_RANGE[sequence.unit]
@@ -262,7 +262,7 @@ def _unit(table: Table, path: str | Path) -> Unit:
 
 
 def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> FloatArray | None:
-    """Poses (n, 3) x, y, heading out of (n, 3) or homogeneous (n, 3, 3)."""
+    """Reads poses (n, 3) x, y, heading from (n, 3) or homogeneous (n, 3, 3)."""
     if key not in table:
         return None
     poses = table[key]

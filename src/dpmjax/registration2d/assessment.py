@@ -1,10 +1,10 @@
-"""Trust in a registration without the truth.
+"""Trust in a registration without ground truth.
 
-A map is wrong where a weak connection holds it together, where beams pass through what others have hit, and where a
-step may slide along a corridor. Trust therefore rests on three quantities. The first is the score of the weakest
+A map is wrong where a weak connection holds it together, where beams pass through the hits of other scans, or where a
+relative pose is unconstrained along a corridor. Trust rests on three quantities. The first is the score of the weakest
 connection of the best tree of pairs. The second is the share of contradicting beams of the pairs outside the tree,
-beyond that of the pairs in it. The third is the standard deviation of each scan's place against the largest part of the
-map that has no open connection.
+beyond that of the pairs in it. The third is the standard deviation of each scan's position relative to the largest part
+of the map without unconstrained connections.
 """
 
 from __future__ import annotations
@@ -41,21 +41,20 @@ _FEW_SCANS = 60
 _CONTRADICTION_FLOOR = 0.02
 _CONTRADICTION_FACTOR = 1.6
 _MAX_CONTRADICTION = 0.055
-# Largest standard deviation of a scan's place against the map, typical ranges.
+# Largest standard deviation of a scan's position relative to the map, typical ranges.
 _MAX_DEVIATION = 0.02
 
 
 class Assessment(NamedTuple):
-    """Trust in a registration, computed without the truth.
+    """Trust in a registration, computed without ground truth.
 
     Attributes:
         weakest_connection: score, at most 1, of the weakest connection that holds two parts of the map together.
         contradiction: share of contradicting beams in the pairs outside the tree of best pairs, less that of the pairs
             in it. A beam contradicts where it ends in the free space of another scan.
-        is_trusted: both values are within the limits of right maps, no scan may slide, the scans are not mirrored, and
-            the range noise is below its limit.
-        uncertain_scans: rows of the scans for which trust does not hold: they fit no other scan, or they may slide
-            along a corridor together.
+        is_trusted: True where both values are within the limits of correct maps, no scan is unconstrained, the scans
+            are not mirrored, and the range noise is below its limit.
+        uncertain_scans: rows of the scans that fit no other scan, or whose position along a corridor is unconstrained.
         fault: sentence on axes or units that contradict the odometry; None: none found.
     """
 
@@ -81,11 +80,11 @@ class _Pairs(NamedTuple):
 def assess_trajectory(
     scans: PlanarScans, poses: Floats, *, prior: StepPrior | None = None, fault: str | None = None
 ) -> Assessment:
-    """Tells whether the registration of scans can be trusted.
+    """Assesses the registration of scans by the scans alone.
 
     The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts.
-    Pairs outside the tree must contradict hardly more than the pairs in it. Scans that fit no other scan are left out,
-    if they are few. No scan may be free to slide against the map.
+    Pairs outside the tree must contradict hardly more than the pairs in it. Few scans that fit no other scan are left
+    out. The position of each other scan relative to the map must be constrained.
 
     Args:
         scans: n scans, two at least.
@@ -134,11 +133,11 @@ def _slide_all(profiles: RangeProfiles, poses: Floats, prior: StepPrior) -> Slid
 
 
 def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: Slides | None) -> Floats:
-    """Returns the standard deviation of each scan's place against the largest part without open connections (n,).
+    """Returns the standard deviation (n,) of each scan's position relative to the largest fully constrained part.
 
-    A pair that has no other place along its weak direction is closed. An open one counts by the spread of its places.
-    These variances are the resistances of a network, with those of the steps (n - 1) that have a prior. The resistance
-    from a scan to that part is the variance of the scan; without a way it is infinite.
+    A pair is closed where its shift along the weak direction is constrained. Other pairs enter with the variance of
+    this shift. These variances, and those of the n - 1 steps with a prior, are the resistances of a network. The
+    variance of a scan is the resistance between the scan and that part, infinite where they are not connected.
     """
     slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
     is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
@@ -170,7 +169,7 @@ def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: S
 
 
 def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
-    """Scans of the largest connected tree, and the lowest score between two of its parts that are no single scans."""
+    """Returns the number of scans of the largest tree, and its lowest score between two parts of several scans."""
     label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
     root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
     order, parent = scipy.sparse.csgraph.breadth_first_order(tree, root, directed=False)

@@ -62,7 +62,7 @@ class GlobalConfig:
         max_unregistered: largest number of unregistered scans that are searched against all keyframes. Those still
             unregistered are then searched against an equal number of further scans. A cluster of up to half of
             `max_unregistered` scans, which matches no scan outside it, is unregistered too.
-        search: of pairs.
+        search: settings of the search of pairs.
     """
 
     max_keyframes: int = 32
@@ -97,16 +97,16 @@ class _Task(NamedTuple):
         return np.setdiff1d(np.arange(len(self.profiles)), self.keyframes)
 
     def search(self, source: Indices, target: Indices, turns: NDArray[np.bool_] | None = None) -> Candidates:
-        """Candidates of pairs."""
+        """Returns candidates of pairs."""
         return search_pairs(self.profiles, source, target, self.config.search, turns=turns)
 
     def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> NDArray[np.bool_]:
-        """Headings of T_target_source that the walls of both scans suggest."""
+        """Returns the headings of T_target_source at which the wall directions of both scans agree."""
         return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
 
 
 def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) -> GlobalRegistration:
-    """Poses of all scans from no guess.
+    """Registers all scans without initial poses.
 
     Args:
         scans: n scans. If they are ordered, neighbours in the array are neighbours in time. Otherwise no order is used,
@@ -145,15 +145,23 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
 
 
 def spread_evenly(num_scans: int, count: int) -> Indices:
-    """At most `count` scans, the first and the last among them."""
+    """Returns up to `count` evenly spaced rows, the first and the last among them."""
     return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
 
 
 def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
-    """Columns of the scans that together are most similar to all of the n scans, of those with m columns."""
+    """Selects `count` columns greedily, which maximise the summed similarity of each scan to its most similar one.
+
+    Args:
+        similarity: of n scans to m candidates.
+        count: largest number of selected columns.
+
+    Returns:
+        Selected columns in increasing order.
+    """
     count = min(similarity.shape[1], count)
     chosen: list[int] = []
-    # Similarity of each scan to the most similar chosen one; each choice adds as much to that as it can.
+    # Similarity of each scan to its most similar chosen scan; each choice adds most to the sum of these.
     covered = np.full(len(similarity), -1.0, similarity.dtype)
     for _ in range(count):
         gain = np.maximum(similarity - covered[:, None], 0.0).sum(axis=0)
@@ -164,12 +172,12 @@ def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
 
 
 def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
-    """Poses of the scans that are not yet placed: of their hypotheses the one with the best score against placed scans.
+    """Places each remaining scan at its hypothesis with the best score against the placed scans.
 
-    Then all scans may change their poses as in `assemble`.
+    Afterwards `settle` revises all poses.
 
     Args:
-        poses: (n, 3); right for those of `placed`.
+        poses: (n, 3) T_world_scan; those of `placed` are correct.
         placed: rows.
         hypotheses: of pairs; each scan that is not placed needs one with a placed scan.
         scorer: of the map.
@@ -181,7 +189,7 @@ def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer:
     is_placed[placed] = True
     fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.anchor] & ~is_placed[hypotheses.scan]))
     candidates = fresh.world_poses(poses)
-    # Hypotheses of one scan compete with each other alone: no need to subtract what chance would give.
+    # Only hypotheses of one scan are compared with each other, so the chance level is not subtracted.
     score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.scan, candidates, placed, poses)
     order = np.argsort(score, kind="stable")
     poses = poses.copy()
@@ -191,12 +199,12 @@ def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer:
 
 
 def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Pairs of each other scan with similar keyframes and with near scans; and the turns to try for each."""
+    """Pairs each other scan with similar keyframes and with near scans, and chooses the turns to try for each pair."""
     others, keyframes = task.others, task.keyframes
     if task.is_ordered:
         after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
         near = np.stack([keyframes[after - 1], keyframes[after]], axis=1)
-    else:  # Those with the most similar views of all are likely to be near.
+    else:  # Scans with the most similar views are likely to be near.
         near = task.walls.most_similar(others, np.arange(len(task.profiles)), _NUM_NEAREST_VIEWS)
     pairs = np.concatenate([task.walls.most_similar(others, keyframes, _NUM_ANCHORS), near], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
@@ -207,11 +215,11 @@ def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
 
 
 def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
-    """Places all scans, from the poses of the keyframes.
+    """Places all scans, given the poses of the keyframes.
 
     Args:
         task: the scans.
-        poses: (n, 3); right for the keyframes.
+        poses: (n, 3) T_world_scan; those of the keyframes are correct.
         found: candidates of the keyframes.
         more: candidates of the scans that are no keyframes.
 
@@ -226,13 +234,13 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         return place_in_map(poses, task.keyframes, Hypotheses.of(candidates), scorer)
 
     poses = place(poses, more)
-    # A scan that sees no keyframe has its neighbours among the remaining scans; so has a keyframe that sees no second
-    # one.
+    # A scan that overlaps with no keyframe has its neighbours among the remaining scans; so has a keyframe that
+    # overlaps with no other keyframe.
     for partners in (task.keyframes, task.others):
         lost = find_unregistered(task.profiles, poses, task.config)
         if not len(lost):
             break
-        # Similarity has misled these, so all turns are tried, with the partners of the most similar views.
+        # The likely turns of these scans were wrong, so all turns are tried, with the most similar partners.
         similar = task.walls.most_similar(lost, partners, len(task.keyframes))
         source, target = similar.reshape(-1), np.repeat(lost, similar.shape[1])
         more = join_candidates(more, task.search(source, target))
@@ -241,7 +249,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
 
 
 def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConfig) -> Indices:
-    """Unregistered scans, the worst first: they match far fewer beams than usual with any scan outside their cluster.
+    """Finds unregistered scans: they match far fewer beams than usual with any scan outside their cluster.
 
     A small cluster of scans that match each other and no other scan is unregistered too: its scans must not support
     each other.
@@ -252,7 +260,7 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
         config: settings.
 
     Returns:
-        Rows of the unregistered scans.
+        Rows of the unregistered scans, the worst first.
     """
     num_scans = len(poses)
     num_near = min(7, num_scans)

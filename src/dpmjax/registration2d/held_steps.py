@@ -1,4 +1,8 @@
-"""Edges between neighbours in time: from the beams where these fix a step, from slides and priors where they do not."""
+"""Pose-graph edges between neighbours in time.
+
+The scans give the relative pose where they constrain it. Along unconstrained directions (open steps, see `Slides`) the
+posterior of the shift gives it.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +17,21 @@ from dpmjax.registration2d.range_profiles import make_profiles
 from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.registration2d.step_slides import Slides, slide_steps
 
-# Accuracy of a fitted beam, typical ranges; and of a step that nothing else is known of: typical ranges, radians.
+# Accuracy of a fitted beam, typical ranges; and of a step without other information: typical ranges, radians.
 BEAM_DEVIATION, _STEP_DEVIATION = 0.03, (0.045, 0.15)
-# Least standard deviation of a held step, typical ranges and radians.
+# Least standard deviation of a constrained step, typical ranges and radians.
 _LEAST_DEVIATION = 0.005
 
 
 def pose_steps(poses: Floats, typical_range: float) -> Edges:
-    """Returns edges between neighbours in time of these poses (n, 3), all loose."""
+    """Returns edges between neighbours in time of these poses (n, 3), with little information."""
     relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
     information = np.diag((np.array(_STEP_DEVIATION)[[0, 0, 1]] * [typical_range, typical_range, 1.0]) ** -2.0)
     return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
 
 
 def prior_steps(prior: StepPrior) -> Edges:
-    """Returns edges between neighbours in time of a prior (n - 1 steps)."""
+    """Returns edges between neighbours in time from a prior of n - 1 steps."""
     later, variances = np.arange(1, len(prior.steps) + 1), prior.deviations**2
     return Edges(later, later - 1, prior.steps, np.eye(3) / variances[:, None])
 
@@ -41,7 +45,8 @@ def matched_steps(matches: PairMatches, slides: Slides, typical_range: float) ->
         typical_range: of the scans.
 
     Returns:
-        Edges; along an open direction the variance of the slide, else no less information than loose edges have.
+        Edges. Along an unconstrained direction the variance is that of the shift. Elsewhere the information is at
+        least that of `pose_steps`.
     """
     loose = pose_steps(se2.chain(matches.poses), typical_range)
     fixed = matches.information / (BEAM_DEVIATION * typical_range) ** 2
@@ -53,20 +58,20 @@ def matched_steps(matches: PairMatches, slides: Slides, typical_range: float) ->
 
 
 def open_projections(slides: Slides, steps: Floats) -> Floats:
-    """Returns projections (k, 3, 3) of tangents in the source frames that drop the direction of each open step."""
+    """Returns projections (k, 3, 3) of tangents in the source frames that remove unconstrained directions."""
     axes = np.where(slides.is_open[:, None], slides.axes(steps), 0.0)
     return np.asarray(np.eye(3) - axes[:, :, None] * axes[:, None, :])
 
 
 def slide_information(slides: Slides, steps: Floats, typical_range: float) -> Floats:
-    """Returns the information (k, 3, 3) of the slides along open directions, in the source frames of the steps."""
+    """Returns the information (k, 3, 3) of the shifts along unconstrained directions, in the source frames."""
     axes = np.where(slides.is_open[:, None], slides.axes(steps), 0.0)
     variances = np.maximum(slides.deviations, _LEAST_DEVIATION * typical_range) ** 2
     return np.asarray(axes[:, :, None] * axes[:, None, :] / variances[:, None, None])
 
 
 def held_steps(slides: Slides, poses: Floats, typical_range: float) -> Edges:
-    """Returns edges of the open and the torn steps of poses (n, 3), at their most probable places.
+    """Returns pose-graph edges for ambiguous relative poses (open or torn in `Slides`), at their most probable shifts.
 
     Args:
         slides: of the n - 1 steps of the poses.
@@ -74,7 +79,7 @@ def held_steps(slides: Slides, poses: Floats, typical_range: float) -> Edges:
         typical_range: of the scans.
 
     Returns:
-        Edges; an open step is held along its weak direction alone.
+        Edges; a step that is open and not torn has information along its weak direction alone.
     """
     steps = pose_steps(poses, typical_range)
     firm = np.array([typical_range, typical_range, 1.0]) * _LEAST_DEVIATION
@@ -87,15 +92,15 @@ def held_steps(slides: Slides, poses: Floats, typical_range: float) -> Edges:
 
 
 def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> tuple[PairMatches, Slides]:
-    """Moves each step to the most probable place along the weak direction of its walls, and aligns it there.
+    """Shifts ambiguous relative poses along their weak direction to the posterior mode, and re-aligns these scans.
 
     Args:
         scans: n scans in time order.
-        matches: the n - 1 steps.
+        matches: of the n - 1 steps.
         prior: of the steps.
 
     Returns:
-        The matches, and the slides about them.
+        The matches after the shift and alignment, and the Slides of these.
     """
     profiles, later = make_profiles(scans), np.arange(1, len(scans))
     slides = slide_steps(profiles, later, later - 1, matches.poses, prior)

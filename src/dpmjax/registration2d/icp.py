@@ -1,4 +1,4 @@
-"""Iterated closest point for two clouds, planar or spatial: robust weights, and whether the loop has converged."""
+"""Iterative closest point for two clouds, planar or spatial, with robust weights."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NORMAL_NEIGHBOURS = 6
 
 _MAX_ITERATIONS = 100
 _OPEN_SHARE = 1e-5
-"""Share of the largest singular value of the balance's derivative below which a direction counts as open."""
+"""Share of the largest singular value of the balance's derivative below which a direction counts as unconstrained."""
 
 
 class IcpResult(NamedTuple):
@@ -51,29 +51,28 @@ def icp(
     source_mask: Bool[AnyArray, " n"] | None = None,
     target_mask: Bool[AnyArray, " m"] | None = None,
 ) -> IcpResult:
-    """Aligns two clouds from a first guess; planar (d = 2: "plane" means line) or spatial (d = 3).
+    """Aligns two clouds from an initial transform; planar (d = 2: "plane" means line) or spatial (d = 3).
 
-    Each source point is paired with its nearest target point. Pairs are trusted by a Geman-McClure weight whose scale
-    is three times the median distance of the pairs, so that what only one cloud has seen does not pull. The loop ends
-    after 100 iterations or earlier.
+    Each source point is paired with its nearest target point. The pairs have Geman-McClure weights, whose scale is
+    three times the median distance of the pairs, so that points outside the overlap have little weight. The loop ends
+    after up to 100 iterations.
 
     The gradient is that of the solution, by the implicit function theorem (Blondel et al. 2022, section 2.1). The
     weighted residuals balance at the solution, also after the points have moved a little. Pairs and normals are
-    constants of the derivative. It is zero along directions that the data leave open, and with respect to `T_init`.
+    constants of the derivative. The gradient is zero along unconstrained directions and with respect to `T_init`.
 
     Args:
         source: points.
         target: points, same unit.
         metric: distance to the nearest point (Besl and McKay), or to its line or plane (Chen and Medioni); static
             under `jit`.
-        T_init: first guess of T_target_source; None: identity. The basin is about as wide as the structures: some
-            degrees.
-        source_mask: False for source points that are not there; they may hold anything.
-        target_mask: the same for the target.
+        T_init: initial T_target_source; None: identity. The basin of convergence is about as wide as the structures:
+            some degrees.
+        source_mask: False for invalid source points, which may have any values.
+        target_mask: False for invalid target points.
 
     Returns:
-        IcpResult. With too few points to fix the motion it stays where the data leave it: near `T_init`, `converged`
-        true.
+        IcpResult. With too few points to constrain the motion, the result stays near `T_init`, with `converged` True.
 
     Raises:
         ValueError: wrong shapes, unknown metric, an empty cloud, or numbers that are not finite (where not traced).
@@ -105,12 +104,12 @@ class _Pairs(NamedTuple):
 
     Attributes:
         points: source points in the frame of the target.
-        apart: from the target points to them.
-        matched: the target points.
-        normals: of the target points; zero where they have none, and for the metric "point".
+        apart: vectors from the target points to the source points.
+        matched: target points.
+        normals: of the target points; zero where a point has none, and for the metric "point".
         residuals: distance to the line or plane, or to the point where there is no normal.
         weights: robust weights, 0 to 1.
-        mask: True where a pair is there.
+        mask: True for valid pairs.
     """
 
     points: Float[Array, "n d"]
@@ -146,7 +145,7 @@ def _icp(source: _Cloud, target: _Cloud, start: Array, *, metric: str) -> IcpRes
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: Array) -> tuple[Array, Array]:
-    """Returns the motion, and whether it has converged."""
+    """Returns the motion, and True where the iteration has converged."""
     resolution, centre = _resolution(target), _mean(source)[None]
 
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -212,7 +211,7 @@ def _find_pairs(source: _Cloud, target: _Cloud, normals: Float[Array, "m d"], T:
 
 
 def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
-    """Computes the small motion, of points onto the lines or planes of their partners, about the points' mean."""
+    """Computes the damped Gauss-Newton motion of points onto the lines or planes of their partners, about `centre`."""
     jacobian = jnp.concatenate([pairs.normals, _turning(pairs.points - centre, pairs.normals)], axis=-1)
     residual = jnp.sum(pairs.apart * pairs.normals, -1)
     weighted = pairs.weights[:, None] * jacobian
@@ -225,7 +224,7 @@ def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "
 
 
 def _turning(lever: Float[Array, "n d"], vectors: Float[Array, "n d"]) -> Float[Array, "n r"]:
-    """Computes torques: the cross product of levers and vectors, one number in the plane."""
+    """Computes torques, the cross products of levers and vectors; in the plane a torque is one number."""
     i, j = np.array([[0], [1]] if lever.shape[1] == 2 else [[1, 2, 0], [2, 0, 1]])
     return lever[:, i] * vectors[:, j] - lever[:, j] * vectors[:, i]
 
@@ -248,7 +247,7 @@ def _size(cloud: _Cloud) -> Float[Array, ""]:
 
 
 def _resolution(target: _Cloud) -> Float[Array, ""]:
-    """Returns a millionth of the cloud, or rounding, and not 0; a constant of the derivative."""
+    """Returns a millionth of the cloud's size or the rounding error, the larger one, above 0; without a derivative."""
     target = _Cloud(jax.lax.stop_gradient(target.points), target.mask)
     rounding = jnp.finfo(target.points.dtype).eps * jnp.max(jnp.abs(target.points))
     return jnp.maximum(jnp.maximum(1e-6 * _size(target), rounding), 1e-12)

@@ -1,4 +1,4 @@
-"""Incremental ICP: every scan against the one before, then the steps chained. The usual warm start of DeepMapping."""
+"""Incremental ICP: each scan is aligned with the one before, and the steps are chained."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.sequence_search import search_sequence
 from dpmjax.registration2d.step_prior import StepPrior, usual_motion
 
-# Share of the typical range that a coarse match is off by; and that of a direction that the scans leave open.
+# Residuals as shares of the typical range: of a coarse match, and along a direction that the scans leave unconstrained.
 _COARSE_RESIDUAL = 0.015
 _OPEN_RESIDUAL = 0.0075
 
 
-# Distance of the turns that are tried, degrees: the basin of one alignment is about as wide. The largest turn between
-# two scans that is searched when the small ones do not fit.
+# Spacing of the turns that are tried, degrees: the basin of convergence of one alignment is about as wide. The largest
+# turn between two scans that is searched where small turns do not fit.
 _TURN_STEP, _MAX_TURN = 15.0, 90.0
 # A pair with a better fitness is not searched further; one with a lower fitness even then is searched at longer steps.
 _GOOD_FITNESS, _POOR_FITNESS = 0.75, 0.4
-# A step is open if its weakest eigenvalue is below this share of the beams.
+# A step is unconstrained in some direction (open) if its weakest eigenvalue is below this share of the beams.
 _MIN_EIGENVALUE = 0.01
 
 
@@ -31,7 +31,7 @@ class IncrementalResult(NamedTuple):
 
     Attributes:
         poses: (n, 3) T_world_scan, the first one zero.
-        steps: the n - 1 matched steps T_scan_next, each by itself.
+        steps: independent matches of the n - 1 steps T_scan_next.
     """
 
     poses: Floats
@@ -49,8 +49,8 @@ def incremental_icp(
     Args:
         scans: n scans in time order.
         metric: distance to lines ("plane") or to points ("point").
-        odometry: (n, 3) raw poses. Their steps serve as guesses; without them the steps are searched.
-        prior: of the steps; None: that of the odometry, if there is any, at the usual deviations.
+        odometry: (n, 3) raw poses, whose steps are initial values; None: the steps are searched.
+        prior: of the steps; None: the odometry, if there is any, with the usual deviations.
 
     Returns:
         IncrementalResult.
@@ -66,7 +66,7 @@ def incremental_icp(
         prior = prior or StepPrior.of_poses(odometry, unit)
         guesses = np.asarray(se2.relative(odometry[:-1], odometry[1:]))
         rough = _match_odometry(source, target, guesses, prior.as_pose_prior(_COARSE_RESIDUAL * unit), metric)
-    # Where the scans fix a step, the prior is weighed against their noise alone; an open step leans on the prior.
+    # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
     num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
     is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
     belief = prior.as_pose_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
@@ -78,10 +78,10 @@ def incremental_icp(
 
 
 def scan_odometry(scans: PlanarScans) -> Floats:
-    """Chains coarse alignments of each scan with the one before, from no motion: about how far the robot has gone.
+    """Chains coarse alignments of each scan with the one before, from zero motion.
 
-    It tells which scans of a dense recording lie apart, where a robot has no odometry; steps that are long or open in
-    some direction are wrong.
+    These poses select scans of a dense recording that lie apart, for a robot without odometry. Steps that are long or
+    unconstrained in some direction are wrong.
 
     Args:
         scans: n scans in time order.
@@ -93,7 +93,7 @@ def scan_odometry(scans: PlanarScans) -> Floats:
 
 
 def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
-    """Returns coarse matches from no motion and small turns."""
+    """Returns coarse matches from zero motion and small turns."""
     fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
     return match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
 
@@ -127,7 +127,7 @@ def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> P
 
 
 def _fan(typical_range: float, radii: tuple[float, ...], num_ways: int, *, turn_share: float = 1.0) -> Floats:
-    """Guesses (h, 3) of a step: every turn at every shift by `radii` (typical ranges) in `num_ways` directions."""
+    """Returns guesses (h, 3) of a step: every turn at shifts by `radii` (typical ranges) in `num_ways` directions."""
     last = turn_share * _MAX_TURN
     turns = np.radians(np.arange(-last, last + 1e-6, _TURN_STEP))
     ways = 2 * np.pi * np.arange(num_ways) / num_ways

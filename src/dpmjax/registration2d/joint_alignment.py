@@ -1,7 +1,7 @@
-"""Joint alignment: every scan against its neighbours in time and in space, all poses in one sparse Gauss-Newton.
+"""Joint alignment of each scan with its neighbours in time and in space: sparse Gauss-Newton over all poses.
 
-A pair of scans that may slide along a corridor counts across it alone. Along it, open steps are held by their prior and
-their slide, and a torn step is put at its most probable place.
+A pair of scans in a corridor constrains the direction across the corridor alone. Along it, the posterior of the shift
+constrains open steps, and torn steps are put at their most probable shift (see `Slides`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
 from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.registration2d.step_slides import slide_steps
 
-# Distances of one round are kept below this by leaving out beams of the sources: about two seconds on two cores.
+# Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
 # Pairs that are linearised side by side: few enough for the cache, enough for all cores.
 _PAIRS_AT_ONCE = 128
 # The number of pairs is rounded up to a power of two up to this one, then to its multiples, so that few shapes compile.
 _PAIRS_ROUNDED = 1024
-# How gates and kernels shrink over the rounds.
+# Gates and kernels of the rounds.
 _ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
-# Gauss-Newton steps that put open steps back after the adjustment to lines.
+# Gauss-Newton steps that restore unconstrained directions after the adjustment to lines.
 _NUM_RESTORATIONS = 3
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
@@ -45,7 +45,7 @@ class JointAlignmentConfig:
     Attributes:
         temporal: offsets of the neighbours in time; only of ordered scans.
         num_spatial: largest number of neighbours in space, each from another visit.
-        radius: within which neighbours in space are looked for.
+        radius: largest distance of neighbours in space.
         max_turn: largest difference of heading of two neighbours in space, radians.
         refresh: number of rounds after which the neighbours are chosen anew.
     """
@@ -62,9 +62,9 @@ def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, p
 
     Args:
         scans: n scans.
-        poses: (n, 3) start, T_world_scan; the first one is held.
+        poses: (n, 3) initial poses T_world_scan; the first one is fixed.
         config: settings.
-        prior: of the steps of ordered scans; None: neighbours in time mean nothing.
+        prior: of the steps of ordered scans; None: no prior.
 
     Returns:
         (n, 3) poses.
@@ -91,7 +91,7 @@ def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, p
 def restore_open(
     profiles: RangeProfiles, aligned: Floats, adjusted: Floats, config: JointAlignmentConfig, prior: StepPrior
 ) -> Floats:
-    """Puts steps back along their open directions after an adjustment that does not hold these.
+    """Restores relative poses along their unconstrained directions after an adjustment without constraints there.
 
     Args:
         profiles: n scans in time order.
@@ -101,7 +101,7 @@ def restore_open(
         prior: of the steps.
 
     Returns:
-        (n, 3) the adjusted poses, with the open steps of the aligned ones.
+        (n, 3) adjusted poses; along the unconstrained directions the relative poses are those of `aligned`.
     """
     scans, unit = profiles.scans, profiles.scans.typical_range
     pairs, poses = _choose_aligned(profiles, aligned, config, prior), adjusted
@@ -111,7 +111,7 @@ def restore_open(
     edges, _ = _linearise(scans, pairs.source, pairs.target, adjusted, (scale[0], scale[1]))
     edges = edges._replace(information=pairs.across @ edges.information @ pairs.across)
     kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
-    # As firm as if all beams of a scan measured the open direction.
+    # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
     edges = join_edges(edges, Edges(pairs.held.source, pairs.held.target, kept, information))
     for _ in range(_NUM_RESTORATIONS):
@@ -122,13 +122,13 @@ def restore_open(
 
 
 class _AlignedPairs(NamedTuple):
-    """Pairs of scans that are aligned (p), and the steps that the scans do not fix.
+    """Pairs of scans that are aligned (p), and the steps that the scans do not constrain.
 
     Attributes:
         source: (p,) rows.
         target: (p,) rows.
-        across: (p, 3, 3) projections of tangents that drop the open direction of a pair.
-        held: edges of open and of torn steps.
+        across: (p, 3, 3) projections of tangents that remove the unconstrained direction of a pair.
+        held: edges of open and of torn steps, see `held_steps`.
     """
 
     source: Indices
@@ -140,7 +140,7 @@ class _AlignedPairs(NamedTuple):
 def _choose_aligned(
     profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None
 ) -> _AlignedPairs:
-    """Chooses the pairs to align at these poses; a torn step is held at its most probable place instead."""
+    """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
     scans, later = profiles.scans, np.arange(1, len(poses))
     source, target = choose_pairs(scans, poses, config)
     steps = se2.relative(poses[:-1], poses[1:])
@@ -156,7 +156,7 @@ def _choose_aligned(
 
 
 def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
-    """One Gauss-Newton step of all poses in their own frames (n, 3); the first one is held.
+    """Computes one Gauss-Newton step of all poses in their own frames; the first pose is fixed.
 
     Args:
         num_poses: n.
@@ -176,7 +176,7 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
 
 
 def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig) -> tuple[Indices, Indices]:
-    """Pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
+    """Returns pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
     num_scans = len(poses)
     temporal = config.temporal if scans.is_ordered else ()
     source = [np.arange(k, num_scans) for k in temporal]
@@ -215,7 +215,7 @@ def _linearise_pairs(
 def _linearise(
     scans: PlanarScans, source: Indices, target: Indices, poses: Floats, scale: tuple[jax.Array, jax.Array]
 ) -> tuple[Edges, PairSystem]:
-    """Systems of all pairs at these poses, gate and kernel; the count is rounded up, so that few shapes compile."""
+    """Linearises all pairs at these poses, gate and kernel; their number is rounded up, so that few shapes compile."""
     relative = se2.relative(poses[target], poses[source])
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
     filled = np.resize(np.arange(len(source)), _rounded_up(len(source)))
@@ -226,7 +226,7 @@ def _linearise(
 
 
 def _rounded_up(num_pairs: int) -> int:
-    """Returns the number of pairs that is computed in place of `num_pairs`."""
+    """Returns the padded number of pairs."""
     if num_pairs > _PAIRS_ROUNDED:
         return _PAIRS_ROUNDED * -(-num_pairs // _PAIRS_ROUNDED)
     return max(_PAIRS_AT_ONCE, 1 << (num_pairs - 1).bit_length())

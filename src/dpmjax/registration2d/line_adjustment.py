@@ -1,8 +1,8 @@
-"""Line adjustment: all poses against lines that all scans make together, as in a bundle adjustment.
+"""Line adjustment: joint estimation of all poses and of lines through the beams of several scans.
 
-The line of one scan is as noisy as its beams. Here every beam is compared with a straight line through the beams of all
-scans nearby. Their weights come from the range noise: a grazing beam measures its wall well, because its noise runs
-along the wall. The lines are eliminated: their weights make each residual a function of poses alone.
+A line of one scan is as noisy as its beams. Here each beam is compared with a straight line through the beams of all
+scans nearby. The weights of these beams come from the range noise: a beam at a grazing angle measures its wall well,
+because its noise is parallel to the wall. The lines are eliminated, so each residual is a function of poses alone.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _einsum = partial(jnp.einsum, precision="highest")
 
 # The nearest beam of a neighbour, and this number of beams to either side of it, may be part of the line.
 _NUM_BESIDE = 2
-# In standard deviations of the range noise: half the length of line that a beam is compared with; beams farther than
-# this off a line are not part of it; walls stray so far from a straight line, so grazing beams are trusted no further.
+# In standard deviations of the range noise: half the length of line that a beam is compared with; largest distance of
+# a beam from its line; deviation of walls from a straight line, which bounds the weights of grazing beams.
 _WINDOW, _GATE, _ROUGHNESS = 6.0, 4.0, 0.2
-# Residuals of this many of their standard deviations lose most of their weight.
+# Residuals above this number of standard deviations lose most of their weight.
 _OUTLIER = 3.0
-# A wall is bent if its points stray by more than this, as a mean square in standard deviations.
+# A wall is bent if the mean square of its normalised residuals is above this.
 _MAX_CHI2 = 1.15
 # Points are a line if their variance along it is this many times the variance across it.
 _MIN_SLENDERNESS = 2.0
@@ -48,7 +48,7 @@ class LineAdjustmentConfig:
         num_neighbours: number of neighbouring scans that share lines with a scan, spread evenly by nearness within
             `radius`.
         radius: within which scans share lines, in typical ranges of the scans.
-        num_rounds: times that the beams of a line are chosen.
+        num_rounds: number of times that the beams of a line are chosen.
     """
 
     num_neighbours: int = 48
@@ -69,10 +69,10 @@ class _Lines(NamedTuple):
     """The line of each beam (b).
 
     Attributes:
-        normals: turned as those of the beams.
-        shares: weights of the beams around, whose mean is the point of the line where the beam meets it.
-        variance: of the line there.
-        is_line: straight, and seen by enough beams.
+        normals: of the lines, on the same side as those of the beams.
+        shares: weights of the surrounding beams; their weighted sum is the point where the beam meets the line.
+        variance: of this point across the line.
+        is_line: True where the line is straight and has enough beams.
     """
 
     normals: Float[Array, "b 2"]
@@ -82,12 +82,12 @@ class _Lines(NamedTuple):
 
 
 def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-    """Returns the derivatives of points with respect to the heading of their scan."""
+    """Computes the derivatives of points with respect to the heading of their scan."""
     return jnp.stack([-points[..., 1], points[..., 0]], -1)
 
 
 def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Array) -> _Beams:
-    """For each beam those of the scans around, beside the nearest one, that see the same side of a surface nearby."""
+    """Gathers, for each beam, the beams of nearby scans that hit the same side of the same surface."""
     noise = own.noises
     rotation = se2.rotation(poses[:, 2])
     turn = partial(_einsum, "sij,skj->ski", rotation)
@@ -100,7 +100,7 @@ def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b 
     offsets = points[scan, index] - own.points[:, None, None]
     squared = (offsets**2).sum(-1)
     faces_same_way = _einsum("bi,bski->bsk", own.normals, turn(others.normals)[scan, index]) > 0.8
-    # Not the beam itself, which would agree with itself.
+    # The beam itself is left out.
     is_near = (squared < (_WINDOW * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
     slant, levers = (turn(x)[scan, index] for x in (others.points / reach, _levers(others.points)))
     mask = others.is_on_line[scan, index] & is_inside & is_near & faces_same_way
@@ -108,7 +108,7 @@ def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b 
 
 
 def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""]) -> _Lines:
-    """Weighted straight lines, each from the beams around one beam; `normals` are where to start."""
+    """Fits a weighted straight line to the beams around each beam, from the initial `normals`."""
     floor = (_ROUGHNESS * noise) ** 2
     taper = jnp.maximum(1.0 - (beams.offsets**2).sum(-1) / (_WINDOW * noise) ** 2, 0.0) ** 2
     for _ in range(2):
@@ -142,7 +142,7 @@ def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, 
 def _linearise(
     own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"]
 ) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
-    """J^T W J and J^T W r of one scan over all; the first of `others` is the scan itself, at pose zero."""
+    """Computes J^T W J and J^T W r of one scan; the first of `others` is the scan itself, at pose zero."""
     noise = own.noises
     beams = _gather_beams(own, others, nearest, poses)
     lines = _fit_lines(beams, own.normals, noise)
@@ -163,7 +163,7 @@ def _linearise(
 
 @jax.jit
 def _find_nearest(scans: PlanarScans, around: Int[Array, "n s"], poses: Float[Array, "n s 3"]) -> Int[Array, "n b s"]:
-    """The beam of each scan around that ends nearest to each beam."""
+    """Finds the beam of each neighbouring scan that ends nearest to each beam."""
 
     def find(one: tuple[Array, Array]) -> Array:
         rows, relative = one
@@ -187,7 +187,7 @@ def _linearise_all(
 
 
 def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices:
-    """Rows of each scan, itself first, and of others: evenly by nearness out of those within the radius."""
+    """Returns the row of each scan and those of neighbours within the radius, spread evenly by nearness."""
     num_scans = len(poses)
     count = min(num_neighbours, num_scans - 1)
     tree = scipy.spatial.cKDTree(poses[:, :2])
@@ -195,22 +195,22 @@ def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices
     for scan, pose in enumerate(poses):
         num_within = tree.query_ball_point(pose[:2], radius, return_length=True)
         near = np.atleast_1d(tree.query(pose[:2], k=min(num_scans, max(num_within, count + 1)))[1])
-        # Of scans at one place any may come first.
+        # Scans at the same position have no defined order.
         near = near[near != scan]
         around[scan] = [scan, *near[np.linspace(0, len(near) - 1, count).astype(np.int64)]]
     return around
 
 
 def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentConfig | None = None) -> Floats:
-    """Gauss-Newton of all poses against lines that all scans make together.
+    """Optimises all poses by Gauss-Newton against lines that all scans share.
 
     Args:
         scans: n scans with a range noise above zero.
-        poses: (n, 3) start, T_world_scan, within a few deviations of the noise.
+        poses: (n, 3) initial poses T_world_scan, within a few standard deviations of the noise.
         config: settings.
 
     Returns:
-        (n, 3) poses; the first is that of the start. Without noise the start itself: nothing tells what to weigh by.
+        (n, 3) poses; the first is the initial one. Without noise all are the initial ones, since weights are undefined.
     """
     config = config or LineAdjustmentConfig()
     poses = np.asarray(poses, np.float64)
@@ -228,5 +228,5 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentCon
 
 
 def _relative_to_own(poses: Floats, around: Indices) -> Float[np.ndarray, "n s 3"]:
-    """Poses of the scans around each scan in its frame."""
+    """Returns the poses of the neighbouring scans in the frame of each scan."""
     return se2.relative(poses[around[:, 0]][:, None], poses[around]).astype(np.float32)

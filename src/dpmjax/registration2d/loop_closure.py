@@ -1,4 +1,4 @@
-"""Loop closure: pairs of scans far apart in time are matched without trust in the drifted poses, then optimised.
+"""Loop closure: matches of scans far apart in time, independent of drift, and a pose graph with these.
 
 A single pair of half-circle scans in a corridor fits in many wrong ways. Three checks make a loop reliable: the target
 is a small submap of several scans, neighbouring loops agree with it, and the robust graph rejects loops that still
@@ -29,7 +29,7 @@ _SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, 
 _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
 # Number of candidates that are matched at a time, all batches of one shape.
 _BATCH = 512
-# Two views that overlap well are nearer than twice this, in typical ranges, whatever the drift.
+# Two views that overlap well are nearer than twice this, in typical ranges, in addition to the drift.
 _NEARBY = 0.15
 # Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
@@ -37,10 +37,10 @@ _SUBMAP_WIDTH = 2
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.4, 0.08
 # Share of the beams that the weakest eigenvalue of a pair must reach.
 _MIN_EIGENVALUE = 0.03
-# Least number of agreeing loops; the number of scans within which they lie; and the limits of agreement: translation in
+# Least number of agreeing loops; largest number of scans between them; and the limits of agreement: translation in
 # typical ranges, radians.
 _MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
-# Number of loops that must contradict a step before the trajectory is torn there.
+# Weight of a step relative to a loop: number of loops that must contradict a step before the graph rejects it.
 _STEP_TRUST = 30.0
 
 
@@ -49,10 +49,10 @@ class LoopConfig:
     """Settings of the loop search. Lengths are in typical ranges of the scans.
 
     Attributes:
-        num_rounds: searches, each from the poses that the one before has corrected.
-        drift: error of a pose as a share of the way since; it sets where loops are looked for.
+        num_rounds: number of searches, each from the corrected poses of the search before.
+        drift: error of a relative pose as a share of the distance travelled; it bounds the search for loops.
         max_radius: largest distance of a candidate.
-        min_way: way between the two scans of a loop.
+        min_way: least distance travelled between the two scans of a loop.
         max_candidates: largest number of pairs in a round.
     """
 
@@ -80,20 +80,20 @@ class LoopResult(NamedTuple):
 def correct_by_loops(
     scans: PlanarScans, poses: Floats, config: LoopConfig | None = None, *, steps: Edges | None = None
 ) -> LoopResult:
-    """Corrects a drifted trajectory by the loops found in it.
+    """Corrects the drift of a trajectory by loop closures.
 
     Args:
         scans: n scans in time order.
-        poses: (n, 3) start, T_world_scan: locally right, globally drifted.
+        poses: (n, 3) initial poses T_world_scan: locally correct, with drift.
         config: settings.
         steps: edges between neighbours in time; None: those of `poses`.
 
     Returns:
-        LoopResult; the poses are those of the start where there is no loop.
+        LoopResult; without a loop the poses are the initial ones.
     """
     config = config or LoopConfig()
     steps = steps or pose_steps(poses, scans.typical_range)
-    # A step that its own scans do not support may be torn like a loop.
+    # The graph may reject a step with a weak score like a loop.
     is_weak = weak_steps(make_profiles(scans), poses, np.arange(len(poses)))
     step_trust = np.where(is_weak, 1.0, _STEP_TRUST)
     for _ in range(config.num_rounds):
@@ -107,7 +107,7 @@ def correct_by_loops(
 
 
 def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
-    """Loops between scans of one trajectory, each supported by its neighbours; perhaps none."""
+    """Finds loops between scans of one trajectory, each supported by neighbouring loops."""
     unit = scans.typical_range
     source, target = find_candidates(poses, config, unit)
     matches = PairMatches(np.zeros((len(source), 3)), np.zeros(len(source)), np.zeros((len(source), 3, 3)))
@@ -125,7 +125,7 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
 
 
 def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
-    """Pairs of scans that may see the same place: later one (source) and earlier one (target)."""
+    """Finds pairs of scans that may overlap: a later one (source) and an earlier one (target)."""
     way, nearby = _way_along(poses), 2.0 * _NEARBY * typical_range
     radius = min(config.max_radius * typical_range, nearby + config.drift * way[-1])
     first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
@@ -142,7 +142,7 @@ def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> 
 
 
 def _way_along(poses: Floats) -> Floats:
-    """(n,) length of the trajectory up to each pose."""
+    """Computes the length (n,) of the trajectory up to each pose."""
     return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
@@ -151,7 +151,7 @@ def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, 
     unit, way = scans.typical_range, _way_along(poses)
     submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
     predicted = se2.relative(poses[target], poses[source])
-    # The prior has the standard deviation of the drift: it fixes the position along a corridor, where scans cannot.
+    # The prior has the standard deviation of the drift: it constrains the position along a corridor.
     sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
     belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
     prior = PosePrior(predicted, (0.015 * unit) ** 2 * belief)
@@ -161,7 +161,7 @@ def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, 
 
 
 def _guesses(predicted: Floats, typical_range: float) -> Floats:
-    """Guesses of each pair (p, h, 3): scans that overlap are near each other; only the heading is trusted a little."""
+    """Returns guesses (p, h, 3) of each pair: near shifts, with headings around the predicted one."""
     shifts = 1.5 * _NEARBY * typical_range * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
     fan = np.array([(x, y, turn) for turn in np.radians([0.0, -12.0, 12.0]) for x, y in shifts])
     guesses = fan + predicted[:, None] * [0.0, 0.0, 1.0]
@@ -169,7 +169,7 @@ def _guesses(predicted: Floats, typical_range: float) -> Floats:
 
 
 def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> PlanarScans:
-    """A submap around each centre scan, in its frame: some scans before and after it, the nearest first."""
+    """Builds a submap in the frame of each centre scan: some scans before and after it, the nearest first."""
     rows = centres[:, None] + np.array(sorted(range(-_SUBMAP_WIDTH, _SUBMAP_WIDTH + 1), key=abs))
     is_there = (rows >= 0) & (rows < len(poses))
     rows = np.clip(rows, 0, len(poses) - 1)
@@ -181,7 +181,7 @@ def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> Plana
 def _merge_scans(
     scans: PlanarScans, rows: Int[Array, "p w"], is_there: Bool[Array, "p w"], poses: Float[Array, "p w 3"]
 ) -> PlanarScans:
-    """Submaps of w scans each; poses are T_submap_scan."""
+    """Merges w scans into each submap; poses are T_submap_scan."""
     some, there = scans.take(rows), is_there[..., None]
     points, centroids = (se2.transform_points(poses, x) for x in (some.points, some.centroids))
     normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), some.normals)
@@ -192,7 +192,7 @@ def _merge_scans(
 
 
 def count_support(edges: Edges, poses: Floats, typical_range: float) -> Indices:
-    """Number of neighbouring loops that agree with each loop, through the steps of the trajectory between them."""
+    """Counts the neighbouring loops that agree with each loop through the trajectory between them."""
     near = np.abs(edges.source[:, None] - edges.source) <= _NEIGHBOURHOOD
     near &= np.abs(edges.target[:, None] - edges.target) <= _NEIGHBOURHOOD
     near &= (edges.source[:, None] != edges.source) | (edges.target[:, None] != edges.target)

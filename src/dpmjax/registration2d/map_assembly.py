@@ -1,13 +1,13 @@
-"""One map from scored relative poses of pairs, grown scan by scan; every new pose is scored against all placed scans.
+"""One map from scored relative poses of pairs, built scan by scan; each new pose is scored against all placed scans.
 
-A wrong pair scores well for its two scans; it rarely does against all others. So the best pair starts a map, and every
-free scan has the pose hypotheses of its pairs. The hypothesis with the best score against all placed scans is taken
-next. Once all scans are placed, each may move to a better hypothesis, and a robust graph over all pairs that agree
-averages their small errors.
+A wrong relative pose may have a high score for its two scans, but rarely against all other scans. So the best pair
+starts a map, and each remaining scan has the pose hypotheses of its pairs. The hypothesis with the best score against
+all placed scans is added next. Once all scans are placed, each may move to a better hypothesis. A robust pose graph
+over all pairs that agree then averages their small errors.
 
-A single wrong connection between similar places can spoil a map. The scans behind it form a block that is consistent in
-itself and misplaced as a whole, and no scan alone gains by moving. So the map is cut at its weakest connections, and
-the smaller block moves to the best of the poses that any pair across the cut supports.
+A single wrong connection between similar places misplaces a consistent block of scans. No scan alone has a better score
+at another pose then. So the map is cut at its weakest connections, and the smaller block moves to the best of the poses
+that pairs across the cut propose.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from dpmjax.registration2d.pair_search import (
 from dpmjax.registration2d.planar_scans import Floats, Indices
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs
 
-# Matched beams that make up for a contradicting one.
+# Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 4.0
-# How much more the matched beams of neighbours in time count, where there is an order.
+# Weight of the matched beams of neighbours in time, where there is an order.
 _NEXT_WEIGHT = 4.0
 # Largest distance of scans that score each other, in typical ranges, and largest number of nearest scans that do.
 _RADIUS, _NUM_SCORERS = 1.2, 32
@@ -50,13 +50,13 @@ _NUM_CUTS, _NUM_BLOCK_POSES = 6, 48
 
 
 class PoseScorer(NamedTuple):
-    """Scores poses of scans against those of placed ones.
+    """Scores poses of scans against placed scans.
 
     Attributes:
         profiles: n scans.
-        chance: beams that two scans of different places match by chance; they do not count.
-        noisy_share: share of visible beams that seem to contradict where all is right; they do not count.
-        is_ordered: neighbours in the array are neighbours in time.
+        chance: number of beams that two scans of different places match by chance, which is subtracted.
+        noisy_share: share of visible beams that range noise makes contradictory, which is subtracted.
+        is_ordered: True where neighbours in the array are neighbours in time.
     """
 
     profiles: RangeProfiles
@@ -70,7 +70,7 @@ class PoseScorer(NamedTuple):
         return _RADIUS * self.profiles.scans.typical_range
 
     def score(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
-        """(m,) score of each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
+        """Scores (m,) each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
         total, height = np.zeros(len(scan)), max(1, _BLOCK // max(len(placed), 1))
         for start in range(0, len(scan), height):
             part = slice(start, start + height)
@@ -78,7 +78,7 @@ class PoseScorer(NamedTuple):
         return total
 
     def pairwise_scores(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
-        """(m, k) score of each `scan` against each of `placed`; 0 for those too far apart."""
+        """Scores (m, k) each `scan` against each of `placed`; 0 for scans too far apart."""
         apart = candidates[:, None, :2] - poses[placed][None, :, :2]
         apart = np.hypot(apart[..., 0], apart[..., 1])
         apart[scan[:, None] == placed[None]] = np.inf
@@ -91,9 +91,9 @@ class PoseScorer(NamedTuple):
         return scores
 
     def score_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
-        """(p,) matched less weighted contradicting beams of pairs at `poses`, T_target_source, above chance."""
+        """Computes matched beams above chance less weighted contradicting beams (p,) of pairs at T_target_source."""
         views = compare_pairs(self.profiles, source, target, poses, stride=4)
-        # Matches by chance do not count; else rooms would be stacked on rooms.
+        # Without this, chance matches would favour poses with more overlap, such as one room on top of another.
         is_next = self.is_ordered & (np.abs(source - target) == 1)
         matched = np.maximum(views.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
         matched *= np.where(is_next, _NEXT_WEIGHT, 1.0)
@@ -101,7 +101,7 @@ class PoseScorer(NamedTuple):
         return np.asarray(matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
 
     def score_map(self, poses: Floats) -> Floats:
-        """(n, n) pairwise scores of a map, below the diagonal; 0 for scans too far apart."""
+        """Computes the pairwise scores (n, n) of a map, below the diagonal; 0 for scans too far apart."""
         source, target = np.tril_indices(len(poses), k=-1)
         relative = se2.relative(poses[target], poses[source])
         near = np.hypot(relative[:, 0], relative[:, 1]) < self.radius
@@ -111,10 +111,10 @@ class PoseScorer(NamedTuple):
 
 
 def add_up(scores: Floats) -> Floats:
-    """Total of pairwise scores: negative ones in full, and the k-th best positive one by 1 / k.
+    """Sums pairwise scores: negative ones with weight 1, the k-th best positive one with weight 1 / k.
 
-    A pose needs a few scans that match it well. Were all counted alike, rooms that look alike would be stacked: the
-    more scans overlap, the more beams match.
+    A pose needs a few scans that match it well. Equal weights would favour overlap and put rooms that look alike on
+    top of each other.
 
     Args:
         scores: (..., k).
@@ -127,17 +127,17 @@ def add_up(scores: Floats) -> Floats:
 
 
 def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> NDArray[np.bool_]:
-    """Returns True where a score is more than 2 % above a reference: below that it is the same pose by another pair."""
+    """Returns True where a score exceeds a reference by more than 2 % of the reference's magnitude."""
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
 
 def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: bool = False) -> Floats:
-    """Poses of all scans from candidates of their pairs, without a first guess.
+    """Assembles one map of all scans from candidates of their pairs, without initial poses.
 
     Args:
         profiles: n scans.
         candidates: of pairs that connect all scans.
-        is_ordered: neighbours in the array are neighbours in time, so likely to overlap.
+        is_ordered: True where neighbours in the array are neighbours in time, so likely to overlap.
 
     Returns:
         (n, 3) T_world_scan; the first pose is zero.
@@ -155,7 +155,7 @@ def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: boo
 
 
 def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
-    """The best pairs, no scan in two of them."""
+    """Selects the rows of the best disjoint pairs."""
     chosen: list[int] = []
     used: set[int] = set()
     for row in np.argsort(-hypotheses.scores, kind="stable"):
@@ -167,10 +167,10 @@ def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
 
 
 def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
-    """Poses of all scans, grown from the anchor of one hypothesis."""
+    """Places all scans one by one, from the anchor of one hypothesis."""
     scan, anchor, num_scans = hypotheses.scan, hypotheses.anchor, len(scorer.profiles)
     poses, is_placed = np.zeros((num_scans, 3)), np.zeros(num_scans, bool)
-    # Of each open hypothesis: the pose of its scan in the world, and its score against each placed scan.
+    # World pose of each usable hypothesis, and its score against each placed scan.
     worlds, scores = np.zeros((len(scan), 3)), np.zeros((len(scan), num_scans))
     newest, pose = int(anchor[seed]), np.zeros(3)
     while True:
@@ -191,7 +191,7 @@ def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
 
 
 def settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
-    """Rounds in which scans move, until none does."""
+    """Moves scans to better pose hypotheses until no scan moves or the limit of rounds is reached."""
     for _ in range(_NUM_REVISIONS):
         poses, num_moved = _revise(poses, hypotheses, scorer)
         if not num_moved:
@@ -200,7 +200,7 @@ def settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
 
 
 def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[Floats, int]:
-    """Moves each scan, the worst supported first, to its hypothesis with the best score; and counts the moves."""
+    """Moves each scan, the lowest score first, to its hypothesis with the best score, and counts the moves."""
     poses, everyone, num_moved = poses.copy(), np.arange(len(poses)), 0
     support = scorer.score(everyone, poses, everyone, poses)
     score = scorer.score(hypotheses.scan, hypotheses.world_poses(poses), everyone, poses)
@@ -228,7 +228,7 @@ def move_blocks(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tu
         scorer: of the map.
 
     Returns:
-        (n, 3) poses, and how many blocks have moved.
+        (n, 3) poses, and the number of blocks that have moved.
     """
     num_moved = 0
     for cut in range(_NUM_CUTS):
@@ -245,7 +245,15 @@ def move_blocks(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tu
 
 
 def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
-    """The smaller sides (n,) of the cuts at the weakest connections of the best tree of pairs, the weakest first."""
+    """Cuts the maximum spanning tree at each of its weakest edges, and returns the smaller component of each cut.
+
+    Args:
+        values: (n, n) pairwise scores of a map, below the diagonal.
+        count: largest number of cuts.
+
+    Returns:
+        A mask (n,) of the smaller component for each cut, the weakest edge first.
+    """
     cost = np.tril(values.max() + 1.0 - np.maximum(values, 0.0), k=-1)
     tree = scipy.sparse.csgraph.minimum_spanning_tree(scipy.sparse.csr_matrix(cost)).tocoo()
     blocks = []
@@ -261,7 +269,7 @@ def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
 def _better_motion(
     poses: Floats, block: NDArray[np.bool_], hypotheses: Hypotheses, scorer: PoseScorer, values: Floats
 ) -> Floats | None:
-    """The motion (3,) of the block in the world with the best score, of those by pairs across the cut; None: none."""
+    """Finds the best motion (3,) of the block in the world, proposed by a pair across the cut; None: none is better."""
     across = np.flatnonzero(block[hypotheses.scan] & ~block[hypotheses.anchor])
     across = across[np.argsort(-hypotheses.scores[across], kind="stable")[:_NUM_BLOCK_POSES]]
     best = hypotheses.take(across)

@@ -1,8 +1,8 @@
-"""Odometry as evidence: its scale, its noise and its faults, estimated from the steps that the scans fix by themselves.
+"""Calibration of odometry: its scale, noise and faults, estimated from steps that the scans alone constrain.
 
-Most steps of a log are clear: two scans share walls in two directions and fit nowhere else. Against these the odometry
-is calibrated, and the same standard deviations hold for the steps that the scans leave open. A sensor whose beams are
-in the reversed order, or whose y axis points to the right, turns against its odometry at every bend.
+Most steps of a log are clear: two scans share walls in two directions, and the score has one mode. The odometry is
+calibrated with these steps, and the same standard deviations hold for steps that the scans leave unconstrained. If the
+beams are in reversed order, or the y axis points to the right, the turns of the scans have the opposite sign.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from dpmjax.registration2d.step_slides import slide_steps
 
 # Score above which a step is clear.
 _CLEAR_SCORE = 0.45
-# Longer steps are no guesses, typical ranges.
+# Longer steps of the odometry are not used as guesses, typical ranges.
 _FARTHEST = 2.0
-# Least number of clear steps to calibrate with, and to recognise a fault with.
+# Least number of clear steps for a calibration, and for the detection of a fault.
 _LEAST_STEPS = 5
-# Shortest moves (typical ranges) and turns (radians) that tell a scale or a sign.
+# Least translation (typical ranges) and turn (radians) from which a scale or a sign is estimated.
 _LEAST_MOVE, _LEAST_TURN = 0.02, 0.08
 # Floors of the standard deviations of a step: typical ranges, radians; and per unit of length moved or turned.
 _FLOOR, _LENGTH_FLOOR, _TURN_FLOOR = (0.002, 0.005), 0.02, 0.02
@@ -54,7 +54,7 @@ _FAULTS: dict[str, Callable[[Floats], Floats]] = {
 
 
 class ClearSteps(NamedTuple):
-    """Steps between neighbours in time that the scans fix by themselves.
+    """Steps between neighbours in time that the scans alone constrain.
 
     Attributes:
         rows: (m,) step i leads from scan i to scan i + 1.
@@ -66,10 +66,10 @@ class ClearSteps(NamedTuple):
 
 
 class Odometry(NamedTuple):
-    """Odometry, or a given trajectory, as evidence.
+    """Calibrated odometry, or a calibrated given trajectory.
 
     Attributes:
-        poses: (n, 3) T_world_scan, a fault of its axes or units corrected.
+        poses: (n, 3) T_world_scan, corrected for a fault of its axes or units.
         prior: the steps at the scale of the scans, with their standard deviations.
         fault: sentence on a wrong axis or unit; None: none found.
     """
@@ -80,12 +80,12 @@ class Odometry(NamedTuple):
 
     @property
     def is_mirrored(self) -> bool:
-        """True where the scans are mirrored against the odometry; it does not tell which of the two is right."""
+        """True where the scans are mirrored against the odometry; either of the two may be wrong."""
         return self.fault == MIRRORED
 
 
 def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
-    """Estimates scale, noise and faults of odometry from the steps that the scans fix by themselves.
+    """Estimates scale, noise and faults of odometry from the steps that the scans alone constrain.
 
     Args:
         scans: n scans in time order, two at least.
@@ -102,14 +102,14 @@ def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
 
 
 def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
-    """Aligns each scan with the one before, from no motion and from that of the odometry under each of its faults.
+    """Aligns each scan with the one before, from zero motion and from that of the odometry under each fault.
 
     Args:
         scans: n scans in time order.
         odometry: (n, 3) raw poses.
 
     Returns:
-        ClearSteps: those that fit well, and nowhere else.
+        ClearSteps: steps with a high score and one mode.
     """
     source, target = scans.take(slice(1, None)), scans.take(slice(len(scans) - 1))
     ways = [odometry, *(change(odometry) for change in _FAULTS.values())]
@@ -125,7 +125,7 @@ def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
 
 
 def _find_fault(clear: ClearSteps, odometry: Floats, unit: float) -> str | None:
-    """Returns the fault under which the odometry agrees with the clear steps, where it does not without one."""
+    """Returns the fault under which the odometry agrees with the clear steps; None where it agrees without a fault."""
     share, num_told = _agreement(clear, odometry, unit)
     if num_told < _LEAST_STEPS or share > _SOUND_SHARE:
         return None
@@ -135,7 +135,10 @@ def _find_fault(clear: ClearSteps, odometry: Floats, unit: float) -> str | None:
 
 
 def _agreement(clear: ClearSteps, odometry: Floats, unit: float) -> tuple[float, int]:
-    """Returns the share of the clear steps with a turn, or a move if none has one, that odometry agrees with."""
+    """Returns the share of the clear steps that the odometry agrees with, and the number of these steps.
+
+    Steps with a turn are used; if they are too few, steps with a translation.
+    """
     expected = se2.relative(odometry[clear.rows], odometry[clear.rows + 1])
     off = clear.steps - expected
     off[:, 2] = se2.wrap_angle(off[:, 2])
@@ -150,7 +153,7 @@ def _agreement(clear: ClearSteps, odometry: Floats, unit: float) -> tuple[float,
 
 
 def _calibrate(clear: ClearSteps, expected: Floats, unit: float) -> StepPrior:
-    """Returns the expected steps at the scale of the clear ones, with the spread of the clear ones about them."""
+    """Estimates the scale of the odometry and its standard deviations from the clear steps."""
     told = expected[clear.rows]
     lengths, measured = np.hypot(told[:, 0], told[:, 1]), np.hypot(clear.steps[:, 0], clear.steps[:, 1])
     is_move, is_turn = lengths > _LEAST_MOVE * unit, np.abs(told[:, 2]) > _LEAST_TURN
@@ -161,7 +164,7 @@ def _calibrate(clear: ClearSteps, expected: Floats, unit: float) -> StepPrior:
     off[:, 2] = np.abs(se2.wrap_angle(off[:, 2]))
     floors = np.array(_FLOOR) * [unit, 1.0]
     length, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
-    # A wheel that slips errs by a share of the way; a turn moves a sensor that is mounted off the axis.
+    # Wheel slip causes errors in proportion to the distance; a turn moves a sensor that is mounted off the axis.
     size = np.hypot(length, _LEAST_MOVE * unit)
     share = max(_LENGTH_FLOOR, _spread((off[:, :2] / size[clear.rows][:, None]).ravel()))
     turn_share = max(_TURN_FLOOR, _spread(off[is_turn, 2] / turn[clear.rows][is_turn]))
@@ -171,7 +174,7 @@ def _calibrate(clear: ClearSteps, expected: Floats, unit: float) -> StepPrior:
 
 
 def _robust_scale(ratios: Floats) -> float:
-    """Returns the median of ratios where it differs clearly from 1: few noisy steps would bend a long way."""
+    """Returns the median of ratios where it differs clearly from 1, else 1."""
     if len(ratios) < _LEAST_STEPS:
         return 1.0
     scale = float(np.median(ratios))

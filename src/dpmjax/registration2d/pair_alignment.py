@@ -1,4 +1,4 @@
-"""Robust alignment of pairs of planar scans, many at once: the kernel under the chain, the loop search and refinement.
+"""Robust alignment of many pairs of planar scans at once, for incremental ICP, loop search and refinement.
 
 A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the
 right, T_target_source @ exp(delta). So every pair costs a 3 x 3 matrix and a 3-vector.
@@ -22,7 +22,7 @@ from dpmjax.types import AnyArray
 
 # GPUs multiply in TF32 by default, with errors of centimetres at a hundred metres.
 _matmul = partial(jnp.matmul, precision="highest")
-# How many distances one batch of pairs may hold at once: 128 MB of float32 with what XLA keeps beside them.
+# Largest number of distances of one batch of pairs: 128 MB of float32 with the temporaries of XLA.
 _LIVE_DISTANCES = 1 << 24
 
 Metric = Literal["point", "plane"]
@@ -51,7 +51,7 @@ class Schedule:
             raise ValueError(f"schedule: gates, kernels and iterations must be positive, got {self}")
 
     def gates_and_kernels(self, typical_range: float, noise: float) -> tuple[jax.Array, jax.Array]:
-        """Gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
+        """Returns gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
         gates, kernels = (typical_range * np.geomspace(*x, self.num_iterations) for x in (self.gate, self.kernel))
         gates, kernels = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
         return jnp.asarray(gates, jnp.float32), jnp.asarray(kernels, jnp.float32)
@@ -66,7 +66,7 @@ class PairMatches(NamedTuple):
 
     Attributes:
         poses: (p, 3) x, y, heading of T_target_source.
-        fitness: (p,) robust share of beams that found their partner, 0 to 1.
+        fitness: (p,) robust share of matched beams, 0 to 1.
         information: (p, 3, 3) J^T W J in the source frame, one unit a beam.
     """
 
@@ -75,16 +75,16 @@ class PairMatches(NamedTuple):
     information: Floats
 
     def weakest_eigenvalue(self) -> Floats:
-        """(p,) information in the direction of the translation that the scans hold least, in beams."""
+        """Computes the information (p,) along the least constrained direction of the translation, in beams."""
         return np.asarray(np.linalg.eigvalsh(self.information[:, :2, :2])[:, 0], np.float64)
 
 
 class PosePrior(NamedTuple):
-    """Prior of relative poses, which fixes the directions that the scans leave open.
+    """Prior of relative poses, which constrains the directions that the scans do not constrain.
 
     Attributes:
         mean: expected relative pose (x, y, heading).
-        information: inverse variances of its three parts, in units of one beam's information; zero: no prior.
+        information: inverse variances of x, y and heading, in units of one beam's information; zero: no prior.
     """
 
     mean: Float[AnyArray, "... 3"]
@@ -144,18 +144,18 @@ def linearise_pair(
 
 
 def _move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """The pose after a small step in its own frame (first order: the step is a few percent of the pose)."""
+    """Applies a small step in the frame of the pose, to first order."""
     return pose + jnp.append(_matmul(se2.rotation(pose[2]), delta[:2]), delta[2])
 
 
 def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Float[Array, " 3"]:
-    """The Gauss-Newton step of the scans and the prior together."""
+    """Computes the Gauss-Newton step of the scans and the prior together."""
     offset = pose - prior.mean
     offset = offset.at[2].set(se2.wrap_angle(offset[2]))
     rotation = jnp.eye(3).at[:2, :2].set(se2.rotation(pose[2]))
     pull = _matmul(rotation.T, prior.information * offset)
     belief = _matmul(rotation.T, prior.information[:, None] * rotation)
-    # Damping in proportion to each axis: a pair that fixes one direction only (a corridor) moves in that one alone.
+    # Damping in proportion to each axis: a pair in a corridor moves along its constrained direction alone.
     diagonal = jnp.diagonal(system.information)
     damping = 1e-3 * diagonal + 1e-6 * diagonal.max() + 1e-9
     return jnp.linalg.solve(system.information + belief + jnp.diag(damping), -system.gradient - pull)
@@ -165,7 +165,7 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Fl
 def _align(
     pairs: tuple[PlanarScans, PlanarScans, Array, PosePrior], scales: tuple[Array, Array], *, metric: Metric
 ) -> tuple[Float[Array, "p 3"], PairSystem]:
-    """Iterated closest point of (source, target, guess, prior); `scales` are gate and kernel of each iteration."""
+    """Aligns pairs (source, target, guess, prior) by ICP; `scales` are gate and kernel of each iteration."""
 
     def align(source: PlanarScans, target: PlanarScans, guess: Array, prior: PosePrior) -> tuple[Array, PairSystem]:
         def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
@@ -187,8 +187,8 @@ def match_pairs(
     Args:
         source: p scans.
         target: p scans, or submaps with any number of points.
-        guesses: (p, h, 3) relative poses T_target_source to start from.
-        schedule: how the search distance shrinks.
+        guesses: (p, h, 3) initial relative poses T_target_source.
+        schedule: search distances of the iterations.
         prior: prior of the relative poses, (p, 3) each; None: none.
         metric: distance to the target's lines ("plane") or points.
 

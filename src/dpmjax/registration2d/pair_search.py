@@ -22,19 +22,18 @@ from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d.planar_scans import Floats, Indices, Tolerances, batches
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
-# Pairs of one turn are filled up to a power of two, at least this, so that few shapes are compiled; more scans than
-# this to a multiple of it.
-# Small, as the last batch is filled up; larger ones are no quicker, for `lax.map` goes through them piece by piece.
+# The number of pairs of one turn is rounded up to a power of two, at least this, so that few shapes compile; the number
+# of scans is rounded up to a multiple of this. Larger values are no quicker, because `lax.map` works piece by piece.
 _SMALLEST = 32
 _REFINE_BATCH = 32
 # A pair agrees with a map within this: translation in typical ranges, radians.
 AGREEMENT = (0.06, 0.1)
-# Share of its beams that a pair must hold by to be an edge; and the accuracy of a pair with all its beams: typical
-# ranges, radians.
+# Least score of an edge as a share of the beams; and the accuracy of a pair with all its beams matched: typical ranges,
+# radians.
 _MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
 # Pairs that are searched at a time: their spectra and images take at most 250 MB at 128 cells.
 _SEARCH_BATCH = 512
-# Matched beams that make up for a contradicting one.
+# Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 2.0
 
 
@@ -43,16 +42,16 @@ class CorrelativeConfig:
     """Settings of the search. Lengths are in typical ranges of the scans.
 
     Attributes:
-        num_cells: cells along a side of the images; a scan fills the inner half, so that no shift wraps around.
+        num_cells: number of cells along a side of the images; a scan fills the inner half, so that no shift wraps.
         cell: side of a cell.
-        num_turns: turns that are tried in a circle.
-        free_weight: how much a cell of free space counts against one of surface.
-        num_peaks: shifts that are kept of each turn, from different blocks of cells.
-        block: cells along a block.
-        num_candidates: poses that are kept of each pair.
-        apart: two candidates of a pair differ by more than this: translation, radians.
-        num_levels: local grids, each half as coarse as the one before.
-        max_shift: longer shifts are not searched; None: all within half the images.
+        num_turns: number of turns in a circle.
+        free_weight: weight of a cell of free space relative to a cell of surface.
+        num_peaks: number of shifts kept for each turn, from different blocks of cells.
+        block: number of cells along a block.
+        num_candidates: number of poses kept for each pair.
+        apart: least difference of two candidates of a pair: translation, radians.
+        num_levels: number of local grids, each with half the spacing of the one before.
+        max_shift: largest shift; None: half the side of the images.
     """
 
     num_cells: int = 128
@@ -78,7 +77,7 @@ class Candidates(NamedTuple):
         source: (p,) rows.
         target: (p,) rows.
         poses: (p, k, 3) T_target_source.
-        scores: (p, k) matched less weighted contradicting beams; minus infinity where there is no further candidate.
+        scores: (p, k) matched less weighted contradicting beams; minus infinity for missing candidates.
     """
 
     source: Indices
@@ -93,7 +92,7 @@ def join_candidates(*candidates: Candidates) -> Candidates:
 
 
 def agreeing_edges(poses: Floats, candidates: Candidates, profiles: RangeProfiles) -> Edges:
-    """Edges of the pairs with a candidate that agrees with the map; of each pair the nearest one."""
+    """Returns edges of the pairs with a candidate that agrees with the map; of each pair the nearest candidate."""
     typical_range, num_beams = profiles.scans.typical_range, np.asarray(profiles.scans.mask.sum(1), np.float64)
     beams = num_beams[candidates.source] + num_beams[candidates.target]
     shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
@@ -111,14 +110,14 @@ def agreeing_edges(poses: Floats, candidates: Candidates, profiles: RangeProfile
 
 
 def chance_level(candidates: Candidates) -> float:
-    """Score of a wrong pose of a pair, the median: second candidates are mostly wrong."""
+    """Estimates the score of a wrong pose of a pair: the median of second candidates, which are mostly wrong."""
     second = candidates.scores[:, 1]
     second = second[np.isfinite(second)]
     return max(0.0, float(np.median(second))) if len(second) else 0.0
 
 
 def noisy_share(profiles: RangeProfiles, candidates: Candidates) -> float:
-    """Share of visible beams that seem to contradict in pairs that are right: what noise alone does."""
+    """Computes a bound on the share of beams that range noise makes contradictory, from the best-scored pairs."""
     best = np.argsort(-candidates.scores[:, 0])[: len(profiles)]
     views = compare_pairs(profiles, candidates.source[best], candidates.target[best], candidates.poses[best, 0])
     share = views.contradicted / np.maximum(views.visible, 1.0)
@@ -135,7 +134,7 @@ class Hypotheses(NamedTuple):
 
     @classmethod
     def of(cls, candidates: Candidates) -> Hypotheses:
-        """Hypotheses of all candidates with a positive score."""
+        """Makes hypotheses of all candidates with a positive score."""
         count = candidates.scores.shape[1]
         source, target = np.repeat(candidates.source, count), np.repeat(candidates.target, count)
         poses, scores = candidates.poses.reshape(-1, 3), candidates.scores.reshape(-1)
@@ -145,11 +144,11 @@ class Hypotheses(NamedTuple):
         return cls(*(np.concatenate(x) for x in both))
 
     def take(self, rows: NDArray[np.integer]) -> Hypotheses:
-        """The hypotheses of these rows."""
+        """Returns the hypotheses of these rows."""
         return Hypotheses(*(x[rows] for x in self))
 
     def world_poses(self, poses: Floats) -> Floats:
-        """(h, 3) pose of each scan in the world, by that of its anchor."""
+        """Computes the world pose (h, 3) of each scan from the world pose of its anchor."""
         return np.asarray(se2.compose(poses[self.anchor], self.poses))
 
 
@@ -157,7 +156,7 @@ class Hypotheses(NamedTuple):
 def _spectra(
     profiles: RangeProfiles, turn: Float[Array, ""], cell: Float[Array, ""], config: CorrelativeConfig
 ) -> tuple[Complex[Array, "n g f"], Complex[Array, "n g f"]]:
-    """Spectra of the two images of each scan, turned by `turn`, its sensor in the middle."""
+    """Computes the spectra of the two images of each scan, turned by `turn`, its sensor in the middle."""
     inner = config.num_cells // 2
     axis = (jnp.arange(inner) - inner // 2) * cell
     x, y = jnp.meshgrid(axis, axis)
@@ -174,7 +173,7 @@ def _spectra(
     # Scans fill the inner half alone, and drawing takes longer than the transform.
     margin = (config.num_cells - inner) // 2
     images = jnp.pad(jnp.stack([hit, evidence]), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
-    # One transform of both: two that run at once wait for each other's threads for ever on a CPU (XLA of JAX 0.11).
+    # One transform of both, because two concurrent transforms deadlock on a CPU (XLA of JAX 0.11).
     spectra = jnp.fft.rfft2(images)
     return spectra[0], spectra[1]
 
@@ -183,7 +182,7 @@ def _spectra(
 def _search_turn(
     sources: tuple[Array, Array], targets: tuple[Array, Array], pairs: tuple[Array, Array], *, config: CorrelativeConfig
 ) -> tuple[Float[Array, "p k"], Int[Array, "p k 2"]]:
-    """Best scores and shifts (x, y in cells) of pairs of spectra, each from another block of cells."""
+    """Finds the best scores and shifts (x, y in cells) of pairs of spectra, each from another block of cells."""
     size, block = config.num_cells, config.block
     num_blocks = size // block
     apart = jnp.minimum(jnp.arange(size), size - jnp.arange(size)) * config.cell
@@ -214,14 +213,14 @@ def search_pairs(
     *,
     turns: NDArray[np.bool_] | None = None,
 ) -> Candidates:
-    """Finds the most likely relative poses of pairs of scans, from no guess at all.
+    """Finds the best-scored relative poses of pairs of scans, without initial poses.
 
     Args:
         profiles: n scans.
-        source: (p,) rows; these scans are turned, so few different ones are quicker.
+        source: (p,) rows; these scans are turned, so fewer distinct rows are quicker.
         target: (p,) rows.
         config: settings.
-        turns: (p, num_turns) which headings of T_target_source to try, multiples of 2 pi / num_turns; None: all.
+        turns: (p, num_turns) True for headings of T_target_source to try, multiples of 2 pi / num_turns; None: all.
 
     Returns:
         Candidates.
@@ -240,7 +239,7 @@ def search_pairs(
 def _search_batch(
     profiles: RangeProfiles, pairs: tuple[Indices, Indices], config: CorrelativeConfig, turns: NDArray[np.bool_] | None
 ) -> Candidates:
-    """Candidates of some pairs."""
+    """Finds candidates of one batch of pairs."""
     unit, (source, target) = profiles.scans.typical_range, pairs
     cell = config.cell * unit
     sources, compact_source = _used_profiles(profiles, source)
@@ -262,12 +261,12 @@ def _search_batch(
         poses[rows, number, :, :2] = cell * np.asarray(shift, np.float64)[: len(rows)]
         poses[rows, number, :, 2] = se2.wrap_angle(turn)
     found = Candidates(source, target, poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1))
-    # After the refinement two may have met at one pose.
+    # Two candidates may converge to one pose in the refinement.
     return _keep_apart(_refine(profiles, _keep_apart(found, config, unit), config), config, unit)
 
 
 def _used_profiles(profiles: RangeProfiles, rows: Indices) -> tuple[RangeProfiles, Indices]:
-    """The profiles of these rows, each once, filled up so that few shapes compile; and where each row is among them."""
+    """Returns the distinct profiles of these rows, padded so that few shapes compile, and the index of each row."""
     used, compact = np.unique(rows, return_inverse=True)
     filled = (
         1 << max(len(used) - 1, 0).bit_length() if len(used) < _SMALLEST else _SMALLEST * -(-len(used) // _SMALLEST)
@@ -276,7 +275,7 @@ def _used_profiles(profiles: RangeProfiles, rows: Indices) -> tuple[RangeProfile
 
 
 def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
-    """The best poses of each pair that are no neighbours of a better one."""
+    """Selects the best poses of each pair by non-maximum suppression."""
     poses, scores, rows = found.poses, found.scores.copy(), np.arange(len(found.poses))
     best = np.zeros((len(poses), config.num_candidates, 3))
     values = np.full(best.shape[:2], -np.inf)
@@ -293,7 +292,7 @@ def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: flo
 def _refine_batch(
     profiles: RangeProfiles, pairs: tuple[Array, Array, Array], step: Float[Array, " 3"], tolerances: Tolerances
 ) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
-    """The best pose, and its score, on a grid of five steps along each axis around the pose of each pair."""
+    """Finds the best pose of each pair, and its score, on a grid of five steps along each axis around the pose."""
     axis = jnp.arange(-2.0, 3.0)
     grid = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3) * step
 
@@ -309,7 +308,7 @@ def _refine_batch(
 
 
 def _refine(profiles: RangeProfiles, found: Candidates, config: CorrelativeConfig) -> Candidates:
-    """Candidates refined on local grids from half a cell down."""
+    """Refines candidates on local grids, from a spacing of half a cell down."""
     cell = config.cell * profiles.scans.typical_range
     first, which = np.nonzero(np.isfinite(found.scores))
     poses, scores = found.poses.copy(), np.full(found.scores.shape, -np.inf)

@@ -1,4 +1,4 @@
-"""Registration of planar scans by one call: a start, DeepMapping from it, refinement, and the choice among the results.
+"""Registration of planar scans by one call: initial poses, DeepMapping, refinement, and the choice among the results.
 
 `register_scans` joins the functions of this room with DeepMapping; no other file of the room imports `deepmapping`. A
 candidate is a trajectory under the name of the method that produced it: "DeepMapping" is the result of L-Net or M-Net.
@@ -32,7 +32,7 @@ from dpmjax.registration2d.refinement import refine
 from dpmjax.types import ScanSet
 
 StartName = Literal["auto", "odometry", "icp-plane", "icp-point", "global", "zero"]
-"""Where the poses start; "auto": see `register_scans`."""
+"""Name of the initial poses; "auto": see `register_scans`."""
 
 DEEPMAPPING = "DeepMapping"
 GIVEN_POSES = "given poses"
@@ -43,19 +43,19 @@ START_NAMES: dict[str, str] = {
     "odometry": "odometry",
     "zero": "zero poses",
 }
-"""The name of the candidate that each start makes."""
+"""Name of the candidate of each kind of initial poses."""
 
 STARTS_FROM_SCANS = ("icp-plane", "icp-point", "global")
 """Starts that use the scans alone."""
 
 Engine = Callable[..., Fit]
-"""What trains, as `fit_deepmapping(engine=...)` takes it."""
+"""Training function, as `fit_deepmapping(engine=...)` takes it."""
 EngineOf = Callable[[Indices], Engine]
 """Makes the engine of the scans of these rows, in this order."""
 
 # Up to this many scans without odometry are all registered.
 _MAX_WHOLE = 256
-# A fit whose map takes this many times the nats of the refined start is not refined.
+# A fit is not refined if its map has a code length above this multiple of that of the refined initial poses.
 _LEAST_PROMISING = 1.15
 
 
@@ -64,13 +64,12 @@ class RegistrationConfig:
     """Settings of `register_scans`.
 
     Attributes:
-        is_ordered: the scans lie in the order of time.
-        refine: the start and the fit are refined, too, and the better map counts.
+        is_ordered: True where the scans are in the order of time.
+        refine: True to refine the initial poses and the fit, and to keep the best map.
         fit: settings of DeepMapping; presets are `dpmjax.deepmapping.preset`.
-        min_distance: scans of a recording are registered where they lie at least this far apart, in the unit of the
-            scans, or are turned by `min_turn`. The remaining scans follow the motion between these. None: all are
-            registered.
-        min_turn: scans of a recording that are turned at least this far against each other are registered, radians.
+        min_distance: least distance of two registered scans of a recording, in the unit of the scans, unless they are
+            turned by `min_turn`. The remaining scans follow the motion between these. None: all are registered.
+        min_turn: least turn between two registered scans nearer than `min_distance`, radians.
 
     Raises:
         ValueError: a limit is not positive.
@@ -95,8 +94,8 @@ class RegistrationHooks(NamedTuple):
             after each call of the step of the fit.
         stop: called before each stage that may be left out and before each call of the step of the fit. Where it
             returns True, the fit ends, and the best of the candidates so far is kept.
-        engine: called with the rows of the scans that are fitted, in the order of the fit; returns what trains them,
-            as `fit_deepmapping(engine=...)`, which reports and stops by itself. None: `deepmapping.fit`.
+        engine: called with the rows of the scans that are fitted, in the order of the fit; returns the `engine` of
+            `fit_deepmapping`, which must report progress and handle stops. None: `deepmapping.fit`.
     """
 
     on_progress: Callable[[str, float], None] = lambda _stage, _share: None
@@ -109,7 +108,7 @@ class Candidate(NamedTuple):
 
     Attributes:
         poses: (k, 3) T_world_scan of the registered scans.
-        score: of its map, by the scans alone.
+        score: of the map, by the scans alone.
     """
 
     poses: Floats
@@ -123,9 +122,8 @@ class RegisteredScans(NamedTuple):
         poses: (n, 3) T_world_scan of all scans, x, y, heading, in the unit of the scans.
         kept: name of the candidate that the poses come from.
         start: name of the candidate that the fit started from.
-        candidates: all candidates by name; DeepMapping is one if it has done a step.
-        assessment: of the kept candidate: `is_trusted` tells whether its map can be trusted, `uncertain_scans` (rows of
-            all scans) for which of the registered scans it cannot, and `fault` what contradicts the odometry.
+        candidates: all candidates by name; with DeepMapping if it has done a step.
+        assessment: of the kept candidate; `uncertain_scans` are rows of all scans.
         fitted: DeepMapping of the registered scans; untrained where the fit was stopped before its first step.
         recording: all scans, and the rows of those that were registered.
     """
@@ -140,7 +138,7 @@ class RegisteredScans(NamedTuple):
 
     @property
     def T_world_scan(self) -> Floats:
-        """(n, 3, 3) the poses as matrices."""
+        """Poses as matrices (n, 3, 3)."""
         return se2.to_matrix(self.poses)
 
 
@@ -153,7 +151,7 @@ def register_scans(
     odometry: ArrayLike | None = None,
     hooks: RegistrationHooks | None = None,
 ) -> RegisteredScans:
-    """Registers planar scans: a start, DeepMapping from it, both refined, and of these the best map.
+    """Registers planar scans from initial poses by DeepMapping and refinement, and keeps the best map.
 
     The map is chosen and assessed by the scans alone. Where the start was "auto", it was the odometry, and the map
     cannot be trusted, the scans are registered without odometry, too.
@@ -217,7 +215,7 @@ def _choose(
         kept, scores = choose_trajectory(scans, candidates)
         return kept, scores, assess_trajectory(scans, candidates[kept])
     kept, scores = choose_trajectory(scans, candidates, prior=evidence.prior)
-    # Units are corrected; of a mirrored log nothing tells which side is right.
+    # Units are corrected; in a mirrored log either the scans or the odometry may be wrong.
     fault = evidence.fault if evidence.is_mirrored else None
     assessment = assess_trajectory(scans, candidates[kept], prior=evidence.prior, fault=fault)
     return kept, scores, assessment._replace(fault=evidence.fault)
@@ -230,7 +228,7 @@ def _find_evidence(
     recording: Recording,
     hooks: RegistrationHooks,
 ) -> Odometry | None:
-    """Calibrates the odometry, or the given poses without any; None where the start uses the scans alone."""
+    """Calibrates the odometry, or given initial poses; returns None for initial poses from the scans alone."""
     given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
     if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
         return None
@@ -241,7 +239,7 @@ def _find_evidence(
 def _checked_start(
     start: StartName | ArrayLike, odometry: Floats | None, count: int, config: RegistrationConfig
 ) -> str | Floats:
-    """Returns the start with "auto" resolved, or the given poses."""
+    """Returns the name of the initial poses with "auto" resolved, or the given initial poses."""
     if not config.is_ordered and odometry is not None:
         raise ValueError("odometry: expected None, because the scans are not ordered")
     if not isinstance(start, str):
@@ -260,7 +258,7 @@ def _checked_start(
 def _choose_scans(
     scans: ScanSet, odometry: Floats | None, start: str | Floats, config: RegistrationConfig, hooks: RegistrationHooks
 ) -> Recording:
-    """Chooses the scans that are registered by the odometry, or by the scans where the start uses them alone."""
+    """Chooses the registered scans by the odometry, or by scan odometry for initial poses from the scans alone."""
     motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
     if not config.is_ordered:
         return Recording(scans, np.arange(len(scans.points)), None, np.arange(len(scans.points)))
@@ -275,7 +273,7 @@ def _choose_scans(
 def _start_poses(
     scans: PlanarScans, start: str | Floats, evidence: Odometry | None, recording: Recording, hooks: RegistrationHooks
 ) -> tuple[str, Floats]:
-    """Returns the name of the start and the poses of the registered scans."""
+    """Returns the name and the values of the initial poses of the registered scans."""
     if not isinstance(start, str):
         return GIVEN_POSES, start[recording.chosen]
     name = START_NAMES[start]
@@ -300,15 +298,15 @@ def fit_in_order(
     is_ordered: bool,
     engine_of: EngineOf | None = None,
 ) -> Fitted:
-    """Fits scans in an order in which neighbours are near each other: that of time, or a tour of the start.
+    """Fits scans by DeepMapping in an order with near neighbours: that of time, or a tour of the initial poses.
 
     Args:
         scans: the scans.
         config: settings of the fit.
         key: of the fit.
-        start: (n, 3) x, y, heading to start from; None: cold start, in the given order.
-        is_ordered: the scans lie in the order of time.
-        engine_of: called with the order, rows of the scans; returns what trains them, as in `fit_deepmapping`. None:
+        start: (n, 3) initial x, y, heading; None: cold start, in the given order.
+        is_ordered: True where the scans are in the order of time.
+        engine_of: called with the order, rows of the scans; returns the `engine` of `fit_deepmapping`. None:
             `deepmapping.fit`.
 
     Returns:
@@ -345,9 +343,9 @@ def _fit(
 def _refined_candidates(
     scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None, hooks: RegistrationHooks
 ) -> dict[str, Floats]:
-    """Returns the start and the fit, each refined; a fit that is a worse map than the refined start is left out.
+    """Returns the refined initial poses and fits, without fits whose map is worse than that of the initial poses.
 
-    Near a good start the fit gives the sharper map. The start keeps the motion that a robot's odometry has measured.
+    From good initial poses the fit gives the sharper map. The initial poses keep the motion that odometry has measured.
     """
     (start, start_poses), *fits = candidates.items()
     prior = None if evidence is None else evidence.prior

@@ -1,12 +1,13 @@
-"""The scan record of this room: planar scans with a line at every beam, and the lengths that settings refer to.
+"""Planar scans with a line fitted at each beam, and the lengths that settings refer to.
 
-All lengths in settings are in typical ranges of the scans, so pixels, rooms and streets need no settings of their own.
-The typical range is the range that nine in ten beams on a line stay below (`dpmjax.geometry.sampling.typical_range`).
+All lengths in settings are in typical ranges of the scans, so one set of settings serves pixels, rooms and streets. The
+typical range is the range that nine in ten beams on a line stay below (`dpmjax.geometry.sampling.typical_range`).
 
-A line with a normal is fitted at every beam and is honest under range noise. Two neighbouring beams give the exact
-normal of a noise-free wall, but nonsense as soon as the noise is as large as the distance between the beams. So several
-windows of neighbouring beams compete for each beam, centred on it and to either side (a beam beside a corner sees only
-one of the two walls). The widest window that is straight up to the noise wins; the noise is measured from the scans.
+A line with a normal is fitted at each beam. Two neighbouring beams give the exact normal of a noise-free wall, but a
+random one as soon as the noise is as large as the distance between the beams. So lines are fitted to several windows of
+neighbouring beams. These are centred on the beam or lie on either side of it, because a beam beside a corner lies on
+one of two walls. Among the windows that are straight up to the noise, the one with the least directional error is kept.
+The noise is estimated from the scans.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class Tolerances(NamedTuple):
 
     Attributes:
         match: standard deviation of a hit about the surface that it belongs to.
-        contradict: a hit farther than this in front of a surface contradicts it.
-        jump: two neighbouring beams whose ranges differ by more end on two surfaces.
+        contradict: least distance in front of a surface at which a hit contradicts the surface.
+        jump: least difference of the ranges of two neighbouring beams that end on two surfaces.
     """
 
     match: float | Float[Array, ""]
@@ -52,7 +53,7 @@ class Tolerances(NamedTuple):
 
     @classmethod
     def of(cls, match: float | Float[Array, ""], contradict: float | Float[Array, ""]) -> Tolerances:
-        """The tolerances with the usual jump."""
+        """Makes tolerances with the usual jump."""
         return cls(match, contradict, 10.0 * match)
 
 
@@ -61,13 +62,13 @@ class PlanarScans(flax.struct.PyTreeNode):
 
     Attributes:
         points: measured beam end points, in the order of their angles; zero where `mask` is False.
-        mask: True where the beam measured something.
+        mask: True for valid beams.
         normals: unit normals of the fitted lines, turned towards the sensor; zero without a line.
-        centroids: a point on each fitted line: the mean of the beams that it was fitted to.
+        centroids: a point on each fitted line: the mean of its beams.
         is_on_line: True where the beam lies on a straight piece (valid, not a corner, not alone).
         noises: `noise`, repeated for each scan, so that rows can be taken in traced code.
         typical_ranges: `typical_range`, repeated likewise.
-        is_ordered: neighbours in the array are neighbours in time.
+        is_ordered: True where neighbours in the array are neighbours in time.
     """
 
     points: Float[Array, "*n b 2"]
@@ -89,22 +90,22 @@ class PlanarScans(flax.struct.PyTreeNode):
 
     @property
     def typical_range(self) -> float:
-        """The range that nine in ten beams on a line stay below, median over the scans: the unit of all settings."""
+        """Range that nine in ten beams on a line stay below, median over the scans: the unit of all settings."""
         return float(self.typical_ranges.reshape(-1)[0])
 
     @property
     def tolerances(self) -> Tolerances:
-        """Tolerances of these scans: from the typical range, or from the noise where that gives more."""
+        """Tolerances of these scans, from the typical range or from the noise, the larger ones."""
         reach, noise = self.typical_range, self.noise
         return Tolerances.of(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
 
     def take(self, rows: Any) -> PlanarScans:
-        """The scans of these rows (an index, a slice, a list or an array); a selection has no order in time."""
+        """Returns the scans of these rows (an index, a slice, a list or an array), without an order in time."""
         index = np.array(rows) if isinstance(rows, list) else rows
         return jax.tree.map(lambda x: x[index], self).replace(is_ordered=False)
 
     def thin(self, stride: int) -> PlanarScans:
-        """The same scans with every `stride`-th beam."""
+        """Returns the same scans with every `stride`-th beam."""
         kept = (slice(None),) * (self.mask.ndim - 1) + (slice(None, None, stride),)
         names = ("points", "mask", "normals", "centroids", "is_on_line")
         return self.replace(**{name: getattr(self, name)[kept] for name in names})
@@ -116,8 +117,8 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     Args:
         points: (n, b, 2) beam end points in the frame of their sensor, any unit; or a ScanSet. Beams that are not in
             the order of their angles are sorted, each scan with its invalid beams last.
-        mask: (n, b) True where the beam measured something; None: everywhere, or the mask of the ScanSet.
-        is_ordered: neighbours in the array are neighbours in time.
+        mask: (n, b) True for valid beams; None: all are valid, or the mask of the ScanSet.
+        is_ordered: True where neighbours in the array are neighbours in time.
 
     Returns:
         PlanarScans.
@@ -138,7 +139,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         raise ValueError("mask: expected at least one valid beam, got none")
     if not np.isfinite(values[valid]).all():
         raise ValueError("points: expected finite coordinates where the mask is True")
-    # What is masked may hold anything; zero times NaN would be NaN later on.
+    # Masked values may be NaN, and zero times NaN is NaN.
     values = np.where(valid[..., None], values, np.float32(0.0))
     if not has_angular_order(values, valid):
         angle = np.where(valid, np.arctan2(values[..., 1], values[..., 0]), np.inf)
@@ -153,11 +154,11 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
 
 
 def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
-    """Splits rows 0 to `count` into batches of one shape; the last one is filled up with repetitions.
+    """Splits rows 0 to `count` into batches of one shape; the last one is padded with repetitions.
 
     Args:
-        count: rows in all.
-        size: rows of a batch.
+        count: number of rows.
+        size: number of rows of a batch.
 
     Yields:
         The slice of a batch, and its rows (size,): those of the slice first, then their repetitions.
@@ -173,10 +174,10 @@ def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "
 
 @jax.jit
 def range_noise(scans: ScanSet) -> Float[Array, ""]:
-    """Standard deviation of the range noise, measured from the scans alone.
+    """Estimates the standard deviation of the range noise from the scans alone.
 
-    The beam between two others that hit the same straight wall must end on their chord. The median over all beams of
-    the distance along the beam to that chord is not disturbed by corners and depth jumps, which are few.
+    A beam between two others that hit the same straight wall must end on their chord. The noise follows from the median
+    over all beams of the distance along the beam to that chord, which is robust to corners and depth jumps.
 
     Args:
         scans: organised planar scans (n, b, 2).
@@ -201,7 +202,7 @@ def range_noise(scans: ScanSet) -> Float[Array, ""]:
 
 @flax.struct.dataclass
 class _Moments:
-    """First and second moments of a run of beams: (..., b) arrays, one run for each beam that it starts at."""
+    """First and second moments of runs of beams: (..., b) arrays, one run for each first beam."""
 
     count: float = flax.struct.field(pytree_node=False)
     mean: Float[Array, "... b 2"]
@@ -210,7 +211,7 @@ class _Moments:
 
 
 def _shift(values: Any, offset: int) -> tuple[Any, NDArray[np.bool_]]:
-    """Arrays (n, b, ...) whose beam i is beam i + offset, and where that is inside the scan (b,)."""
+    """Shifts arrays (n, b, ...) so that beam i is beam i + offset; the mask (b,) is True where this is in the scan."""
     moved = jax.tree.map(lambda x: jnp.roll(x, -offset, axis=1), values)
     size = jax.tree.leaves(values)[0].shape[1]
     beam = np.arange(size) + offset
@@ -218,13 +219,13 @@ def _shift(values: Any, offset: int) -> tuple[Any, NDArray[np.bool_]]:
 
 
 def _start_at(run: _Moments, offset: int) -> _Moments:
-    """The runs that start `offset` beams later; incomplete where that is outside the scan."""
+    """Returns the runs that start `offset` beams later, incomplete where this is outside the scan."""
     moved, is_inside = _shift(run, offset)
     return dataclasses.replace(moved, is_complete=moved.is_complete & is_inside)
 
 
 def _join(first: _Moments, second: _Moments) -> _Moments:
-    """Moments of two disjoint runs together; stable, because only the difference of their means enters."""
+    """Joins the moments of two disjoint runs; stable, because only the difference of their means enters."""
     count = first.count + second.count
     step = second.mean - first.mean
     spread = (first.count * second.count / count) * step[..., :, None] * step[..., None, :]
@@ -248,7 +249,7 @@ def _runs(scans: ScanSet) -> list[_Moments]:
 
 
 def _line_of(run: _Moments, noise: Float[Array, ""]) -> tuple[Float[Array, "... b 2"], Float[Array, "... b"]]:
-    """Direction of the line through each run, and the error of that direction in radians: infinite if not straight."""
+    """Computes the direction of the line through each run, and its error in radians: infinite if not straight."""
     xx, xy, yy = run.scatter[..., 0, 0], run.scatter[..., 0, 1], run.scatter[..., 1, 1]
     half_difference, half_sum = 0.5 * (xx - yy), 0.5 * (xx + yy)
     radius = jnp.sqrt(half_difference**2 + xy**2)
@@ -264,8 +265,8 @@ def _line_of(run: _Moments, noise: Float[Array, ""]) -> tuple[Float[Array, "... 
 
 @jax.jit
 def _fit_lines(scans: ScanSet) -> PlanarScans:
-    """Fits a line at every beam; a beam without any straight run of its own has none. Typical ranges are left at 1."""
-    # Rounding of float32 coordinates looks like noise of this size; below it "straight" would mean nothing.
+    """Fits a line at each beam with a straight run; typical ranges are set to 1."""
+    # Rounding of float32 coordinates looks like noise of this size, a lower bound of the noise.
     reach = jnp.max(jnp.where(scans.mask, jnp.linalg.norm(scans.points, axis=-1), 0.0))
     noise = jnp.maximum(range_noise(scans), 1e-6 * reach)
     tangent, centroid = jnp.zeros_like(scans.points), scans.points

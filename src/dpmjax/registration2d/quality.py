@@ -1,8 +1,8 @@
-"""Quality of a registration without the truth: scores of trajectories, and the choice among them.
+"""Quality of a registration without ground truth: scores of trajectories, and the choice among them.
 
 A map is good if few nats encode all its beams (`map_code_length`) and if near scans agree (`view_misfit`). A trajectory
-is good if its steps are those of the odometry, within its noise. `assessment.py` decides whether the best trajectory
-can be trusted.
+is good if its steps are those of the odometry, within its noise. `assessment.py` accepts or rejects the best
+trajectory.
 """
 
 from __future__ import annotations
@@ -19,26 +19,27 @@ from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import compare_pairs, make_profiles
 from dpmjax.registration2d.step_prior import StepPrior
 
-# Maps whose code lengths differ by less than this part are equally good as maps (how walls lie in the cells is worth
-# some percent); then their surfaces decide.
+# Maps whose code lengths differ by less than this share are compared by their misfits, because the position of the
+# walls in the cells changes the code length by some percent.
 _SAME_MAP = 0.1
-# Nats a beam, and share of misfits, that a nat a step counts as; and standard deviations of a step that cost nothing.
+# Weight of the mean nats of a step relative to nats of a beam and to misfit; and standard deviations of a step without
+# cost.
 _STEP_WEIGHT, _ALLOWED = 0.2, 3.0
-# Hits and passages that are counted at most; more would only take longer.
+# Largest number of beams, and number of free samples on each beam.
 _MAX_BEAMS = 40_000
 _SAMPLES_A_BEAM = 32
 _GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
-# Side of a cell in typical ranges: some thicknesses of a wall. Finer agreement is the business of `view_misfit`.
+# Side of a cell in typical ranges: some thicknesses of a wall. `view_misfit` measures finer agreement.
 _CELL = 0.015
-# Least tolerance of that agreement, in typical ranges; with range noise it is the noise.
+# Least tolerance of the misfit, in typical ranges; a larger range noise replaces it.
 _LEAST_TOLERANCE = 0.001
-# Bearings of the profiles that it is measured by: exact to less than that tolerance.
+# Number of bearings of the profiles of the misfit, exact to less than that tolerance.
 _NUM_BEARINGS = 4096
 # Number of nearest scans, by position and once more by position and heading, that each scan is compared with.
 _NUM_NEAREST = 12
-# Typical ranges that a radian of heading counts as in the second of these searches.
+# Typical ranges that a radian of heading equals in the second of these searches.
 _HEADING_WEIGHT = 0.5
-# Range noise in typical ranges above which right and wrong maps look alike: no map is trusted there.
+# Range noise in typical ranges above which correct and wrong maps have equal scores, so no map is trusted.
 MAX_NOISE = 0.0225
 
 
@@ -46,9 +47,9 @@ class Score(NamedTuple):
     """Errors of a trajectory in three measures; lower is better.
 
     Attributes:
-        code_length: nats a beam for the map (`map_code_length`): whether the map is right as a whole.
-        misfit: share of beams off the surfaces of near scans (`view_misfit`): how sharp it is.
-        surprise: mean nats a step beyond what its prior allows: how far it tears the odometry; 0 without a prior.
+        code_length: nats of the map for each beam (`map_code_length`), a measure of global consistency.
+        misfit: share of beams off the surfaces of near scans (`view_misfit`), a measure of sharpness.
+        surprise: mean nats of a step beyond the tolerance of its prior; 0 without a prior.
     """
 
     code_length: float
@@ -59,10 +60,10 @@ class Score(NamedTuple):
 def choose_trajectory(
     scans: PlanarScans, candidates: Mapping[str, Floats], *, prior: StepPrior | None = None
 ) -> tuple[str, dict[str, Score]]:
-    """The best trajectory: among those whose maps are about as short to describe as the shortest, the sharpest.
+    """Chooses the trajectory of least misfit among those with nearly the shortest code length.
 
-    With range noise above `MAX_NOISE`, surfaces do not separate right maps from wrong ones, and the shortest map is the
-    best.
+    With range noise above `MAX_NOISE`, misfits do not separate correct maps from wrong ones, and the trajectory with
+    the shortest code length is chosen.
 
     Args:
         scans: n scans.
@@ -88,7 +89,7 @@ def choose_trajectory(
 
 
 def _surprise(poses: Floats, prior: StepPrior | None) -> float:
-    """Returns the mean cost of the steps beyond that of three standard deviations."""
+    """Computes the mean cost of the steps beyond that of three standard deviations."""
     if prior is None:
         return 0.0
     steps = np.asarray(se2.relative(poses[:-1], poses[1:]))
@@ -99,13 +100,13 @@ def _surprise(poses: Floats, prior: StepPrior | None) -> float:
 
 
 def map_code_length(scans: PlanarScans, poses: Floats) -> float:
-    """Nats a beam that the map of all scans needs at these poses; lower is better.
+    """Computes the code length of the map of all scans at these poses, in nats for each beam; lower is better.
 
-    The world is cut into cells. Each beam calls the cells that it passes free and the one where it ends occupied. A
-    cell that all beams call the same costs next to nothing. A cell that has been called both, or that no other beam has
-    seen, costs nats (a Krichevsky-Trofimov code for each cell). A doubled wall costs twice: it contradicts beams that
-    pass through it, and it opens new cells. It is the occupancy loss of DeepMapping with the best possible M-Net. Only
-    beams on a line are coded. How the walls lie in the cells must not decide, so the mean over turned grids is taken.
+    The world is divided into cells. Each beam labels the cells that it passes free and the cell where it ends occupied.
+    A Krichevsky-Trofimov code encodes the labels of each cell. It is short where all beams agree, and long for cells
+    with both labels or with one beam. A doubled wall is coded at two positions and contradicts beams that pass through
+    it. The code length equals the occupancy loss of DeepMapping with the best possible M-Net. Only beams on a line are
+    coded. The mean over turned grids reduces the influence of the position of the walls in the cells.
 
     Args:
         scans: n scans.
@@ -124,7 +125,7 @@ def map_code_length(scans: PlanarScans, poses: Floats) -> float:
 
 
 def _code_length(hits: Floats, sensors: Floats, cell: float) -> float:
-    """The same in one grid; hits and the sensors that made them, (m, 2) in the frame of the grid."""
+    """Computes the code length in one grid, from hits and their sensor positions (m, 2) in the frame of the grid."""
     ranges = np.linalg.norm(hits - sensors, axis=-1)
     # Passages stop two cells short of the hit, where a slanted wall may still be touched.
     share = (np.arange(_SAMPLES_A_BEAM) + 0.5) / _SAMPLES_A_BEAM
@@ -142,16 +143,16 @@ def _code_length(hits: Floats, sensors: Floats, cell: float) -> float:
     free_cells, num_free = count(free)
     row = np.minimum(np.searchsorted(free_cells, hit_cells), len(free_cells) - 1)
     passages = np.where(free_cells[row] == hit_cells, num_free[row], 0)
-    # Only cells that were hit are coded: how much is seen free depends on the room, not on the poses.
+    # Only cells with hits are coded: the amount of free space depends on the room, not on the poses.
     nats = np.log(np.pi) - scipy.special.betaln(num_hits + 0.5, passages + 0.5)
     return float(nats.sum() / len(hits))
 
 
 def view_misfit(scans: PlanarScans, poses: Floats) -> float:
-    """Returns the disagreement of near scans at these poses; lower is better.
+    """Computes the disagreement of near scans at these poses; lower is better.
 
-    Each scan predicts the ranges of the scans near it, straight between its own beams. So it needs no walls: between
-    two beams the outline of a tree is straight enough. Beams that are hidden from the predicting scan do not count.
+    Each scan predicts the ranges of near scans by linear interpolation between its own beams, which needs no straight
+    walls. Beams that are occluded in the predicting scan are left out.
 
     Args:
         scans: n scans.
@@ -169,7 +170,7 @@ def view_misfit(scans: PlanarScans, poses: Floats) -> float:
 
 
 def near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
-    """Returns source and target of each scan and its nearest ones, each pair once."""
+    """Returns pairs (source, target) of each scan and its nearest scans, each pair once."""
     heading = _HEADING_WEIGHT * typical_range * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     count, row = min(_NUM_NEAREST + 1, len(poses)), np.arange(len(poses))
     pairs = []

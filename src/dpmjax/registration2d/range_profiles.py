@@ -1,7 +1,7 @@
-"""Range profiles: scans as functions of the bearing, and hits of one scan that match or contradict another scan.
+"""Range profiles: range as a function of the bearing, and hits of one scan that match or contradict another scan.
 
-A profile has, for every bearing, the range and the slant of the surface, and the free space in front of it. A hit of
-another scan lies on that surface (a match), in that free space (a contradiction), or where the scan cannot see.
+A profile has, for each bearing, the range and the slant of the surface, and the free space in front of it. A hit of
+another scan lies on that surface (a match), in that free space (a contradiction), or in an unobserved region.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from dpmjax.types import AnyArray
 
 # A bearing is not seen where the two beams around it are farther apart than this many times an even spread.
 _MAX_GAP = 2.5
-# Surfaces that are more slanted than this count as no more slanted, and do not correct the range of a beam.
+# Least cosine of the slant of a surface. Surfaces with a smaller cosine do not correct the range of a beam.
 _MIN_COSINE = 0.3
 _UNKNOWN_COSINE = 0.7
-# Surfaces that are turned away from the viewer by more than this sine are not the ones it sees.
+# Largest sine by which a visible surface is turned away from the viewer.
 _MAX_AVERTED = 0.1
 # Odd minimax polynomial of the arctangent on [0, 1], the highest power first.
 _ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
 # Bearings of a profile.
 _NUM_BEARINGS = 512
-# Pairs that are compared at a time, all batches of one shape; many calls have but a few hundred.
+# Pairs that are compared at a time, all batches of one shape; many calls have only a few hundred.
 _BATCH = 256
 
 
@@ -43,7 +43,7 @@ class RangeProfiles(flax.struct.PyTreeNode):
         near: the smaller range of the two beams; nearer points are free.
         far: the larger range of the two beams; farther points are hidden.
         slant: cosine of the angle between beam and surface normal, at least 0.3.
-        is_seen: there are two beams around.
+        is_seen: True between two neighbouring beams.
     """
 
     scans: PlanarScans
@@ -57,7 +57,7 @@ class RangeProfiles(flax.struct.PyTreeNode):
         return len(self.scans)
 
     def take(self, rows: Any) -> RangeProfiles:
-        """The profiles of these rows."""
+        """Returns the profiles of these rows."""
         return jax.tree.map(lambda x: x[rows], self)
 
 
@@ -76,7 +76,7 @@ class ViewComparison(NamedTuple):
 
 
 def _smooth_ranges(scans: PlanarScans) -> Float[Array, "n b 2"]:
-    """Points moved along their beams onto the lines fitted at them: the range noise of a wall averages out."""
+    """Moves points along their beams onto their fitted lines, which averages the range noise of a wall."""
     reach = jnp.linalg.norm(scans.points, axis=-1)
     beam = scans.points / jnp.maximum(reach, 1e-9)[..., None]
     slope = jnp.sum(scans.normals * beam, -1)
@@ -87,11 +87,11 @@ def _smooth_ranges(scans: PlanarScans) -> Float[Array, "n b 2"]:
 
 
 def make_profiles(scans: PlanarScans, num_bearings: int = _NUM_BEARINGS) -> RangeProfiles:
-    """Range profiles of planar scans.
+    """Makes range profiles of planar scans.
 
     Args:
         scans: n scans.
-        num_bearings: c; more of them make comparisons of exact scans more exact.
+        num_bearings: c; larger values make comparisons of noise-free scans more accurate.
 
     Returns:
         RangeProfiles with arrays (n, c).
@@ -106,7 +106,7 @@ def _make_profiles(scans: PlanarScans, *, num_bearings: int) -> RangeProfiles:
 
 
 def _profile(scan: PlanarScans, num_bearings: int) -> RangeProfiles:
-    """The profile of one scan."""
+    """Makes the profile of one scan."""
     points, valid = scan.points, scan.mask
     reach = jnp.maximum(jnp.linalg.norm(points, axis=-1), 1e-9)
     cosine = jnp.maximum(jnp.abs(jnp.sum(scan.normals * points, -1)) / reach, _MIN_COSINE)
@@ -131,7 +131,7 @@ def _profile(scan: PlanarScans, num_bearings: int) -> RangeProfiles:
 
 
 def _bearing(points: Float[Array, "b 2"]) -> Float[Array, " b"]:
-    """Bearing in [0, 2 pi] to 2e-6 radians; an exact arctangent would take two thirds of a global registration."""
+    """Computes the bearing in [0, 2 pi] to 2e-6 radians by a polynomial, which is quicker than an exact arctangent."""
     x, y = jnp.abs(points[:, 0]), jnp.abs(points[:, 1])
     slope = jnp.minimum(x, y) / jnp.maximum(jnp.maximum(x, y), 1e-12)
     octant = slope * jnp.polyval(jnp.asarray(_ARCTANGENT, slope.dtype), slope**2)
@@ -141,7 +141,7 @@ def _bearing(points: Float[Array, "b 2"]) -> Float[Array, " b"]:
 
 
 def _view(scan: PlanarScans, pose: Float[Array, " 3"], viewer: RangeProfiles, tolerances: Tolerances) -> ViewComparison:
-    """Hits of a scan against the profile of a viewer; `pose` is T_viewer_scan."""
+    """Compares the hits of a scan with the profile of a viewer; `pose` is T_viewer_scan."""
     points = se2.transform_points(pose, scan.points)
     normals = jnp.matmul(scan.normals, se2.rotation(pose[2]).T, precision="highest")
     count = viewer.surface.shape[-1]
@@ -214,6 +214,6 @@ def compare_pairs(
 
 
 def contradicted_share(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
-    """(p,) share of the visible beams of two scans that contradict each other; of few beams a low one."""
+    """Computes the share (p,) of the visible beams of two scans that contradict each other, of at least 20 beams."""
     views = compare_pairs(profiles, source, target, poses, stride=1)
     return np.asarray(views.contradicted, np.float64) / np.maximum(np.asarray(views.visible, np.float64), 20.0)

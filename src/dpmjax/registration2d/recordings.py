@@ -1,8 +1,8 @@
-"""Whole recordings: choice of the scans that are registered, and poses of all scans.
+"""Recordings: choice of the scans that are registered, and poses of all scans.
 
-A robot's log has thousands of scans, most of them a hand's breadth from the one before. Only those are registered that
-lie some way or turn apart. Each remaining scan follows the odometry between the registered scans before and after it,
-and is then aligned with the nearer of the two.
+A robot's log has thousands of scans, most of them some centimetres from the one before. Only scans that lie some
+distance or turn apart are registered. Each remaining scan follows the odometry between the registered scans before and
+after it, and is then aligned with the nearer of the two.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dpmjax.types import ScanSet
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
 _ODOMETRY_SIGMA = (0.005, 0.01)
-# The same of a scan that does not fit: a robot that turns fast has read its wheels at another moment than its scans.
-# Such a scan is turned by these angles first, radians.
+# The same for a scan that does not fit, because in fast turns odometry and scan have different times. Initial turns of
+# such a scan, radians.
 _LOOSE_SIGMA, _TURNS = (0.01, 0.1), (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
-# A scan keeps to odometry where a lower share of its beams fits, or where more of them contradict the chosen scan.
+# Least fitness, and largest share of beams that contradict the chosen scan, of an aligned scan; else odometry is kept.
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
-# A robot stands still that moves by less than this share of the way between registered scans.
+# A robot stands still where it moves by less than this share of the least distance of registered scans.
 _STANDING = 0.02
 # Scans that are aligned at a time.
 _BLOCK = 1024
@@ -40,9 +40,9 @@ class Recording(NamedTuple):
     Attributes:
         scans: all n scans.
         chosen: rows of the k registered scans, in order.
-        motion: (n, 3) poses whose steps are the motion between registered scans; None where all are registered but
-            repeated ones.
-        originals: (n,) row of the scan that each scan repeats beam by beam; its own row where it repeats none.
+        motion: (n, 3) poses whose steps are the motion between registered scans; None where all scans except repeated
+            ones are registered.
+        originals: (n,) row of the scan that each scan repeats beam by beam; the row of the scan itself for others.
     """
 
     scans: ScanSet
@@ -51,14 +51,14 @@ class Recording(NamedTuple):
     originals: Indices
 
     def between(self, poses: Floats) -> Floats:
-        """Returns poses of all scans, by those of the registered ones and the motion between them."""
+        """Returns poses of all scans from those of the registered scans and the motion between them."""
         rows = np.unique(self.originals)
         if self.motion is not None:
             poses = fill_between(np.searchsorted(rows, self.chosen), poses, self.motion[rows])
         return poses[np.searchsorted(rows, self.originals)]
 
     def aligned(self, poses: Floats) -> Floats:
-        """Returns the same, each scan aligned with the nearest registered one."""
+        """Returns poses of all scans, each scan aligned with the nearest registered one."""
         poses = self.between(poses)
         if self.motion is None:
             return poses
@@ -75,7 +75,7 @@ def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
 
 
 def find_originals(scans: ScanSet) -> Indices:
-    """Finds scans that repeat the one before beam by beam: recorded twice, or by a robot that waits in a simulation.
+    """Finds scans that repeat the scan before beam by beam.
 
     Args:
         scans: n scans in the order of time.
@@ -89,7 +89,9 @@ def find_originals(scans: ScanSet) -> Indices:
 
 
 def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float) -> Recording:
-    """Chooses the scans of a recording that are registered: those that lie apart, or all that move where most do.
+    """Selects the scans to register by distance and turn.
+
+    If that keeps at least half of the distinct scans, all scans of the moving robot are selected.
 
     Args:
         scans: n scans in the order of time.
@@ -98,7 +100,7 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
         min_turn: as `choose_by_motion`.
 
     Returns:
-        Recording; a scan that repeats the one before is not registered, and has its pose.
+        Recording; a scan that repeats the scan before is not registered, and has the pose of that scan.
     """
     originals = find_originals(scans)
     rows = np.unique(originals)
@@ -140,18 +142,18 @@ def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, mi
 
 
 def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Float[np.ndarray, "n 3"]) -> Floats:
-    """Returns poses of all scans: those of the chosen ones, and odometry in between, corrected at both ends.
+    """Computes poses of all scans from those of the chosen scans, and from corrected odometry between these.
 
-    The error of odometry at the next chosen scan is spread over the scans before it, in proportion to the way and the
-    turns until there.
+    The error of odometry at the next chosen scan is distributed over the scans before it, in proportion to distance and
+    turns.
 
     Args:
         chosen: rows of k scans in order, the first and the last scan among them.
-        poses: T_world_scan of these, x, y, heading.
+        poses: T_world_scan of the chosen scans, x, y, heading.
         odometry: of all n scans.
 
     Returns:
-        (n, 3) T_world_scan; the given ones at `chosen`, to rounding.
+        (n, 3) T_world_scan; those at `chosen` are `poses`.
 
     Raises:
         ValueError: if the rows do not begin at the first scan, end at the last one, and increase.
@@ -161,7 +163,7 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     before = np.clip(np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1, 0, max(len(chosen) - 2, 0))
     after = np.minimum(before + 1, len(chosen) - 1)
     start, end = chosen[before], chosen[after]
-    # All in the frame of the chosen scan before: where odometry puts the next one, and how far off that is.
+    # In the frame of the chosen scan before: the next chosen scan by odometry, and the error of odometry there.
     T_before_after = se2.relative(odometry[start], odometry[end])
     error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
     part = _exp(_share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64))
@@ -173,15 +175,15 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
 
 
 def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, "n 3"]) -> Floats:
-    """Aligns each scan with one of the chosen scans before and after it, point to line: the nearer one if it fits.
+    """Aligns each scan with the chosen scan before or after it, point to line; the nearer one first.
 
     Args:
         scans: n scans in the order of time.
         chosen: rows of k scans in order, the first and the last scan among them.
-        poses: T_world_scan of all scans, right at `chosen`, as `fill_between` makes them.
+        poses: T_world_scan of all scans, as `fill_between` computes them.
 
     Returns:
-        (n, 3) T_world_scan; those at `chosen`, and of scans that fit badly, as they were.
+        (n, 3) T_world_scan; unchanged at `chosen` and for scans that do not fit.
     """
     aligned = poses.copy()
     others = np.setdiff1d(np.arange(len(poses)), chosen)
@@ -212,7 +214,7 @@ def _align_with(
     turns: tuple[float, ...],
     sigma: tuple[float, float],
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Returns poses of the sources aligned with their targets, from some turns of the expected poses, and their fit."""
+    """Aligns sources with their targets from turns of the expected poses; returns poses, and True where they fit."""
     source, target = pairs
     expected = np.asarray(se2.relative(poses[target], poses[source]))
     spread = np.array(sigma)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
@@ -226,7 +228,7 @@ def _align_with(
 
 
 def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
-    """Returns how much of the way from `start` to `end` each scan has behind it; turns count as a metre a radian."""
+    """Computes the share of the path from `start` to `end` up to each scan; a radian equals one unit of length."""
     steps = se2.relative(odometry[:-1], odometry[1:])
     lengths = np.hypot(steps[:, 0], steps[:, 1]) + np.abs(se2.wrap_angle(steps[:, 2])) + 1e-9
     way = np.append(0.0, np.cumsum(lengths))

@@ -1,6 +1,6 @@
-"""Refinement of a trajectory: loops where it leaves doubt, then the joint alignment of all scans.
+"""Refinement of a trajectory: loop closure where its steps fit badly, then the joint alignment of all scans.
 
-Under range noise the scans are then adjusted to lines that they make together (line_adjustment.py).
+With range noise the scans are then adjusted to common lines (line_adjustment.py).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from dpmjax.registration2d.step_scores import fitting_scans, interpolate, pair_s
 from dpmjax.registration2d.torn_steps import restore_torn
 from dpmjax.types import ScanSet
 
-# The start is sound, and no loops are searched, if the fitness of all its steps is above this, and so is the weakest
-# eigenvalue of each, as a share of the beams.
+# No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
+# as a share of the beams, above the second one.
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
-# Times that the alignment is repeated where it tears steps.
+# Largest number of repetitions of the alignment after torn steps are restored.
 _NUM_REPAIRS = 2
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
@@ -41,7 +41,7 @@ class RefinementConfig(JointAlignmentConfig):
     """Settings of the refinement: those of the alignment, and of the loop search.
 
     Attributes:
-        loops: settings of the loop search, which only ordered scans get; None: never.
+        loops: settings of the loop search of ordered scans; None: no search.
     """
 
     loops: LoopConfig | None = field(default_factory=LoopConfig)
@@ -52,7 +52,7 @@ class Refined(NamedTuple):
 
     Attributes:
         poses: (n, 3) x, y, heading.
-        num_loops: loops that were found and kept; 0 where none was needed.
+        num_loops: number of loops in the kept trajectory.
     """
 
     poses: Floats
@@ -60,7 +60,7 @@ class Refined(NamedTuple):
 
     @property
     def T_world_scan(self) -> Floats:
-        """(n, 3, 3) the poses as matrices."""
+        """Poses as matrices (n, 3, 3)."""
         return se2.to_matrix(self.poses)
 
 
@@ -71,22 +71,22 @@ def refine(
     *,
     prior: StepPrior | None = None,
 ) -> Refined:
-    """Closes loops where the start leaves doubt, then aligns all scans together, and to common lines if there is noise.
+    """Refines a trajectory by loop closure, joint alignment of all scans, and adjustment to common lines.
 
-    Loops are searched from a chain of the start's steps, which forgets what else the start knows; so the start is
-    aligned without loops too, and the better map counts. Of scans that are not ordered only neighbours in space count,
-    the steps of the start mean nothing, and no loops are searched.
+    Loops are searched only where steps of the initial poses fit badly, in a chain of re-aligned steps. The initial
+    poses are also aligned without loops, and the better map is kept. For scans without an order, only neighbours in
+    space are aligned, and no loops are searched. The adjustment to lines needs range noise.
 
     Args:
         scans: (n, b, 2) beam end points in the sensor frames, any unit, in the order of time; all-zero or non-finite
             beams are left out. Or a ScanSet. Or PlanarScans: scans without an order are
             `planar_scans(scans, is_ordered=False)`.
-        poses: start, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
+        poses: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
         config: settings.
-        prior: of the steps of ordered scans; None: that of the start, at the usual deviations.
+        prior: of the steps of ordered scans; None: the steps of the initial poses, with the usual deviations.
 
     Returns:
-        Refined; the first pose is that of the start, unless loops are kept.
+        Refined; the first pose is the initial one, unless loops are kept.
 
     Raises:
         ValueError: the scans or the poses have a wrong shape or are not finite.
@@ -98,7 +98,7 @@ def refine(
     fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
-        # The steps again, with those of the start as guess, and with the prior where the scans leave a direction open.
+        # Steps re-aligned from the initial ones, with the prior along unconstrained directions.
         chained, steps = incremental_icp(scans, odometry=start, prior=prior)
         rows = np.flatnonzero(fitting_scans(scans, chained))
         if len(rows) < len(scans):
@@ -124,7 +124,7 @@ def refine(
 def _align(
     scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
 ) -> Floats:
-    """Aligns all scans, and again from where torn steps are put back, as long as the map gets no worse."""
+    """Aligns all scans, restores torn steps and aligns again, as long as the code length does not grow."""
     best = align_all(scans, poses, config, prior)
     if prior is None:
         return best
@@ -140,21 +140,21 @@ def _align(
 
 
 def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
-    """Returns poses with their torn steps put back, unless that makes the map worse."""
+    """Restores torn steps, unless the code length of the map grows."""
     restored = restore_torn(make_profiles(scans), steps, poses, config, prior)
     is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
     return restored if restored is not None and is_better else poses
 
 
 def _better_steps(profiles: RangeProfiles, steps: Floats, others: Floats) -> Floats:
-    """Returns of each step (n - 1, 3) the one of two that fits better."""
+    """Returns, for each of n - 1 steps, the one of two relative poses with the higher score."""
     later = np.arange(1, len(steps) + 1)
     scores = [pair_scores(profiles, later, later - 1, found) for found in (steps, others)]
     return np.where((scores[1] > scores[0])[:, None], others, steps)
 
 
 def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
-    """Returns True if all steps fit and are fixed in every direction, so that a chain of them has little drift."""
+    """Returns True if all steps fit and are constrained in every direction, so that their chain has little drift."""
     guesses = se2.relative(poses[:-1], poses[1:])[:, None]
     steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
     share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)

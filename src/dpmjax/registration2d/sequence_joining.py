@@ -1,9 +1,9 @@
-"""Joins the parts of a sequence that weak steps connect: from submap to submap, and by loops that agree.
+"""Correction of the weak steps between the parts of a sequence, by submaps and by loops that agree.
 
-A step is weak where the scans on both sides share few beams, and all scans behind it may be metres off. So the two
-submaps on either side are searched against each other. Then submaps of different parts are searched against each other.
-A single such pair may be wrong, but wrong pairs disagree about the weak step and right ones agree (consensus, as in
-pairwise consistent sets of loops).
+A step is weak where the scans on both sides share few beams, and all later scans may be metres off. So the two submaps
+on either side are searched against each other. Then submaps of different parts are searched against each other. A
+single such pair may be wrong, but wrong pairs propose different poses and correct pairs the same one (consensus, as in
+pairwise consistent sets of loops). Each pair is a vote.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from dpmjax.registration2d.step_scores import MotionPrior, pair_scores, weak_ste
 from dpmjax.registration2d.submaps import along_way, submap_scans
 from dpmjax.registration2d.wall_directions import WallDirections
 
-# The submaps on either side of a weak step reach so far along the way, typical ranges: what both see may be the end of
-# a corridor. The largest turn of such a step, its longest shift, cells of the images and candidates of each.
+# Length of the submaps on either side of a weak step along the trajectory, typical ranges, so that both may see the end
+# of a corridor. Largest turn and shift of such a step, and number of cells of the images and of candidates.
 _SIDE_LENGTH, _MAX_TURN, _MAX_SHIFT, _NUM_CELLS, _NUM_CANDIDATES = 2.0, 2.2, 1.6, 256, 24
 # Weight of the motion prior beside the agreement of two submaps, and beside the votes of loops.
 _PRIOR_WEIGHT, _LOOP_PRIOR_WEIGHT = 0.1, 0.3
 # Submaps lie a typical range apart, or farther if they were more than this.
 _MAX_SUBMAPS = 80
-# Pairs of submaps are searched within a distance that adds up: a constant, a share of the way between them, and a
-# length for each weak step between them. Least way between the two where they lie on either side of one weak step.
-# Lengths are in typical ranges. Number of likely turns that are searched.
+# The largest distance of pairs of submaps is the sum of a constant, a share of the path length between them, and a
+# length for each weak step between them. Least path length between two submaps on either side of one weak step. Lengths
+# are in typical ranges. Number of likely turns that are searched.
 _NEAR, _DRIFT, _WEAK_STEP, _LEAST_WAY, _NUM_TURNS = 1.0, 0.1, 1.0, 1.5, 6
-# Pairs with a lower score do not vote; votes within these (typical ranges, radians) are one.
+# Least score of a vote; and scale within which votes agree (typical ranges, radians).
 _LEAST_VOTE, _AGREEMENT = 0.3, (0.15, 0.12)
-# How often the own score of a weak step counts, and how many more votes another pose must have.
+# Weight of the score of a weak step itself, and least gain in votes of another pose.
 _OWN_WEIGHT, _LEAST_GAIN = 4.0, 0.4
 # Smaller corrections are left to the loop closure: typical ranges, radians.
 _LEAST_MOVE = (0.25, 0.25)
@@ -51,7 +51,7 @@ class _Sequence(NamedTuple):
 
 
 class _Submaps(NamedTuple):
-    """Submaps along a sequence: the row of the centre, the part that it belongs to, the way until there."""
+    """Submaps along a sequence: rows of the centres, their parts, and the path length up to them."""
 
     profiles: RangeProfiles
     centres: Indices
@@ -71,17 +71,17 @@ class _Votes(NamedTuple):
 def join_parts(
     profiles: RangeProfiles, poses: Floats, rows: Indices, prior: MotionPrior, config: CorrelativeConfig
 ) -> Floats:
-    """Moves the scans behind each weak step to the pose that most scans support.
+    """Corrects each weak step to the relative pose that most scans support.
 
     Args:
         profiles: n scans in time order.
         poses: (n, 3) T_world_scan.
         rows: (k,) the registered scans.
-        prior: of their motion.
-        config: of the search of pairs of submaps.
+        prior: motion prior of the registered scans.
+        config: settings of the search of pairs of submaps.
 
     Returns:
-        (n, 3) poses; those that were given where no step is weak.
+        (n, 3) poses; unchanged where no step is weak.
     """
     sequence = _Sequence(profiles, poses.copy(), rows, prior)
     steps = np.flatnonzero(weak_steps(profiles, poses, rows))
@@ -98,7 +98,7 @@ def join_parts(
 
 
 def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfig) -> None:
-    """Moves the scans behind each weak step by a search of the submap behind it against the one before it."""
+    """Corrects each weak step by a search of the submap after it against the submap before it."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
     ends = np.concatenate([[-1], steps, [len(rows) - 1]])
     sides = []
@@ -125,14 +125,14 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
 
 
 def _move_behind(sequence: _Sequence, step: int, way: Floats) -> None:
-    """Moves all scans behind a step so that it becomes `way`."""
+    """Moves all scans after a step so that the relative pose of the step becomes `way`."""
     poses, rows = sequence.poses, sequence.rows
     motion = se2.compose(se2.compose(poses[rows[step]], way), se2.inverse(poses[rows[step + 1]]))
     poses[rows[step + 1] :] = se2.compose(motion, poses[rows[step + 1] :])
 
 
 def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
-    """Submaps about a typical range apart, none across a weak step."""
+    """Makes submaps about a typical range apart, none across a weak step."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[rows, :2], axis=0).T)))
     spacing = max(unit, way[-1] / _MAX_SUBMAPS)
@@ -149,7 +149,7 @@ def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
 
 
 def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfig) -> _Votes:
-    """Relative poses of submaps of different parts that may overlap."""
+    """Finds relative poses of submaps of different parts that may overlap."""
     unit, poses = sequence.profiles.scans.typical_range, sequence.poses[submaps.centres]
     later, earlier = np.tril_indices(len(poses), k=-1)
     way, crossed = submaps.ways[later] - submaps.ways[earlier], submaps.parts[later] - submaps.parts[earlier]
@@ -169,7 +169,7 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
 
 
 def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: _Votes, step: int) -> None:
-    """Moves the scans behind a weak step to the pose that most loops across it agree on."""
+    """Corrects a weak step to the relative pose that most loops across it agree on."""
     poses, unit, prior = sequence.poses, sequence.profiles.scans.typical_range, sequence.prior
     before, after = sequence.rows[step], sequence.rows[step + 1]
     here, gap = se2.relative(poses[before], poses[after]), int(after - before)

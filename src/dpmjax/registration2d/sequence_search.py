@@ -1,10 +1,10 @@
-"""Poses of a sequence of scans by a beam search: each scan against the last placed ones, several hypotheses a step.
+"""Poses of a sequence of scans by beam search: each scan against the last placed scans, with several hypotheses.
 
-A step between two scans that share few beams has several poses that fit. They are found by an exhaustive search of the
-pair (`pair_search.py`). Their score is matched less contradicting beams against all of the last placed scans; the
-fitness of an ICP has no contradicting beams. The best few sequences of poses are kept from scan to scan. A scan that
-fits none of the last ones (a swapped line of the log, a lens that was covered) stays unregistered, and the sequence
-goes on behind it.
+A step between two scans that share few beams has several poses that fit. An exhaustive search of the pair finds these
+hypotheses (`pair_search.py`). Their score is matched less contradicting beams against all of the last placed scans; the
+fitness of an ICP ignores contradicting beams. The best sequences of poses are kept from scan to scan. A scan that fits
+none of the last placed scans (a swapped line of the log, a covered lens) stays unregistered, and the sequence continues
+with the next scan.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ _MAX_TURN = 1.7
 # A step is clear where its score, fitness and the weakest eigenvalue (share of the beams) are above these, and the
 # share of visible beams that contradict is below the last one.
 _CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE, _CLEAR_CONTRADICTION = 0.45, 0.5, 0.02, 0.05
-# Weak steps are also searched from the scans before and behind them, up to the first number of scans apart; steps with
-# a score below the second number, up to the third number apart.
+# Weak steps are also searched between scans before and after them, up to the first number of scans apart; steps with a
+# score below the second number, up to the third number apart.
 _WEAK_SPAN, _BAD_SCORE, _BAD_SPAN = 3, 0.12, 5
-# Where neither step of a scan has a better score, the scans before and behind it are searched against each other.
+# Where neither step of a scan has a better score, the scans before and after it are searched against each other.
 _SURE_SCORE = 0.5
-# Largest number of scans between two weak steps that are left out.
+# Largest number of scans between two weak steps for which these scans are left out.
 _NUM_ALONE = 2
-# Hypotheses of a scan that are nearer to each other, in typical ranges and radians, are one.
+# Hypotheses of a scan within these tolerances are equal, typical ranges and radians.
 _SAME = (0.02, 0.02)
-# Two sequences are one if this number of their last scans agrees within these tolerances, typical ranges and radians.
+# Two sequences are equal if this number of their last scans agrees within these tolerances, typical ranges and radians.
 _NUM_SAME, _SAME_SHAPE = 4, (0.05, 0.05)
-# Score of a scan that is left out; and of one that is placed by the motion before it, after too many were left out.
+# Score of a scan that is left out; and of one at the pose of the scan before it, after too many were left out.
 _LEFT_OUT, _GUESSED = 0.05, -1.0
 # Weight of the motion prior.
 _PRIOR_WEIGHT = 0.1
@@ -59,9 +59,9 @@ class SequenceConfig:
     """Settings of the sequence search.
 
     Attributes:
-        num_sequences: sequences of poses that are kept from scan to scan.
+        num_sequences: number of sequences of poses that are kept from scan to scan.
         num_compared: number of the last placed scans that a scan is compared with.
-        search: of pairs whose step is not clear.
+        search: settings of the search of steps that are not clear.
     """
 
     num_sequences: int = 6
@@ -120,7 +120,7 @@ def search_sequence(scans: PlanarScans, steps: PairMatches, config: SequenceConf
 
 
 def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(k,) scans between two weak steps, one or two of them."""
+    """Returns True (k,) for one or two scans between two weak steps."""
     part = np.append(0, np.cumsum(is_weak))
     return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
 
@@ -128,7 +128,7 @@ def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _find_hypotheses(
     scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches, config: SequenceConfig
 ) -> _Hypotheses:
-    """The steps, and the candidates of a search where they are not clear."""
+    """Returns the steps, and candidates of a search for steps that are not clear."""
     num_scans = len(scans)
     later = np.arange(1, num_scans)
     scores = pair_scores(profiles, later, later - 1, steps.poses)
@@ -165,7 +165,7 @@ def _find_hypotheses(
 def _search(
     scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64], config: SequenceConfig
 ) -> _Hypotheses:
-    """Candidates of pairs (p, 2), each aligned by ICP where that is no worse."""
+    """Finds candidates of pairs (p, 2), each aligned by ICP where the score does not fall."""
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(config.search.num_turns) / config.search.num_turns)
     turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
@@ -180,11 +180,11 @@ def _search(
 
 
 class _Sequences(NamedTuple):
-    """The best sequences of poses up to some scan, s of them, the best first.
+    """The s best sequences of poses up to some scan, the best first.
 
     Attributes:
         poses: (s, w, 3) T_world_scan of the last w scans.
-        is_placed: (s, w) which of these are registered.
+        is_placed: (s, w) True for registered scans.
         scores: (s,) totals.
     """
 
@@ -194,7 +194,7 @@ class _Sequences(NamedTuple):
 
 
 def _with_second_start(now: _Sequences) -> _Sequences:
-    """The sequences of two scans, and one that begins at the second scan."""
+    """Adds a sequence that begins at the second scan."""
     poses, is_placed = np.zeros_like(now.poses[:1]), np.zeros_like(now.is_placed[:1])
     is_placed[:, -1] = True
     scores = np.append(now.scores, _LEFT_OUT)
@@ -202,7 +202,7 @@ def _with_second_start(now: _Sequences) -> _Sequences:
 
 
 class _Ways(NamedTuple):
-    """Ways to go on with a scan, m of them: (m,) sequence, (m, 3) pose, (m,) score, (m,) whether it is registered."""
+    """Continuations by one scan: (m,) sequence, (m, 3) pose, (m,) score, (m,) True where the scan is registered."""
 
     parent: Indices
     poses: Floats
@@ -221,7 +221,7 @@ class _Beam:
         self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
 
     def run(self) -> SequenceResult:
-        """Goes through all scans, then back along the best sequence."""
+        """Runs the search over all scans and traces the best sequence back."""
         num_scans = len(self.profiles)
         poses, is_placed = np.zeros((1, self.width, 3)), np.zeros((1, self.width), bool)
         is_placed[:, -1] = True
@@ -230,7 +230,7 @@ class _Beam:
         for scan in range(1, num_scans):
             now, parents = self.advance(now, scan)
             if scan == 1:
-                # The first scan may be the one that fits nothing.
+                # The first scan may fit no other scan.
                 now, parents = _with_second_start(now), np.append(parents, 0)
             history.append((parents, now.poses[:, -1], now.is_placed[:, -1]))
         world, is_registered, which = np.zeros((num_scans, 3)), np.ones(num_scans, bool), 0
@@ -242,7 +242,7 @@ class _Beam:
         return SequenceResult(world, is_registered)
 
     def advance(self, now: _Sequences, scan: int) -> tuple[_Sequences, Indices]:
-        """The best sequences with one more scan, and the sequence that each of them goes on."""
+        """Returns the best sequences with one more scan, and the rows of the sequences that they continue."""
         ways = self.extend(now, scan)
         parent, pose, score, placed = ways
         total = now.scores[parent] + score
@@ -260,7 +260,7 @@ class _Beam:
         return _Sequences(poses, is_placed, total[rows] - total[rows[0]]), parents
 
     def extend(self, now: _Sequences, scan: int) -> _Ways:
-        """All ways to go on with a scan: its hypotheses, and to leave it out."""
+        """Returns all continuations by a scan: its hypotheses, and the scan left out."""
         own = slice(self.starts[scan], self.starts[scan + 1])
         back = scan - self.hypotheses.target[own]
         parent, which = np.nonzero(now.is_placed[:, self.width - back])
@@ -279,7 +279,7 @@ class _Beam:
         )
 
     def distinct(self, parent: Indices, pose: Floats) -> Indices:
-        """Rows of the hypotheses that equal none before them in the same sequence."""
+        """Returns rows of the hypotheses that differ from all earlier ones of the same sequence."""
         off = pose[:, None] - pose
         near = np.hypot(off[..., 0], off[..., 1]) < _SAME[0] * self.unit
         near &= (np.abs(se2.wrap_angle(off[..., 2])) < _SAME[1]) & (parent[:, None] == parent)
@@ -290,7 +290,7 @@ class _Beam:
         return np.array(kept, np.int64)
 
     def score(self, now: _Sequences, scan: int, parent: Indices, pose: Floats) -> Floats:
-        """(m,) agreement of a scan with the last placed ones, and the motion prior."""
+        """Computes the agreement (m,) of a scan with the last placed scans, less the weighted motion prior."""
         rank = np.cumsum(now.is_placed[:, ::-1], axis=1)[:, ::-1]
         is_used = (now.is_placed & (rank <= self.config.num_compared))[parent]
         placed = now.poses[parent]
@@ -298,7 +298,7 @@ class _Beam:
         row, column = np.nonzero(is_used)
         pairs = np.full(len(row), scan), scan - self.width + column
         evidence, visible = find_evidence(self.profiles, *pairs, relative[row, column])
-        # The newest scan counts most: a pose is not better for having moved less and so overlapping with older scans.
+        # The newest scan has the largest weight, so that overlap with older scans does not favour short motions.
         weight = 1.0 / rank[parent][row, column]
         total, seen = (np.bincount(row, weight * x, len(parent)) for x in (evidence, visible))
         agreement = total / (seen + LEAST_VISIBLE)
@@ -307,7 +307,7 @@ class _Beam:
         return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
     def is_same(self, now: _Sequences, ways: _Ways, row: int, other: int) -> bool:
-        """Returns True if two continuations agree about the last scans, so that no later scan can separate them."""
+        """Returns True if two continuations agree in their last scans."""
         rows = np.array([row, other])
         parent = ways.parent[rows]
         placed = np.concatenate([now.is_placed[parent, 1 - _NUM_SAME :], ways.is_placed[rows, None]], axis=1)

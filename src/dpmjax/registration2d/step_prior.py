@@ -1,4 +1,4 @@
-"""Expected steps of a sequence before its beams are compared: of odometry, of given poses, or of the usual motion."""
+"""Prior of the steps of a sequence, from odometry, from given poses, or from the usual motion."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior
 from dpmjax.registration2d.planar_scans import Floats, Indices
 
-# Standard deviations of a step of poses that nothing is known about: typical ranges, radians.
+# Standard deviations of a step of poses of unknown accuracy: typical ranges, radians.
 _USUAL_DEVIATION = (0.0225, 0.15)
-# Clear steps predict the translation of another one if their turns differ by less, in radians; with fewer of them,
-# all clear ones do, or none. Least deviation of such a prediction, typical ranges.
+# Clear steps predict the translation of another step if the turns differ by less than this, in radians. Least number of
+# such steps; with fewer, all clear steps predict. Least deviation of such a prediction, typical ranges.
 _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_DEVIATION = 0.15, 5, 0.015
-# Degrees of freedom of the cost of a step: wheels slip, and logs have gaps.
+# Degrees of freedom of Student's t for steps, heavy-tailed because wheels slip and logs have gaps.
 _FREEDOM = 3.0
 
 
 def step_cost(chi2: Any) -> Any:
-    """Returns the nats of a step that is off by this squared number of standard deviations: those of Student's t."""
+    """Returns the negative log-likelihood of a step under Student's t, from its squared Mahalanobis distance."""
     return 0.5 * (_FREEDOM + 3.0) * np.log1p(chi2 / _FREEDOM)
 
 
@@ -44,7 +44,7 @@ class StepPrior(NamedTuple):
         return cls(steps, np.broadcast_to(deviation, steps.shape))
 
     def costs(self, steps: Float[np.ndarray, "k *m 3"]) -> Floats:
-        """(k, *m) heavy-tailed costs of steps in nats; 0 where they are as expected."""
+        """Computes heavy-tailed costs (k, *m) of steps in nats; 0 for the expected steps."""
         shape = (len(self.steps),) + (1,) * (steps.ndim - 2) + (3,)
         off = steps - self.steps.reshape(shape)
         off[..., 2] = se2.wrap_angle(off[..., 2])
@@ -52,7 +52,7 @@ class StepPrior(NamedTuple):
         return np.asarray(step_cost(chi2), np.float64)
 
     def as_pose_prior(self, residual: float | Floats) -> PosePrior:
-        """Returns the prior of alignments whose beams have this standard deviation, in the unit of the points."""
+        """Returns the prior of alignments whose beams have this standard deviation `residual`, unit of the points."""
         return PosePrior(self.steps, (residual / self.deviations) ** 2)
 
     def through(self, rows: Indices) -> StepPrior:
@@ -64,13 +64,12 @@ class StepPrior(NamedTuple):
 
 
 def usual_motion(matches: PairMatches, typical_range: float) -> StepPrior:
-    """Predicts each step by the median translation of the clear ones with a similar turn.
+    """Predicts each step by the median translation of clear steps with a similar turn.
 
-    In a corridor two scans fit at every shift along it; a robot that has made straight steps of one metre elsewhere
-    has made another one there.
+    In a corridor two scans fit at every shift along it. The prediction assumes that the robot moves there as elsewhere.
 
     Args:
-        matches: of the steps; those with much information and a good fitness are clear.
+        matches: of the steps; those with information and fitness of at least the median are clear.
         typical_range: of the scans.
 
     Returns:

@@ -14,16 +14,16 @@ from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
 from dpmjax.registration2d.recordings import fill_between
 
-# Matched beams that make up for a contradicting one; the share of visible beams that seem to contradict by noise.
+# Number of matched beams that outweigh a contradicting one; share of visible beams that noise makes contradictory.
 _CONTRADICTION_WEIGHT, _NOISY_SHARE = 2.5, 0.02
-# Visible beams, as a share of all, that are added where few are visible: agreement of few beams says little.
+# Regularisation of the score where few beams are visible, as a share of all beams.
 LEAST_VISIBLE = 0.3
 # A step with a lower score is weak.
 WEAK_SCORE = 0.25
-# Scales of the motion prior: usual steps that a step is shorter, longer or off to the side; radians.
+# Scales of the motion prior: deviations backward, forward and sideways in usual steps; radians.
 _SHORT, _LONG, _SIDEWAYS, _TURN = 0.6, 1.5, 0.5, 0.8
-# Score above which two scans fit each other, and the largest number of steps between them. Largest size of a group that
-# is left out where it fits no further scan.
+# Score above which two scans fit each other, and the largest number of steps between them. Largest size of an outlier
+# group.
 _FITTING_SCORE, _FITTING_SPAN, _SMALL_GROUP = 0.0, 3, 3
 # Range noise, in typical ranges, above which no two scans are equal.
 _LEAST_NOISE = 1.5e-4
@@ -52,13 +52,13 @@ def find_evidence(profiles: RangeProfiles, source: Indices, target: Indices, pos
 
 
 def pair_scores(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
-    """(p,) scores of pairs at T_target_source, at most 1: the agreement of the visible beams."""
+    """Computes the scores (p,) of pairs at T_target_source, at most 1: the agreement of the visible beams."""
     agreement, visible = find_evidence(profiles, source, target, poses)
     return agreement / (visible + LEAST_VISIBLE)
 
 
 def weak_steps(profiles: RangeProfiles, poses: Floats, rows: Indices) -> NDArray[np.bool_]:
-    """(k - 1,) whether the step from each of k rows to the next one has little support of its own."""
+    """Returns True for each of the k - 1 steps whose scan-match score is below `WEAK_SCORE`."""
     before, after = rows[:-1], rows[1:]
     return pair_scores(profiles, after, before, se2.relative(poses[before], poses[after])) < WEAK_SCORE
 
@@ -68,7 +68,7 @@ class MotionPrior(NamedTuple):
 
     Attributes:
         length: of a step, in the unit of the points.
-        forward: the part of it that goes straight ahead, -1 to 1.
+        forward: share of the length that is straight ahead, -1 to 1.
     """
 
     length: float
@@ -76,20 +76,20 @@ class MotionPrior(NamedTuple):
 
     @classmethod
     def of(cls, steps: Floats, typical_range: float) -> MotionPrior:
-        """The prior of steps (k, 3) that are clear; of none, that the robot stands still."""
+        """Estimates the prior from clear steps (k, 3); without any it expects no motion."""
         if not len(steps):
             return cls(0.05 * typical_range, 0.0)
         length = max(float(np.median(np.hypot(steps[:, 0], steps[:, 1]))), 0.05 * typical_range)
         return cls(length, float(np.median(steps[:, 0])) / length)
 
     def expected(self, gap: int) -> Floats:
-        """(3,) the motion over `gap` scans that goes on as usual, without a turn."""
+        """Returns the usual motion (3,) over `gap` scans, without a turn."""
         return np.array([self.forward * self.length * gap, 0.0, 0.0])
 
     def surprise(self, steps: Floats, gap: Indices) -> Floats:
-        """(m,) heavy-tailed cost of motions (m, 3) over `gap` scans each."""
+        """Computes the heavy-tailed cost (m,) of motions (m, 3) over `gap` scans each."""
         share, turn = steps[:, :2] / self.length, np.abs(se2.wrap_angle(steps[:, 2]))
-        # A robot that turns may stand still; one that does not goes on.
+        # The expected forward motion decreases with the turn, because a robot may turn on the spot.
         ahead = share[:, 0] / gap - self.forward * np.cos(np.minimum(turn, 0.5 * np.pi))
         excess = np.where(ahead < 0, ahead / _SHORT, ahead / _LONG) ** 2
         excess += (share[:, 1] / gap / _SIDEWAYS) ** 2 + (turn / (_TURN * gap**0.5)) ** 2
@@ -97,14 +97,15 @@ class MotionPrior(NamedTuple):
 
 
 def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
-    """Tells which scans fit some of the scans around them in time, beyond a small group that fits nothing else.
+    """Returns False for outliers, which match only a small group of neighbours in time or repeat the scan before.
 
     Args:
         scans: n scans in time order.
         poses: (n, 3) T_world_scan.
 
     Returns:
-        (n,) False for scans of another moment, repeated ones, and those that were taken through a covered lens.
+        (n,) True for scans that are no outliers. Outliers are scans of another time, repeated scans, and scans taken
+        through a covered lens.
     """
     num_scans, profiles = len(scans), make_profiles(scans)
     spans = range(1, min(_FITTING_SPAN + 1, num_scans))
@@ -120,14 +121,14 @@ def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
 
 
 def distinct_rows(scans: PlanarScans) -> Indices:
-    """Rows of the scans that differ from the one before; no sensor with noise measures the same twice."""
+    """Returns rows of the scans that differ from the scan before; all rows for scans without noise."""
     is_new = np.asarray((np.abs(np.diff(np.asarray(scans.points), axis=0)) > 0).any(axis=(1, 2)))
     is_new = is_new | (scans.noise < _LEAST_NOISE * scans.typical_range)
     return np.flatnonzero(np.append(True, is_new))
 
 
 def interpolate(num_scans: int, rows: Indices, poses: Floats) -> Floats:
-    """Poses of all scans from those (k, 3) of `rows` (k,); before the first and after the last one nothing moves."""
+    """Interpolates poses of all scans from those (k, 3) of `rows` (k,); both ends of the sequence are constant."""
     at_start, at_end = rows[:1] * 0, rows[-1:] * 0 + num_scans - 1
     chosen, first = np.unique(np.concatenate([rows, at_start, at_end]), return_index=True)
     known = np.concatenate([poses, poses[:1], poses[-1:]])[first]

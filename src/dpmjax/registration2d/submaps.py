@@ -1,7 +1,7 @@
-"""Submaps as scans: what a sensor with a full field of view would measure at one place, made from several scans.
+"""Submaps as scans: several scans merged into one scan of a sensor with a full field of view.
 
-A scan of a limited field of view shares few beams with the one before where the robot turns or passes a door. Ten scans
-on either side together see most of both places.
+A scan of a limited field of view shares few beams with the scan before where the robot turns or passes a door. Merged
+scans on either side share more.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import numpy as np
 from dpmjax.geometry import se2
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
 
-# Beams of a submap; scans of it at most, evenly along the way.
+# Number of beams of a submap, and largest number of its scans, spread evenly along the trajectory.
 _NUM_BEAMS, _NUM_SCANS = 360, 12
 
 
 def submap_scans(scans: PlanarScans, poses: Floats, centres: Indices, members: list[Indices]) -> PlanarScans:
-    """Makes a scan of each submap: of the hits of all its scans the nearest one at each bearing of the centre.
+    """Makes a scan of each submap from the nearest hit of all its scans at each bearing of the centre.
 
     Args:
         scans: n scans.
-        poses: (n, 3) T_world_scan; right within a submap.
-        centres: (s,) rows; the frame of each submap.
+        poses: (n, 3) T_world_scan, correct within a submap.
+        centres: (s,) rows of the scans whose frames are those of the submaps.
         members: rows of the scans of each submap, s arrays.
 
     Returns:
@@ -44,6 +44,6 @@ def submap_scans(scans: PlanarScans, poses: Floats, centres: Indices, members: l
 
 
 def along_way(poses: Floats, rows: Indices, length: float) -> Indices:
-    """Returns the rows, from the first one on, that the robot reaches within a way of this length."""
+    """Returns the first rows within this length of the trajectory from the first row."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[rows, :2], axis=0).T)))
     return rows[way <= length]

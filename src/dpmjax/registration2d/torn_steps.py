@@ -1,7 +1,7 @@
-"""Steps that a refinement has torn: two scans that fitted each other before it, and do not after it.
+"""Torn steps: relative poses of two scans that fit each other before a refinement and not after it.
 
-A loop that pulls at a long step, or a wrong pair in space, moves single scans away from their neighbours by more than
-an alignment can mend. The graph is solved again with the steps of before at these places.
+A loop over a long step, or a wrong pair in space, moves single scans away from their neighbours, beyond the basin of
+convergence of an alignment. The pose graph is solved again with the previous relative poses of these steps.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.registration2d.step_scores import WEAK_SCORE, pair_scores
 from dpmjax.registration2d.step_slides import slide_steps
 
-# A step is torn whose score has fallen by this much, from a score that was not weak.
+# A step is torn where its score has fallen by this much, from a score that was not weak.
 _LOST_SCORE = 0.25
 # Gauss-Newton steps of the graph, and the least weight of a step, whose score may be negative.
 _NUM_ROUNDS, _LEAST_WEIGHT = 5, 0.01
@@ -26,14 +26,14 @@ _NUM_ROUNDS, _LEAST_WEIGHT = 5, 0.01
 def restore_torn(
     profiles: RangeProfiles, steps: Floats, poses: Floats, config: JointAlignmentConfig, prior: StepPrior
 ) -> Floats | None:
-    """Puts torn steps back and spreads the difference over the pairs that hold the map.
+    """Restores torn steps and distributes the difference over the pairs that constrain the map.
 
     Args:
         profiles: n scans in time order.
         steps: (n - 1, 3) T_scan_next before the refinement.
-        poses: (n, 3) T_world_scan after it.
+        poses: (n, 3) T_world_scan after the refinement.
         config: of the pairs in space.
-        prior: of the steps; one that fits better elsewhere along its walls is torn, too.
+        prior: of the steps; a step that is torn in `Slides` with this prior is shifted to its mode.
 
     Returns:
         (n, 3) T_world_scan, to be aligned again; None where no step is torn.
@@ -60,7 +60,7 @@ def restore_torn(
 
 
 def _holding_pairs(profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig) -> Edges:
-    """Returns the pairs that fit, without steps; the weights are their scores (e,)."""
+    """Returns edges of the pairs that fit, without steps; their information is the scores (e,)."""
     source, target = choose_pairs(profiles.scans, poses, config)
     is_pair = source != target + 1
     source, target = source[is_pair], target[is_pair]

@@ -1,8 +1,8 @@
-"""Likely turns between scans, from the directions of the walls that each of them sees.
+"""Likely turns between scans, from the directions of the visible walls.
 
-The histogram of these directions turns with the scan and does not change where the scan moves along the same walls. So
-two histograms are correlated over all turns (angle histograms, Weiss and von Puttkamer 1995). A scan with a limited
-field of view misses walls, which lowers the peak of the right turn and does not shift it.
+The histogram of these directions turns with the scan and does not change under translation along the same walls. So two
+histograms are correlated over all turns (angle histograms, Weiss and von Puttkamer 1995). A scan with a limited field
+of view misses walls, which lowers the peak of the correct turn and does not shift it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 
 # Directions of a histogram, and the blur of each direction in units of them.
 NUM_DIRECTIONS, _BLUR = 128, 1.0
-# A beam counts by the root of the length of wall between it and the next one, so that neither near nor slanted walls
-# rule; cosines of slanted walls are bounded below.
+# The weight of a beam is the root of the length of wall between neighbouring beams, so that neither near nor slanted
+# walls dominate; cosines of slanted walls are bounded below.
 _LENGTH_POWER, _MIN_COSINE = 0.5, 0.15
 # Turns on either side of a peak that belong to it, of NUM_DIRECTIONS; headings that are tried on either side of it.
 _PEAK_WIDTH, _TRIED_WIDTH = 6, 2
@@ -71,10 +71,10 @@ class WallDirections:
         Args:
             rows: (r,) rows.
             others: (o,) rows; a scan is not compared with itself.
-            count: of partners at most.
+            count: largest number of partners.
 
         Returns:
-            (r, k) rows of `others`, the most similar first; k is `count`, or one less than all where they are fewer.
+            (r, k) rows of `others`, the most similar first; k is `count`, or the number of other scans if it is less.
         """
         num_kept = min(count, len(others) - int(np.isin(rows, others).any()))
         chosen, height = np.empty((len(rows), num_kept), np.int64), max(1, _BLOCK // max(len(others), 1))
@@ -85,7 +85,7 @@ class WallDirections:
         return chosen
 
     def likely_turns(self, source: Indices, target: Indices, num_turns: int, num_peaks: int) -> Bool[np.ndarray, "p t"]:
-        """Chooses the headings at which a pair is worth searching.
+        """Chooses the headings of a pair near the peaks of the similarity.
 
         Args:
             source: (p,) rows.
@@ -107,7 +107,7 @@ class WallDirections:
 
 
 def _spectra(scans: PlanarScans) -> Complex[np.ndarray, "n f"]:
-    """Spectra of the histograms, without their mean and of length one."""
+    """Computes the spectra of the histograms, which have zero mean and unit norm."""
     normals, points = np.asarray(scans.normals, np.float64), np.asarray(scans.points, np.float64)
     ranges = np.linalg.norm(points, axis=-1)
     cosine = np.abs((normals * points).sum(-1)) / np.maximum(ranges, 1e-9)
@@ -122,7 +122,7 @@ def _spectra(scans: PlanarScans) -> Complex[np.ndarray, "n f"]:
 
 
 def _histogram(angles: Floats, weights: Floats) -> Floats:
-    """Each angle adds to the two directions next to it."""
+    """Computes weighted histograms of angles; each angle adds to the two directions next to it."""
     place = np.mod(angles, 2 * np.pi) * (NUM_DIRECTIONS / (2 * np.pi))
     below: NDArray[np.int64] = np.floor(place).astype(np.int64)
     share, histogram = place - below, np.zeros((len(angles), NUM_DIRECTIONS))

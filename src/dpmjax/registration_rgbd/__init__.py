@@ -1,4 +1,4 @@
-"""Classical registration of depth images: a search for first poses by projective consistency."""
+"""Classical registration of depth images: a search of initial poses by projective consistency."""
 
 import lazy_loader
 

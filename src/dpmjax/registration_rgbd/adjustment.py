@@ -1,7 +1,6 @@
-"""Adjustment of the poses of depth images, so that points of each lie on the surfaces that others see.
+"""Adjustment of the poses of depth images by the distances of points to the surfaces of other images.
 
-Levenberg and Marquardt's steps on the distances of points in front of or behind surfaces. A point belongs to the
-surface that it is projected to, and a large distance weighs little.
+Levenberg-Marquardt on the distances along z of points to the surfaces that they are projected to, with a robust weight.
 """
 
 from __future__ import annotations
@@ -19,7 +18,8 @@ from dpmjax.geometry.se3 import Motion, motion_matrices
 from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
 from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs, surface_gap
 
-# Share of the mean information that is added to all, at first; divided after a better step, multiplied after a worse.
+# Damping as a share of the mean information: initial value, least value, divisor after an accepted step, and factor
+# after a rejected step.
 _DAMPING, _LEAST_DAMPING, _BETTER, _WORSE = 1e-3, 1e-5, 4.0, 8.0
 # Longest step, in tolerances: of the typical range, and radians.
 _LONGEST_STEP = 4.0
@@ -40,7 +40,7 @@ class SampledImages(NamedTuple):
 
 
 class _Progress(NamedTuple):
-    """Motions so far, their score, and the damping of the next step."""
+    """Current motions, the score of these, and the damping of the next step."""
 
     motions: Float[Array, "n 4 4"]
     score: Float[Array, ""]
@@ -48,7 +48,7 @@ class _Progress(NamedTuple):
 
 
 def motion_scales(motion: Motion, unit: Float[Array, ""] | float, tolerance: Float[Array, ""]) -> Float[Array, " k"]:
-    """Unit of each value of a motion in an adjustment: lengths in tolerances of the typical range, angles in radians.
+    """Returns the unit of each value of a motion in an adjustment: translations in tolerances, angles in radians.
 
     Args:
         motion: degrees of freedom of the camera.
@@ -64,12 +64,12 @@ def motion_scales(motion: Motion, unit: Float[Array, ""] | float, tolerance: Flo
 def gap_equations(
     gap: Float[Array, " p"], weight: Float[Array, " p"] | Bool[Array, " p"], slopes: Float[Array, "p *k"]
 ) -> tuple[Float[Array, "*kk"], Float[Array, "*k"]]:
-    """Information and slope of half the sum of squared gaps, of which a large one weighs little.
+    """Computes the Gauss-Newton normal equations of surface residuals with Welsch weights.
 
     Args:
-        gap: gap in tolerances; a gap of 1 weighs 0.6, one of 2 weighs 0.14.
-        weight: weight of each gap besides, 0 where there is none.
-        slopes: slopes of the gaps over each value.
+        gap: residuals in tolerances; the Welsch weight is 0.6 at 1 and 0.14 at 2.
+        weight: further weight of each residual, 0 for invalid ones.
+        slopes: derivatives of the residuals with respect to each value.
 
     Returns:
         The normal equations, (*k, *k) and (*k).
@@ -87,7 +87,7 @@ def improve_motions(
     count: int,
     num_iterations: int,
 ) -> Float[Array, "n 4 4"]:
-    """Levenberg and Marquardt's steps from no motion; each is kept only if the score grows.
+    """Optimises motions from zero by Levenberg-Marquardt; a step is accepted only if the score grows.
 
     Args:
         equations: normal equations of values in `scales`, applied after given motions.
@@ -125,22 +125,22 @@ def adjust_poses(
     num_iterations: int,
     motion: Motion,
 ) -> Float[Array, "n 4 4"]:
-    """Adjusts poses so that points lie on the surfaces of all other images, where that makes them more consistent.
+    """Adjusts poses to the surfaces of all other images, as long as the projective consistency grows.
 
     Args:
-        T_world_camera: poses to start from, off by few tolerances.
+        T_world_camera: initial poses, with errors of few tolerances.
         images: depth images, unit of the poses.
-        tolerance: share of the depth; the unit of the gaps in `gap_equations`.
-        num_iterations: each one is kept only if the projective consistency grows.
+        tolerance: share of the depth; unit of the residuals in `gap_equations`.
+        num_iterations: number of steps.
         motion: degrees of freedom of the camera.
 
     Returns:
-        Motions to apply after the poses, T_world_camera @ them; that of the first image is none.
+        Motions to right-multiply to the poses, T_world_camera @ motion; that of the first image is the identity.
     """
     scans, sample, unit = images
     tolerance, count = jnp.asarray(tolerance), T_world_camera.shape[0]
     scales, offsets = motion_scales(motion, unit, tolerance), jnp.arange(1, count // 2 + 1)
-    # The first image stays.
+    # The first image is fixed.
     free = slice(len(scales), None)
 
     def with_first(motions: Float[Array, "m 4 4"]) -> Float[Array, "n 4 4"]:
@@ -165,7 +165,7 @@ def _normal_equations(
     scales: Float[Array, " k"],
     tolerance: Float[Array, ""],
 ) -> tuple[Float[Array, "nk nk"], Float[Array, " nk"]]:
-    """Information and slope of the gaps of all pairs of images, each both ways, over motions after their poses."""
+    """Computes the normal equations of the residuals of all pairs of images, in both directions."""
     count, freedom, surfaces = T.shape[0], len(scales), scans.surfaces
 
     def gaps(values: Float[Array, "2 k"], pair: Int[Array, "2"]) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-# Four pixels whose inverse depths differ by less than this share lie on one surface; else an edge runs between them.
+# Largest relative difference of the inverse depths of four pixels on one surface.
 _EDGE = 0.15
 
 
@@ -25,11 +25,11 @@ class Pinhole(NamedTuple):
 
 
 class PixelSample(NamedTuple):
-    """Some points of each image, in its camera frame.
+    """Sampled points of each image, in the camera frame.
 
     Attributes:
         points: (n, p, 3), or (p, 3) of one image.
-        mask: False for points that are not there.
+        mask: False for invalid points.
     """
 
     points: Float[Array, "... p 3"]
@@ -42,7 +42,7 @@ class DepthScans:
 
     Attributes:
         points: metres, or typical ranges inside of the fit.
-        mask: True where something was measured.
+        mask: True for valid pixels.
         pinhole: camera of all images.
     """
 
@@ -52,30 +52,29 @@ class DepthScans:
 
     @property
     def surfaces(self) -> Float[Array, "n 4 r c"]:
-        """The surface between the pixels of each image; see `image_surface`."""
+        """Computes the surface between the pixels of each image; see `image_surface`."""
         return jax.vmap(image_surface)(jnp.where(self.mask, self.points[..., 2], 0.0))
 
     @property
     def pixels(self) -> PixelSample:
-        """All pixels of each image."""
+        """Returns all pixels of each image."""
         count = self.mask.shape[0]
         return PixelSample(self.points.reshape(count, -1, 3), self.mask.reshape(count, -1))
 
 
 def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthScans:
-    """Checked depth images.
+    """Checks depth images and fits the camera.
 
     Args:
         points: (n, h, w, 3) in the camera frames (x right, y down, z forward), any unit.
-        mask: (n, h, w) True where something was measured; None: pixels that are not finite or all zero measured
-            nothing.
+        mask: (n, h, w) True for valid pixels; None: pixels that are not finite or all zero are invalid.
 
     Returns:
         The images with their camera.
 
     Raises:
-        ValueError: the shapes are not (n, h, w, 3) and (n, h, w) with n >= 2, an image has no valid pixel, or a valid
-            point is not finite or not in front of the camera (z above 0).
+        ValueError: the shapes are not (n, h, w, 3) and (n, h, w) with n >= 2. Also if an image has no valid pixel, or
+            if a valid point is not finite or not in front of the camera (z above 0).
     """
     cloud = np.asarray(points, np.float32)
     if cloud.ndim != 4 or cloud.shape[-1] != 3 or len(cloud) < 2:
@@ -96,16 +95,16 @@ def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthSca
 
 
 def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
-    """The surface between the pixels of a depth image: one over the depth, bilinear between each four pixels.
+    """Computes the surface between the pixels of a depth image, by bilinear interpolation of the inverse depth.
 
-    One over the depth is linear on a plane.
+    The inverse depth is linear on a plane.
 
     Args:
-        depth: depth along z, 0 where nothing was measured.
+        depth: depth along z, 0 at invalid pixels.
 
     Returns:
-        Value at the upper left pixel of each four, slopes along columns and rows, and the twist. All are 0 where the
-        four pixels do not lie on one surface. r = h - 1, c = w - 1.
+        For each cell of four pixels the value at the upper left pixel, the slopes along columns and rows, and the
+        mixed derivative. All are 0 where the four pixels do not lie on one surface. r = h - 1, c = w - 1.
     """
     inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
     corners = jnp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
@@ -115,11 +114,11 @@ def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
 
 
 def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
-    """The camera of organised clouds, by least squares.
+    """Fits the camera of organised clouds by least squares.
 
     Args:
         points: (n, h, w, 3) in the camera frames.
-        mask: (n, h, w) True where something was measured, with z above 0.
+        mask: (n, h, w) True for valid pixels, with z above 0.
 
     Returns:
         Pinhole.

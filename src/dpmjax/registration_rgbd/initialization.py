@@ -1,8 +1,8 @@
-"""First poses of depth images without a guess: trajectories that grow side by side, image after image.
+"""Initial poses of depth images by a beam search over trajectories, image after image.
 
-Each proposes several motions of the next image. The trajectories that explain the largest share of the points go on,
-as far as they differ: what one image leaves open, later ones decide. After each image the poses of each are adjusted;
-in the end at a finer tolerance, by which the best trajectory is chosen.
+Several motions of the next image are proposed for each trajectory. The trajectories that explain the largest share of
+the points are kept, as far as they differ, so that later images resolve ambiguous motions. After each image the poses
+of each trajectory are adjusted. At the end they are adjusted at a finer tolerance, and the best trajectory is chosen.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ from dpmjax.registration_rgbd.motion_search import (
 )
 from dpmjax.registration_rgbd.projective_consistency import explained_share
 
-# Trajectories differ by such a share of the largest translation, root mean square, or of the largest turn.
+# Least root mean square difference of two trajectories, as shares of the largest translation and of the largest turn.
 _APART = (0.085, 0.075)
-# Cost of motions, in explained points: images that look at new things explain less than those that stay.
+# Weight of the cost of motions relative to the explained share.
 _MOTION_COST = 3.0
-# Searches for an image where few trajectories are left, each with other points; where more are left, one for each, and
-# this number more for the best ones.
+# Number of searches for an image with few trajectories, each with other points; with more trajectories, number of
+# searches in addition to one for each.
 _NUM_TRIES = 4
-# A trajectory that explains less of the points than the best one by more than this share is dropped.
+# Largest difference of the explained share of a kept trajectory from that of the best one.
 _MARGIN = 0.25
-# Points of each image in a search, and those by which trajectories are compared and adjusted.
+# Number of points of each image in a search, and in the comparison and adjustment of trajectories.
 _NUM_POINTS, _NUM_COMPARED = 100, 300
-# While trajectories grow, they are compared and adjusted by this number of last images.
+# Number of last images by which incomplete trajectories are compared and adjusted.
 _NUM_WINDOW = 24
-# Steps of an adjustment.
+# Number of steps of an adjustment.
 _NUM_ITERATIONS = 6
-# Number of trajectories that are adjusted in the end, and of tolerances.
+# Number of trajectories in the last adjustment, and of its tolerances.
 _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
 
 def initialize_depth(
     scans: DepthScans, config: DepthSearchConfig | None = None, *, key: jax.Array
 ) -> NDArray[np.float64]:
-    """Searches first poses of all images, the first at the origin.
+    """Searches initial poses of all images, the first at the origin.
 
     Args:
         scans: images in order of time, metres; neighbours overlap.
@@ -93,7 +93,7 @@ def initialize_depth(
 
 
 def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
-    """Some points of each image."""
+    """Draws points of each image."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     num_scans = scans.mask.shape[0]
     points, mask = np.asarray(scans.points).reshape(num_scans, -1, 3), np.asarray(scans.mask).reshape(num_scans, -1)
@@ -102,7 +102,7 @@ def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
 
 
 def _window(num_placed: int, images: SampledImages, num_window: int) -> tuple[NDArray[np.intp], SampledImages]:
-    """Rows of the last images with a pose, and these images; while there are few, later ones that show nothing."""
+    """Returns rows of the last images with a pose, and these images, padded with fully masked images."""
     length = min(num_window, images.scans.mask.shape[0])
     rows = max(num_placed - length, 0) + np.arange(length)
     is_placed = jnp.asarray(rows < num_placed)
@@ -113,25 +113,25 @@ def _window(num_placed: int, images: SampledImages, num_window: int) -> tuple[ND
 
 
 def _mean_cost(T: NDArray[np.float64], config: DepthSearchConfig) -> NDArray[np.float64]:
-    """Cost of the motions of each trajectory."""
+    """Computes the mean cost of the motions of each trajectory."""
     motions = np.linalg.inv(T[:, :-1]) @ T[:, 1:]
     costs = motion_cost(np.linalg.norm(motions[..., :3, 3], axis=-1), _turns(motions), config)
     return _MOTION_COST * costs.mean(axis=1)
 
 
 def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles of (..., 4, 4) motions, radians."""
+    """Computes the angles of (..., 4, 4) motions, radians."""
     return Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).magnitude().reshape(T.shape[:-2])
 
 
 @jax.jit
 def _explained(T: Float[Array, "m n 4 4"], images: SampledImages, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
-    """Explained share of each trajectory."""
+    """Computes the explained share of each trajectory."""
     return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, images.unit, tolerance), T)
 
 
 def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: DepthSearchConfig) -> NDArray[np.float64]:
-    """The best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
+    """Selects the best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
     rows, window = _window(T.shape[2], images, _NUM_WINDOW)
     tolerance = jnp.asarray(config.tolerance[1])
     scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
@@ -151,7 +151,7 @@ def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: Dep
 def _adjusted(
     T: NDArray[np.float64], images: SampledImages, tolerance: float, motion: Motion, *, num_window: int = _NUM_WINDOW
 ) -> NDArray[np.float64]:
-    """Trajectories whose last poses are adjusted, where that makes them more consistent; the first of all stays."""
+    """Adjusts the last poses of trajectories, as long as the consistency grows; the first pose is fixed."""
     rows, window = _window(T.shape[1], images, num_window)
     num_placed = rows[-1] - rows[0] + 1
     T = T.copy()

@@ -1,8 +1,8 @@
-"""The motions by which a depth image may follow earlier ones: a search of the largest projective consistency.
+"""Search of the motions of a depth image relative to earlier images by projective consistency.
 
-Motions are drawn and varied from coarse to fine against the last images. An image of a wall hardly depends on the
-motion along the wall: the best motions that differ are slid along the surfaces of the image. The best of those are
-adjusted against more images, and many that differ are proposed: what this image leaves open, later ones decide.
+Motions are drawn and varied from coarse to fine against the last images. An image of a wall hardly constrains the
+motion along the wall, so distinct best motions are also shifted along the surfaces of the image. The best of these are
+adjusted against more images. Many distinct motions are proposed, so that later images resolve the ambiguity.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ MAX_TRANSLATION = 0.7
 # Largest turn between neighbouring images about the vertical axis of the camera, and largest tilt (turn about a
 # horizontal axis; full motion only), degrees.
 MAX_TURN_DEG, _MAX_TILT_DEG = 75.0, 30.0
-# Best motions that go on to the next round, before the slides. Adjusted motions that differ, by which a trajectory is
-# continued: where an image leaves open how far the camera moved along a wall, they lie side by side along it.
+# Number of best motions that are kept for the next round. Number of distinct adjusted motions that are proposed; for an
+# unconstrained direction along a wall they are spread along the wall.
 _NUM_KEPT, _NUM_DISTINCT = 32, 16
-# Rounds of motions, each varied half as widely as the one before.
+# Number of rounds of motions, each with half the variation of the one before.
 _NUM_ROUNDS = 4
-# Best motions of the last round that differ and are slid; places of each along each direction of the surfaces; best
-# motions after the slides that differ and are adjusted.
+# Number of distinct best motions of the last round that are shifted; number of shifts along each direction of the
+# surfaces; number of distinct best motions after the shifts that are adjusted.
 _NUM_SLID, _NUM_SLIDES, _NUM_ADJUSTED = 8, 51, 32
-# Earlier images that an image is compared to before the slides, and from the slides on.
+# Number of earlier images that an image is compared with before the shifts, and afterwards.
 _NUM_REFERENCES, _NUM_CHECKED = 4, 8
-# Motions differ by such shares of the largest translation and turn: those that are slid, and those that are kept then.
+# Least differences of distinct motions, as shares of the largest translation and turn: before the shifts, and after.
 _DIFFERENT, _SLID_APART = (0.35, 0.1), (0.12, 0.06)
-# Motions are slid by this number of largest translations, and may then be as long as the second number of them.
+# Largest shift, and longest motion after a shift, in largest translations.
 _SLIDE, _LONGEST = 1.4, 1.5
-# Width of the first variations in shares of the limits; halved from round to round.
+# Width of the first variations as a share of the limits; halved from round to round.
 _FIRST_SPREAD = 0.25
 # Number of tolerances of an adjustment, and of steps at each.
 _NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
@@ -55,15 +55,15 @@ class DepthSearchConfig:
 
     Attributes:
         motion: degrees of freedom of the camera.
-        num_trajectories: the largest number of trajectories that go on from image to image.
+        num_trajectories: largest number of trajectories that are kept from image to image.
         num_candidates: number of motions of the first round, spread evenly.
         num_varied: number of new motions around each kept one in a round.
-        tolerance: share of the depth by which matching points may differ, in the first and in the last round; the last
-            one also while trajectories grow.
-        final_tolerance: the same, in the last adjustment and where the best trajectory is chosen.
-        translation_weight: cost of the largest translation, in matching points. Along a bare wall only this cost
-            chooses how far the camera has moved: the shortest translation.
-        turn_weight: cost of the largest turn, in matching points.
+        tolerance: tolerance of matching points as a share of the depth, in the first and in the last round; the last
+            one is also that of incomplete trajectories.
+        final_tolerance: tolerance of the last adjustment and of the choice of the best trajectory.
+        translation_weight: cost of the largest translation, in units of consistency. Along a bare wall, where the
+            translation is unconstrained, this cost selects the shortest one.
+        turn_weight: cost of the largest turn, in units of consistency.
     """
 
     motion: Motion = "planar"
@@ -81,11 +81,11 @@ class DepthSearchConfig:
 
 
 def depth_search(motion: Motion) -> DepthSearchConfig:
-    """Returns the settings of the search for first poses.
+    """Returns the settings of the search of initial poses.
 
     Args:
-        motion: "planar": a level camera on wheels. "full": a hand-held camera, with six numbers to search instead of
-            three, small moves between images, and the noise of a real sensor.
+        motion: "planar": a level camera on wheels. "full": a hand-held camera, with six degrees of freedom, small
+            motions between images, and the noise of a real sensor.
 
     Returns:
         The settings.
@@ -112,12 +112,12 @@ class SearchCamera(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Images as the search sees them; of one image without the leading axis.
+    """Images as inputs of the search; without the leading axis for one image.
 
     Attributes:
-        sample: (r, p, 3) points of each.
-        surfaces: (r, 4, h - 1, w - 1) their surfaces, as `image_surface` has them.
-        directions: (r, a, 3) axes of the surfaces in the camera frame, that along which the surfaces hold least first.
+        sample: (r, p, 3) points of each image.
+        surfaces: (r, 4, h - 1, w - 1) surfaces of `image_surface`.
+        directions: (r, a, 3) axes of the surfaces in the camera frame, the least constrained direction first.
     """
 
     sample: PixelSample
@@ -126,11 +126,11 @@ class Views(NamedTuple):
 
 
 class References(NamedTuple):
-    """Earlier images that an image is compared to, the last one first.
+    """Earlier images that an image is compared with, the last one first.
 
     Attributes:
         T_last_reference: poses in the frame of the last image.
-        weights: 0 for images that are not there.
+        weights: 0 for padding images.
         views: the images.
     """
 
@@ -140,7 +140,7 @@ class References(NamedTuple):
 
 
 def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]:
-    """Directions in which the surfaces of an image hold the camera, from the least to the most.
+    """Computes the principal axes of each image's surface normals, in order of increasing eigenvalue.
 
     Args:
         scans: depth images.
@@ -165,10 +165,10 @@ def propose_motions(
     *,
     key: jax.Array,
 ) -> NDArray[np.float64]:
-    """Returns the best motions of the next image that differ.
+    """Searches the best distinct motions of the next image.
 
     Args:
-        T_world_camera: (m, 4, 4) poses of the images before it.
+        T_world_camera: (m, 4, 4) poses of the images before the next one.
         views: all images, n > m.
         camera: camera of the images.
         config: settings of the search.
@@ -179,7 +179,7 @@ def propose_motions(
     """
     scan, num_scans = len(T_world_camera), views.surfaces.shape[0]
     num_checked = min(max(_NUM_REFERENCES, _NUM_CHECKED), num_scans - 1)
-    # A window of fixed length: where there are fewer images before, the first is repeated without weight.
+    # A window of fixed length; with fewer earlier images the first is repeated with weight 0.
     before = scan - 1 - np.arange(num_checked)
     rows = np.maximum(before, 0)
     references = References(
@@ -192,15 +192,15 @@ def propose_motions(
 
 
 def motion_cost(length: Any, turn: Any, config: DepthSearchConfig) -> Any:
-    """Returns the costs of motions, in consistency: the shortest motion is taken where images leave it open.
+    """Computes a regulariser of camera motions that is linear in translation and rotation, in units of consistency.
 
     Args:
         length: length of motions between neighbouring images, unit of the points.
-        turn: their angles, radians.
+        turn: angles of the motions, radians.
         config: settings of the search.
 
     Returns:
-        The cost of each.
+        The cost of each motion.
     """
     turn_share = turn / np.deg2rad(MAX_TURN_DEG)
     return config.translation_weight * length / MAX_TRANSLATION + config.turn_weight * turn_share
@@ -211,7 +211,7 @@ def _take(tree: Any, rows: Any) -> Any:
 
 
 def _turn_of(T: Float[Array, "... 4 4"]) -> Float[Array, "..."]:
-    """Angle of a motion, radians."""
+    """Computes the angle of a motion, radians."""
     return jnp.arccos(jnp.clip(0.5 * (jnp.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0), -1.0, 1.0))
 
 
@@ -223,7 +223,7 @@ def _score_motion(
     tolerance: Array,
     config: DepthSearchConfig,
 ) -> Float[Array, ""]:
-    """Consistency of an image with its references at a motion, less the cost of the motion."""
+    """Computes the consistency of an image with its references at a motion, less the cost of the motion."""
 
     def against(T_last_ref: Array, reference: Views) -> Agreement:
         T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_scan)
@@ -243,7 +243,7 @@ def _distinct(
     count: int,
     shares: tuple[float, float],
 ) -> Float[Array, "k 4 4"]:
-    """The best motions that differ by these shares of the largest translation or turn from all better ones."""
+    """Selects the best motions that differ by these shares of the largest translation or turn from better ones."""
     far, turn = shares[0] * MAX_TRANSLATION, shares[1] * np.deg2rad(MAX_TURN_DEG)
 
     def pick(left: Float[Array, " m"], _: None) -> tuple[Float[Array, " m"], Array]:
@@ -256,7 +256,7 @@ def _distinct(
 
 
 def _slid(T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"]) -> Float[Array, "m 4 4"]:
-    """The motions, each moved to and fro along each axis of the image."""
+    """Returns the motions, and each motion shifted along each axis of the image in both directions."""
     lengths = _SLIDE * MAX_TRANSLATION * jnp.linspace(-1.0, 1.0, _NUM_SLIDES)
     moves = (lengths[:, None, None] * directions).reshape(-1, 3)
     T_scan_slid = jnp.tile(jnp.eye(4), (len(moves), 1, 1)).at[:, :3, 3].set(moves)
@@ -272,7 +272,7 @@ def _adjusted(
     tolerance: Float[Array, ""],
     config: DepthSearchConfig,
 ) -> Float[Array, "4 4"]:
-    """A motion so that points of the image lie on the surfaces of its references, and theirs on its own."""
+    """Adjusts a motion to the distances between points and surfaces of the image and its references."""
     pinhole = camera.pinhole
     scales = motion_scales(config.motion, camera.unit, tolerance)
 
@@ -310,7 +310,7 @@ def _search(
     *,
     config: DepthSearchConfig,
 ) -> Float[Array, "k 4 4"]:
-    """The best T_last_scan of the image that differ."""
+    """Searches the best distinct T_last_scan of the image."""
     turn, tilt, far = np.deg2rad(MAX_TURN_DEG), np.deg2rad(_MAX_TILT_DEG), MAX_TRANSLATION
     widths = jnp.array([far, far, turn] if config.motion == "planar" else [far, far, far, tilt, turn, tilt])
     first_key, round_key = jax.random.split(key)

@@ -1,7 +1,7 @@
-"""Projective consistency of depth images at given poses: the share of matching pixels less the cost of contradictions.
+"""Projective consistency of depth images at given poses: share of matching pixels less the cost of contradictions.
 
-An organised image is its own nearest-neighbour structure. Two images are compared by one projection each way, and a
-point is compared with the surface between the pixels instead of with the nearest of them.
+Correspondences come from projection instead of a nearest-neighbour search. Two images are compared by one projection in
+each direction. A point is compared with the interpolated surface between the pixels, not with the nearest pixel.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.geometry import rigid
 from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample
 
-# Cost of a contradiction in matches: along a bare wall a wrong pose matches nearly everywhere, and overlaps more. At a
-# coarse tolerance many contradictions only say that the pose is not exact yet, and cost less.
+# Cost of a contradiction in matches, and least cost, at coarse tolerances; tolerance up to which the full cost holds.
+# Along a bare wall a wrong pose matches nearly everywhere. At a coarse tolerance inexact poses cause contradictions.
 _CONTRADICTION, _LEAST_CONTRADICTION, _FULL_TOLERANCE = 18.0, 3.0, 0.02
-# Cost of a point that any image contradicts, in explained points. Such a point lies twice this share of its depth in
-# front of a surface: no pose that is nearly right puts it there. Points nearer than this share of the typical range
-# may lie as far in front as one at that distance, because an error of a position weighs more the nearer a point is.
+# Cost of a point that any image contradicts, in explained points. Such a point lies twice the second share of its depth
+# in front of a surface, beyond the error of nearly correct poses. The tolerance of near points is that at the third
+# share of the typical range, because an error of position is a larger share of a smaller depth.
 _CONTRADICTED_POINT, _CLEAR, _NEAR = 20.0, 0.04, 0.25
-# Matches count as a share of the visible points, not of all points, or else every image would be pulled onto the
-# others. This share of all points is added to the visible ones, so that a little overlap that matches is worth little.
+# Matches are normalised by the visible points, because normalisation by all points would favour overlap. This share of
+# all points is added to the visible ones, so that matches in a small overlap have a low score.
 _UNSEEN = 0.1
 
 
 class Agreement(NamedTuple):
-    """Agreement of points with depth images: `total / comparable` is their consistency, -18 to 1.
+    """Agreement of points with depth images: `total / comparable` is the consistency, -18 to 1.
 
     Attributes:
         total: matches less the cost of contradictions.
-        comparable: visible points, and a share of all points.
+        comparable: number of visible points, plus a share of all points.
     """
 
     total: Float[Array, "..."]
     comparable: Float[Array, "..."]
 
     def consistency(self) -> Float[Array, ""]:
-        """The consistency of all comparisons together; 0 where nothing is visible."""
+        """Consistency of all comparisons together; 0 where no point is visible."""
         return self.total.sum() / jnp.maximum(self.comparable.sum(), 1.0)
 
 
@@ -50,34 +50,34 @@ def image_agreement(
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
 ) -> Agreement:
-    """Matches less contradictions of points with the depth image of another camera.
+    """Computes matches less contradictions of points with the depth image of another camera.
 
-    A point that lands on the surface of the image matches it. A point in front of that surface
-    contradicts it, because the other camera looked through it. This is the self-contradictory occupancy of DeepMapping
-    figure 3, tested on the image instead of the map. A point behind the surface is hidden and counts 0.
+    A point on the surface of the image matches. A point in front of that surface contradicts it, because the other
+    camera looked through it. This is the self-contradictory occupancy of DeepMapping figure 3, tested on the image
+    instead of the map. A point behind the surface is occluded and counts 0.
 
     Args:
         T_other_camera: motion of the points into the frame of a second camera.
         sample: points of one image.
         surface_other: `image_surface` of that camera.
         pinhole: pinhole of that camera.
-        tolerance: share of the depth by which matching points may differ.
+        tolerance: tolerance of matching points as a share of the depth.
 
     Returns:
-        The agreement, two numbers.
+        Agreement, two numbers.
     """
     gap, is_visible = surface_gap(T_other_camera, sample, surface_other, pinhole)
     gap /= tolerance
     match, contradiction = _match_and_contradiction(gap)
     cost = jnp.clip(_CONTRADICTION * _FULL_TOLERANCE / tolerance, _LEAST_CONTRADICTION, _CONTRADICTION)
     score = jnp.where(is_visible, match - cost * contradiction, 0.0)
-    # Images that show nothing are compared with none.
+    # Fully masked images are not compared.
     unseen = jnp.where((surface_other[0] > 0.0).any(), _UNSEEN * sample.mask.sum(), 0.0)
     return Agreement(score.sum(), is_visible.sum() + unseen)
 
 
 def _match_and_contradiction(gap: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns match and contradiction of points with a surface, 0 to 1 each; the gap is in tolerances."""
+    """Computes match and contradiction of points with a surface, 0 to 1 each; the gap is in tolerances."""
     return jnp.exp(-(gap**2)), jax.nn.sigmoid(3.0 * (gap - 2.0))
 
 
@@ -87,7 +87,7 @@ def surface_gap(
     surface_other: Float[Array, "4 r c"],
     pinhole: Pinhole,
 ) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """Computes the distances of points in front of the surface that another camera sees.
+    """Computes the distances of points in front of the surface of another camera's image.
 
     Args:
         T_other_camera: motion of the points into the frame of a second camera.
@@ -96,8 +96,8 @@ def surface_gap(
         pinhole: pinhole of that camera.
 
     Returns:
-        The distance in shares of the surface's depth, below 0 behind it; and whether the point lands on a surface,
-        else the distance is 0.
+        Distance as a share of the surface's depth, negative behind the surface; and True for points that are projected
+        to a surface, else the distance is 0.
     """
     seen = rigid.transform_points(T_other_camera, sample.points)
     depth = seen[:, 2]
@@ -112,7 +112,7 @@ def surface_gap(
 def _inverse_depth_at(
     surface: Float[Array, "4 r c"], row: Float[Array, " p"], column: Float[Array, " p"]
 ) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """One over the depth between four pixels, and whether they lie on one surface."""
+    """Interpolates the inverse depth between four pixels; the mask is True where they lie on one surface."""
     num_rows, num_columns = surface.shape[1:]
     top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, num_rows - 1)
     left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, num_columns - 1)
@@ -131,7 +131,7 @@ def both_ways(
     pinhole: Pinhole,
     tolerance: Float[Array, ""],
 ) -> Agreement:
-    """Agreement of a pair of images, in both directions.
+    """Computes the agreement of a pair of images, in both directions.
 
     Args:
         T_other_camera: motion of points of the first image into the frame of the second camera.
@@ -155,15 +155,15 @@ def consistency_of_pairs(
     offsets: Int[Array, " o"],
     tolerance: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Consistency of each image with those `offsets` later, the last followed by the first; each pair once.
+    """Computes the consistency of each image with those `offsets` later, cyclically; each pair once.
 
-    All comparisons are pooled: the mean over pairs would reward images for looking at what many others see.
+    All comparisons are pooled, because the mean over pairs would favour views of places that many images overlap with.
 
     Args:
         T_world_camera: poses.
-        sample: some points of each image.
+        sample: sampled points of each image.
         scans: depth images, unit of the poses.
-        offsets: different numbers, 1 to n // 2; half the circle of offsets has every pair.
+        offsets: distinct numbers, 1 to n // 2; these offsets cover every pair.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
@@ -178,7 +178,7 @@ def consistency_of_pairs(
         agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
             T_other_camera, (sample, others), (surfaces, surfaces[other]), scans.pinhole, tolerance
         )
-        # At half the circle the second half of the images repeats the pairs of the first.
+        # At offset n / 2 the second half of the images repeats the pairs of the first half.
         is_new = (2 * offset != count) | (jnp.arange(count) < offset)
         return Agreement(*(jnp.sum(jnp.where(is_new, values, 0.0)) for values in agreements))
 
@@ -192,16 +192,15 @@ def explained_share(
     unit: Float[Array, ""] | float,
     tolerance: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Share of the points that another image explains, less the cost of those that another image contradicts.
+    """Computes the share of the points that another image explains, less the cost of contradicted points.
 
-    Each point counts once: it is explained as well as by the image that it matches best, and contradicted as much as
-    by the image that contradicts it most. Images that look at one thing together gain nothing by it. A contradiction
-    is clear at any tolerance: a pose that is off by a tolerance still explains nearly all it should, and contradicts
-    nothing.
+    Each point counts once, with the best match and the largest contradiction over all images, so views of one place by
+    many images are not favoured. The limit of contradictions does not depend on the tolerance: a pose error of one
+    tolerance keeps nearly all matches and causes no contradiction.
 
     Args:
         T_world_camera: poses.
-        sample: some points of each image.
+        sample: sampled points of each image.
         scans: depth images, unit of the poses.
         unit: typical range of the images, unit of the points.
         tolerance: share of the depth by which matching points may differ.
@@ -233,15 +232,15 @@ def explained_share(
 def projective_consistency(
     scans: DepthScans, T_world_camera: Float[Array, "n 4 4"], tolerance: Float[Array, ""] | float = 0.02
 ) -> Float[Array, ""]:
-    """Consistency of all pairs of images, all their pixels: compares trajectories without a ground truth.
+    """Computes the consistency of all pairs of images with all pixels, without ground truth.
 
     Args:
         scans: depth images.
-        T_world_camera: their poses, unit of the points.
+        T_world_camera: poses of the images, unit of the points.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
-        -18 (every point contradicts an image) to 1; 0 where no image sees anything of another one.
+        -18 (every point contradicts an image) to 1; 0 without any overlap.
     """
     offsets = jnp.arange(1, scans.mask.shape[0] // 2 + 1)
     T = jnp.asarray(T_world_camera, scans.points.dtype)

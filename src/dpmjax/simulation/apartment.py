@@ -1,4 +1,4 @@
-"""Furnished apartments of boxes, made by seed, and the depth that a ray from a camera meets.
+"""Furnished apartments of boxes, made by seed, and depth images of them by ray casting.
 
 World frame: x and z span the floor, y points down; the camera travels in the plane y = 0.
 """
@@ -32,8 +32,8 @@ class Apartment:
         half_sizes: (b, 3) metres.
         yaws: (b,) radians about y.
         size_x_m: the rectangle is [0, size_x_m] x [0, size_z_m].
-        size_z_m: the same along z.
-        is_seen_through: (b,) True for the shell, which is seen from within.
+        size_z_m: side of the rectangle along z.
+        is_seen_through: (b,) True for the outer shell, which is visible from within.
     """
 
     name: str
@@ -106,7 +106,7 @@ class _Rooms(NamedTuple):
 
 
 def _place_furniture(rng: np.random.Generator, rooms: _Rooms) -> list[_Box]:
-    """One piece at a wall, on a wall, or in the room; nothing where it would block the doorway."""
+    """Places one piece at a wall, on a wall, or in the room; none where it would block the doorway."""
     size_x, size_z, wall_x, door_z = rooms
     kind = _KINDS[int(rng.choice(len(_KINDS), p=_KIND_SHARES))]
     width, depth = rng.uniform(0.3, 1.1), rng.uniform(0.25, 0.6)
@@ -134,7 +134,7 @@ def _place_furniture(rng: np.random.Generator, rooms: _Rooms) -> list[_Box]:
 def _build_furniture(
     rng: np.random.Generator, kind: str, place: FloatArray, footprint: tuple[float, float, float]
 ) -> list[_Box]:
-    """The boxes of a piece; the footprint is width, depth and yaw."""
+    """Builds the boxes of a piece; the footprint is width, depth and yaw."""
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
     width, depth, yaw = footprint
     x, z = place
@@ -165,17 +165,17 @@ def cast_depth(
     half_sizes: Float[AnyArray, "b 3"],
     yaws: Float[AnyArray, " b"],
 ) -> Float[Array, "h w"]:
-    """Depth along z of the first surface that each ray meets; `vmap` over cameras.
+    """Computes the depth along z of the first surface that each ray hits; `vmap` over cameras.
 
     Args:
         T_world_camera: pose of the camera.
         rays: directions in the camera frame with z = 1, so that a length along a ray is a depth.
         centres: centres of the boxes in the world, metres.
-        half_sizes: half sizes of the boxes; a box of size 0 is never met.
+        half_sizes: half sizes of the boxes; a box of size 0 is never hit.
         yaws: turn of each box about y, radians.
 
     Returns:
-        (h, w) metres; infinite where a ray meets nothing. From within a box its inside is seen.
+        (h, w) metres; infinite without a hit. A ray from within a box hits the inside of the box.
     """
     T, rays = jnp.asarray(T_world_camera), jnp.asarray(rays)
     directions_world = jnp.einsum("ij,hwj->hwi", T[:3, :3], rays, precision=jax.lax.Precision.HIGHEST)

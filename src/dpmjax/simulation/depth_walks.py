@@ -18,7 +18,7 @@ from dpmjax.simulation.apartment import Apartment, cast_depth, make_apartment
 # DeepMapping section 4.2: distance of places, angle between views, share of the steps that are moves instead of turns.
 _GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
 _REVERSAL_SHARE = 0.2
-"""So many turns go the other way than the one before."""
+"""Share of the turns with the opposite sign of the turn before."""
 
 _CLEARANCE_M, _FREE_CLEARANCE_M = 0.2, 0.1  # Places keep these distances from walls and furniture; after jitter.
 _FARTHEST_M = 6.0  # Deeper pixels are masked.
@@ -40,8 +40,8 @@ class DepthWalkConfig:
         dropout_share: share of the pixels without a depth at three metres; it grows with the square of the depth, too.
         steps: "one": one move of 0.3 m or one turn of 30 degrees between views, as in the Active Vision Dataset.
             "both": moves and turns at once, both with jitter.
-        min_spread_m: walks are drawn until the cameras are this far from their mean (root mean square): the ATE of not
-            moving at all.
+        min_spread_m: least root mean square distance of the cameras from their mean, which is the ATE of a constant
+            position; walks are drawn until it is reached.
 
     Raises:
         ValueError: a number out of range.
@@ -61,14 +61,14 @@ class DepthWalkConfig:
 
 
 HARD_WALK = DepthWalkConfig(depth_noise_m=0.0015, dropout_share=0.1, steps="both", min_spread_m=0.45)
-"""Walks on which not moving exceeds the paper's threshold of 450 mm. The noise is that of a structured-light camera
+"""Walks for which a constant position exceeds the paper's threshold of 450 mm, with noise of a structured-light camera
 (Khoshelham and Elberink 2012: 1.4 mm at one metre)."""
 
 
 def simulate_depth_sequence(
     apartment: int | Apartment = 0, num_views: int = 16, *, seed: int = 0, config: DepthWalkConfig | None = None
 ) -> DepthSequence:
-    """A random walk over the grid of an apartment, seen by a depth camera that looks level.
+    """Simulates a random walk of a level depth camera over the grid of an apartment.
 
     Args:
         apartment: seed for `make_apartment`, or an apartment.
@@ -114,7 +114,7 @@ def _wide_walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np
 
 
 def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.random.Generator) -> FloatArray:
-    """(n, 3) x, z and angle about y: neighbouring places of a grid, neighbouring views."""
+    """Draws x, z and angle about y (n, 3) of neighbouring views at neighbouring positions of a grid."""
     x, z = np.arange(0.0, home.size_x_m, _GRID_M), np.arange(0.0, home.size_z_m, _GRID_M)
     places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1)
     is_free = home.is_free(places.reshape(-1, 2), _CLEARANCE_M).reshape(places.shape[:2])
@@ -147,14 +147,14 @@ def _free_neighbours(is_free: BoolArray, at: np.ndarray) -> list[np.ndarray]:
 
 
 def _jittered(home: Apartment, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Moves and turns each pose a little; a place that would not be free stays."""
+    """Adds noise to each pose, unless the new position is not free."""
     moved = poses + rng.standard_normal(poses.shape) * [_JITTER_M, _JITTER_M, np.deg2rad(_JITTER_DEG)]
     is_free = home.is_free(moved[:, :2], _FREE_CLEARANCE_M)
     return np.where(is_free[:, None], moved, poses)
 
 
 def _planar_to_matrices(poses: FloatArray) -> FloatArray:
-    """(n, 4, 4) T_world_camera of x, z and the angle about y."""
+    """Converts x, z and the angle about y to T_world_camera (n, 4, 4)."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, 0, 0], T[:, 0, 2], T[:, 2, 0], T[:, 2, 2] = cos, sin, -sin, cos

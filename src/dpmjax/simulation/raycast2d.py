@@ -1,4 +1,4 @@
-"""The ideal planar lidar: exact meeting points of beams with a world of unit pixel squares, and scans of a walk.
+"""Planar lidar: exact intersections of beams with a world of unit pixel squares, and scans of a walk.
 
 Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1). The x axis points right along the
 columns, y points up along the rows (row 0 is the lowest). So the world is right-handed, and a plot with the origin
@@ -18,7 +18,7 @@ from dpmjax.simulation.world2d import make_world
 
 
 def beam_angles(num_beams: int) -> FloatArray:
-    """Angles of a 360-degree scan as the DeepMapping authors order it.
+    """Returns the angles of a 360-degree scan in the order of the DeepMapping authors.
 
     Args:
         num_beams: number of beams.
@@ -35,7 +35,7 @@ def beam_angles(num_beams: int) -> FloatArray:
 
 
 def cast_scans(is_obstacle: BoolArray, poses: ArrayLike, *, num_beams: int = 256) -> FloatArray:
-    """Ranges of noise-free scans of 360 degrees.
+    """Computes the ranges of noise-free scans of 360 degrees.
 
     Args:
         is_obstacle: (h, w), True where a pixel is solid.
@@ -108,7 +108,7 @@ def scan_world(
 
     Returns:
         points: (n, num_beams, 2) float32 in the sensor frame, px; zero where masked.
-        mask: (n, num_beams) bool, True where the beam measured something.
+        mask: (n, num_beams) bool, True for valid beams.
 
     Raises:
         ValueError: a pose lies in an obstacle or outside of the image; or there is noise but no `rng`.
@@ -121,7 +121,7 @@ def scan_world(
 
 
 def _measured_points(ranges: FloatArray, range_noise_px: float, rng: np.random.Generator | None) -> NDArray[np.float32]:
-    """(n, b, 2) beam end points in the sensor frame, with range noise."""
+    """Computes beam end points (n, b, 2) in the sensor frame, with range noise."""
     angles = beam_angles(ranges.shape[1])
     if rng is not None and range_noise_px > 0:
         ranges = np.maximum(ranges + rng.normal(0.0, range_noise_px, ranges.shape), 0.0)
@@ -148,7 +148,7 @@ def simulate_sequence(
         num_beams: beams per scan over 360 degrees.
         range_noise_px: standard deviation of Gaussian noise on the ranges, px.
         seed: seed of walk and noise.
-        with_odometry: whether to simulate wheel odometry too.
+        with_odometry: True to simulate wheel odometry, too.
 
     Returns:
         The sequence in px, organised, with the true poses in the world's frame as reference.
@@ -159,7 +159,7 @@ def simulate_sequence(
     if num_scans < 2:
         raise ValueError(f"num_scans must be at least 2, got {num_scans}")
     scene = world if isinstance(world, World) else make_world(world)
-    # The name takes part, so that walks through two worlds are two walks and not one bent by other walls.
+    # The name is part of the seed, so that walks through two worlds are independent.
     streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(4))
     walk_rng, noise_rng, odometry_rng, people_rng = map(np.random.default_rng, streams)
     poses = simulate_trajectory(scene, num_scans, rng=walk_rng)
@@ -183,7 +183,7 @@ def _check_origins(is_obstacle: BoolArray, origins: FloatArray) -> None:
 
 
 def _free_distance(is_obstacle: BoolArray) -> NDArray[np.int32]:
-    """(h + 2, w + 2) chessboard distance to the nearest solid pixel; a solid frame is put round the image."""
+    """Computes chessboard distances (h + 2, w + 2) to the nearest solid pixel, with a solid frame round the image."""
     from scipy.ndimage import distance_transform_cdt
 
     framed = np.pad(is_obstacle, 1, constant_values=True)
@@ -200,9 +200,9 @@ def _leap(
     Args:
         start: (m, 2) origins.
         direction: (m, 2) unit directions.
-        cell: (m, 2) pixels that the beams are in.
+        cell: (m, 2) current pixels of the beams.
         reach: (m,) half-widths of the free squares.
-        reached: (m,) lengths at which the beams are.
+        reached: (m,) current lengths of the beams.
 
     Returns:
         The new cells (m, 2), and the lengths (m,) at which they are entered.
@@ -213,7 +213,7 @@ def _leap(
         time = np.where(direction == 0, np.inf, (edge - start) / direction)
     axis = np.argmin(time, axis=1)
     rows, other = np.arange(len(cell)), 1 - axis
-    # A beam that starts on an edge and all but follows it may be found to cross it late: never go back.
+    # Rounding may give an earlier crossing for a beam nearly along an edge, so lengths never decrease.
     length = np.maximum(time[rows, axis], reached)
     entered = np.empty_like(cell)
     entered[rows, axis] = cell[rows, axis] + ahead[rows, axis]

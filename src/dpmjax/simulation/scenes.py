@@ -1,4 +1,4 @@
-"""Scenes to train on: a place, a lidar and a route, drawn by seed from a mixture that spans what lidars see."""
+"""Scenes for training: a kind of place, a lidar and a route, drawn by seed from a mixture."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class SceneMixture:
     Attributes:
         kinds: kinds of place, outdoors and indoors, with their weights.
         sensors: lidars, with their weights.
-        length_m: length of the way outdoors; indoors a quarter of it.
-        spacing_m: mean way between scans outdoors; indoors a quarter of it.
-        indoor_scale: lowest and highest factor that a scene indoors and its poses are scaled by, drawn uniformly in its
-            logarithm: networks made for tens of metres see more of a scene that is enlarged.
+        length_m: length of the route outdoors; indoors a quarter of it.
+        spacing_m: mean distance between scans outdoors; indoors a quarter of it.
+        indoor_scale: lowest and highest scale of an indoor scene and its poses, drawn log-uniformly, because networks
+            for ranges of tens of metres resolve more of an enlarged scene.
         moving_rate: share of the drives whose lidar moves during its turn.
         other_lidar_rate: share of the drives in which every other scan is of a second lidar.
 
@@ -69,16 +69,16 @@ class SceneMixture:
 
 @dataclass(frozen=True)
 class Scene:
-    """A place, and how a lidar is moved through it.
+    """A place, a lidar, and the motion of the lidar.
 
     Attributes:
-        seed: of everything random in it.
+        seed: seed of all random choices.
         place: configuration of the town or the building.
-        motion: how the lidar is moved, `DriveConfig` in a town, `WalkConfig` in a building.
+        motion: settings of the motion, `DriveConfig` in a town, `WalkConfig` in a building.
         sensor: the lidar.
         scale: factor of points and poses.
         is_moving: the lidar moves during its turn, and the scans are not corrected for it.
-        other_sensor: lidar of every other scan; None where all are of one.
+        other_sensor: lidar of every other scan; None: all scans are of one lidar.
 
     Raises:
         ValueError: a motion that does not belong to the place.
@@ -109,7 +109,7 @@ TRAINING_MIXTURE = SceneMixture(
     ),
     other_lidar_rate=0.7,
 )  # fmt: skip
-"""What networks are trained on: a third indoors, and drives in which two lidars take turns."""
+"""Mixture for training: a third of the scenes are indoors, and some drives alternate between two lidars."""
 
 
 def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
@@ -129,7 +129,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
         raise ValueError(f"seed must not be negative, got {seed}")
     rng = np.random.default_rng([_SCENE_STREAM, seed])
     kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
-    # Drawn outdoors, too, where it is 1: the choices after it stay those of the seed.
+    # Also drawn outdoors, where the scale is 1, so that later draws of a seed are the same.
     scale = float(np.exp(rng.uniform(*np.log(mixture.indoor_scale if kind in INDOOR_KINDS else (1.0, 1.0)))))
     is_moving = bool(rng.random() < mixture.moving_rate)
     if kind in INDOOR_KINDS:
@@ -215,11 +215,11 @@ def simulate_drive(
     """Draws and builds one scene of the mixture, of a given kind of place or with a given lidar.
 
     Args:
-        seed: of everything random in it, not negative.
-        length_m: length of the way outdoors; indoors a quarter of it.
+        seed: seed of all random choices, not negative.
+        length_m: length of the route outdoors; indoors a quarter of it.
         kind: kind of place; None draws one.
         sensor: the lidar; None draws one.
-        mixture: distribution of scenes; its `length_m` does not count.
+        mixture: distribution of scenes; `length_m` replaces that of the mixture.
 
     Returns:
         The sequence, with exact poses and times; a scan is simulated when it is read.

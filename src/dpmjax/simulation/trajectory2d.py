@@ -1,7 +1,7 @@
 """Walks of the robot and of people through a planar world, with the step statistics of DeepMapping section 4.1.
 
-The lidar sees all round, so the robot may move in any direction. It steers by the direction of the step, and the
-heading turns by an independent uniform angle: the statistics of the paper hold exactly.
+The lidar has a view of 360 degrees, so the robot may move in any direction. Steps follow the route, and the heading
+turns by an independent uniform angle, so that the statistics of the paper hold exactly.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _MAX_ROTATION_DEG, _MEAN_STEP_PX = 10.0, 8.16
 _CLEARANCE_PX = 8.0  # No point of the path comes closer to an obstacle or to the border of the image.
 _LEG_PX = 260.0  # Wanted length of a leg to a new place; after two legs the robot comes home by another way.
 _CELL_PX = 8  # Raster of the route planner.
-_PLAN_MARGIN_PX = 8.0  # Routes keep this much more clearance than the walk has to.
+_PLAN_MARGIN_PX = 8.0  # Additional clearance of routes.
 _LOOKAHEAD_PX = 36.0
 
 
 def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generator) -> FloatArray:
-    """Walks through a world: out to new places, home again by another way, and so on.
+    """Simulates a walk through a world: repeatedly to new places and back by another route.
 
     Args:
         world: where to walk.
@@ -55,17 +55,17 @@ def simulate_odometry(
     rotation_noise_deg: float = 1.0,
     bias: float = 0.01,
 ) -> FloatArray:
-    """Simulates wheel odometry: each relative motion gets a fixed scale error and white noise; the motions are chained.
+    """Simulates wheel odometry: chained relative motions with a constant scale error and white noise.
 
     Args:
         poses: (n, 3) true x, y, heading (radians).
         rng: source of the errors.
         translation_noise: standard deviation of each step's error per length travelled, along and across.
         rotation_noise_deg: standard deviation of each step's heading error, degrees.
-        bias: standard deviation of the scale errors that stay the same over the whole drive.
+        bias: standard deviation of the constant scale errors of a drive.
 
     Returns:
-        (n, 3) float64 poses in the odometry's own world: the first is zero.
+        (n, 3) float64 poses in the frame of the odometry; the first is zero.
     """
     pose = np.asarray(poses, np.float64).reshape(-1, 3)
     forward, left, turn = se2.relative(pose[:-1], pose[1:]).T
@@ -78,7 +78,7 @@ def simulate_odometry(
 
 
 def _clearance(is_obstacle: BoolArray) -> FloatArray:
-    """(h, w) lower bound of the distance (px) of any point of a pixel to the next obstacle or to the border."""
+    """Computes a lower bound (h, w) of the distance (px) of a pixel to the next obstacle or to the border."""
     from scipy.ndimage import distance_transform_edt
 
     distance = distance_transform_edt(np.pad(~is_obstacle, 1, constant_values=False))[1:-1, 1:-1]
@@ -86,14 +86,14 @@ def _clearance(is_obstacle: BoolArray) -> FloatArray:
 
 
 def _plan_route(clearance: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:
-    """(k, 2) raster points of a route of at least the wanted length, every third leg back to where it began."""
+    """Plans raster points (k, 2) of a route of at least the wanted length, every third leg back to its start."""
     coarse = clearance[_CELL_PX // 2 :: _CELL_PX, _CELL_PX // 2 :: _CELL_PX]
     cells = np.argwhere(largest_region(coarse >= _CLEARANCE_PX + _PLAN_MARGIN_PX))
     if len(cells) < 2:
         raise ValueError("world is too narrow to move in: no connected free space with the wanted clearance")
     centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
     visits = np.zeros(len(cells))
-    # Of three places the middlemost: from a corner there is little to explore.
+    # The most central of three positions, because few places are reachable from a corner.
     wishes = rng.integers(len(cells), size=3)
     home = place = int(wishes[np.argmin(np.linalg.norm(centres[wishes] - centres.mean(axis=0), axis=1))])
     route, travelled, leg = [place], 0.0, 0
@@ -113,7 +113,7 @@ def _plan_route(clearance: FloatArray, length_px: float, rng: np.random.Generato
 def _shortest_paths(
     cells: NDArray[np.int64], coarse: FloatArray, visits: FloatArray, start: int
 ) -> tuple[FloatArray, NDArray[np.int32]]:
-    """Costs (k,) from the start cell and predecessors (k,); walls and used ways cost more than open new ground."""
+    """Computes costs (k,) from the start cell and predecessors (k,), higher near walls and on visited cells."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
@@ -131,7 +131,7 @@ def _shortest_paths(
 
 
 def _choose_goal(cost: FloatArray, visits: FloatArray, rng: np.random.Generator) -> int:
-    """The least visited of a handful of places about a leg away."""
+    """Chooses the least visited of several cells about a leg away."""
     off = np.abs(cost / (1.5 * _LEG_PX) - 1.0)
     near_enough = np.flatnonzero((off <= max(0.4, float(np.partition(off, 1)[1]))) & (cost > 0))
     options = rng.choice(near_enough, size=min(8, len(near_enough)), replace=False)
@@ -139,7 +139,7 @@ def _choose_goal(cost: FloatArray, visits: FloatArray, rng: np.random.Generator)
 
 
 def _trace(before: NDArray[np.int32], start: int, goal: int) -> list[int]:
-    """Cells after `start` up to and including `goal`."""
+    """Returns the cells after `start` up to and including `goal`."""
     path = [goal]
     while path[-1] != start:
         path.append(int(before[path[-1]]))
@@ -147,7 +147,7 @@ def _trace(before: NDArray[np.int32], start: int, goal: int) -> list[int]:
 
 
 def _walk(route: FloatArray, clearance: FloatArray, num_poses: int, rng: np.random.Generator) -> FloatArray:
-    """(num_poses, 2) positions: steps of random length towards the farthest visible point of the route, unsteadily."""
+    """Simulates positions (num_poses, 2): steps of random length and direction towards the farthest visible point."""
     positions, along = [route[0]], 0
     lengths = _MEAN_STEP_PX * rng.uniform(0.6, 1.4, num_poses - 1)
     sway = np.deg2rad(12.0) * rng.normal(size=num_poses - 1)
@@ -167,7 +167,7 @@ def _walk(route: FloatArray, clearance: FloatArray, num_poses: int, rng: np.rand
 
 
 def _aim(route: FloatArray, along: int, here: FloatArray, clearance: FloatArray) -> int:
-    """Index of the route point to walk to: the farthest one ahead that is within sight and not far off."""
+    """Finds the index of the farthest visible route point ahead within the look-ahead distance."""
     last = min(along + int(2 * _LOOKAHEAD_PX / _CELL_PX), len(route) - 1)
     for index in range(last, along, -1):
         is_near = np.linalg.norm(route[index] - here) <= _LOOKAHEAD_PX
@@ -187,16 +187,16 @@ def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray) -> bool
 
 
 _RADIUS_PX = 11.0
-# People who would stand nearer to the sensor than this have stepped out of the way, and are not in that scan.
+# People nearer to the sensor than this are left out of the scan.
 _LEAST_DISTANCE_PX = 2.0 * _RADIUS_PX
 
 
 def simulate_people(world: World, num_scans: int, *, rng: np.random.Generator) -> FloatArray:
-    """Lets the people of a world walk, at the pace of the robot and by its rules.
+    """Simulates the walks of the people of a world, with the speed and the rules of the robot.
 
     Args:
-        world: where to walk, and how many people do.
-        num_scans: moments at which they are wanted.
+        world: world with a number of people.
+        num_scans: number of scans.
         rng: source of all choices.
 
     Returns:
@@ -207,7 +207,7 @@ def simulate_people(world: World, num_scans: int, *, rng: np.random.Generator) -
 
 
 def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, people: FloatArray) -> FloatArray:
-    """Shortens the beams that meet a person before they meet the world.
+    """Shortens the beams that hit a person before the world.
 
     Args:
         ranges: (n, b) of the world without people, px.
@@ -224,7 +224,7 @@ def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, pe
         to_person = centres - poses[:, :2]
         along = np.einsum("nbk,nk->nb", beams, to_person)
         distance = np.linalg.norm(to_person, axis=-1)[:, None]
-        # Half of the chord that the beam cuts out of the disc, squared; negative where it passes by.
+        # Squared half chord of the beam in the disc; negative without a hit.
         half_chord = _RADIUS_PX**2 - (distance**2 - along**2)
         is_met = (half_chord > 0) & (along > 0) & (distance > _LEAST_DISTANCE_PX)
         ranges = np.where(is_met, np.minimum(ranges, along - np.sqrt(np.maximum(half_chord, 0.0))), ranges)

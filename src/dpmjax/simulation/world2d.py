@@ -1,10 +1,10 @@
 """Binary worlds of 1024 x 1024 pixels in the manner of DeepMapping Figure 4, each made by its seed.
 
-The index selects one of three kinds in turn. 0 is an office (rooms cut out of rooms). 1 is a yard (free-standing
-blocks, open to the border of the image). 2 is a clinic (a corridor between two rows of rooms). All are furnished with
-round, square and three-cornered obstacles, so that no two places look alike. Two more kinds have names only: a grove
-(trees, bushes and rocks within the edge of a forest, without a straight wall) and a crowd (an office with walking
-people). The frame is that of `raycast`: row 0 is the lowest.
+The index selects one of three kinds in turn. 0 is an office (rooms by repeated division). 1 is a yard (free-standing
+blocks, open to the border of the image). 2 is a clinic (a corridor between two rows of rooms). All have round, square
+and triangular obstacles, so that no two places look alike. Two more kinds have names only. A grove has trees, bushes
+and rocks within the edge of a forest, without a straight wall. A crowd is an office with walking people. The frame is
+that of `raycast2d`: row 0 is the lowest.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ def make_world(world: int | str) -> World:
 
 
 def _build_office(grid: BoolArray, rng: np.random.Generator) -> None:
-    """Rooms by repeated division, each wall with its doors."""
+    """Builds rooms by repeated division, each wall with its doors."""
     _paint_frame(grid)
     _divide(grid, rng, (0, 0, SIZE_PX, SIZE_PX), depth=0)
     _furnish(grid, rng, num_tries=320, gap=40)
 
 
 def _build_yard(grid: BoolArray, rng: np.random.Generator) -> None:
-    """Blocks of one to three boxes on a shaken 4 x 4 raster; the border is open, as in the authors' worlds."""
+    """Builds blocks of one to three boxes on a jittered 4 x 4 raster, with an open border as in the authors' worlds."""
     for x, y in rng.permutation([(x, y) for x in range(4) for y in range(4)])[:13]:
         centre = (np.array([x, y]) + 0.5) * SIZE_PX / 4 + rng.uniform(-25, 25, 2)
         for _ in range(rng.integers(1, 4)):
@@ -75,13 +75,13 @@ def _build_yard(grid: BoolArray, rng: np.random.Generator) -> None:
 
 
 def _build_clinic(grid: BoolArray, rng: np.random.Generator) -> None:
-    """A crooked corridor from left to right, a row of rooms above and one below, and doors from room to room."""
+    """Builds a crooked corridor from left to right, rows of rooms above and below, and doors from room to room."""
     _paint_frame(grid)
     for sign, wall_y in ((1, 570), (-1, 430)):
         widths = rng.dirichlet(np.full(4, 12.0)) * SIZE_PX
         edges = np.concatenate([[0.0], np.cumsum(widths)])
         for left, right in pairwise(edges):
-            # Each room stands forward or back: along a straight corridor no scan would fix the position.
+            # Walls of rooms are offset, because no scan constrains the position along a straight corridor.
             y = wall_y + sign * rng.uniform(-15, 45)
             door = rng.uniform(left + 0.2 * (right - left), left + 0.8 * (right - left) - _DOOR_PX)
             _paint_span(grid, 0, y, (left, right), [door])
@@ -93,7 +93,7 @@ def _build_clinic(grid: BoolArray, rng: np.random.Generator) -> None:
 
 
 def _build_grove(grid: BoolArray, rng: np.random.Generator) -> None:
-    """A clearing within the uneven edge of a forest; round trunks, bushes and rocks stand in it."""
+    """Builds a clearing within the uneven edge of a forest, with round trunks, bushes and rocks."""
     middle = np.full(2, SIZE_PX / 2)
     clearing = np.zeros_like(grid)
     _paint_outline(clearing, middle, 0.39 * SIZE_PX, _EDGE_WAVES * rng.normal(size=(2, len(_EDGE_WAVES))))
@@ -103,7 +103,7 @@ def _build_grove(grid: BoolArray, rng: np.random.Generator) -> None:
 
 
 def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int, int], depth: int) -> None:
-    """Cuts a room (x, y, width, height) in two by a wall with one or two doors, and goes on with both halves."""
+    """Divides a room (x, y, width, height) by a wall with one or two doors, and then both halves in turn."""
     x, y, width, height = room
     if max(width, height) < 330 or (depth >= 3 and max(width, height) < 420):
         return
@@ -125,7 +125,7 @@ def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int
 
 
 def _clear_door(grid: BoolArray, along: int, at: float, door: float) -> None:
-    """Takes away what a later wall put into a doorway."""
+    """Clears a doorway of later walls."""
     reach = slice(max(int(at) - 40, _WALL_PX), int(at) + 40)
     width = slice(int(door), int(door) + _DOOR_PX)
     grid[(width, reach) if along else (reach, width)] = False
@@ -134,7 +134,7 @@ def _clear_door(grid: BoolArray, along: int, at: float, door: float) -> None:
 def _furnish(
     grid: BoolArray, rng: np.random.Generator, num_tries: int, gap: int, painters: Sequence[_Painter] | None = None
 ) -> None:
-    """Puts obstacles of different shapes wherever a passage of `gap` pixels is left all round."""
+    """Adds obstacles of different shapes where a passage of `gap` pixels remains all round."""
     painters = painters or (_paint_box, _paint_disc, _paint_triangle)
     for _ in range(num_tries):
         centre, size = rng.uniform(40, SIZE_PX - 40, 2), rng.uniform(9, 34, 2)
@@ -150,7 +150,7 @@ def _paint_frame(grid: BoolArray) -> None:
 
 
 def _paint_span(grid: BoolArray, along: int, at: float, span: tuple[float, float], doors: list[float]) -> None:
-    """A wall along x (0) or y (1) at the second coordinate `at`, over `span`, with gaps that start at `doors`."""
+    """Paints a wall along x (0) or y (1) at the second coordinate `at`, over `span`, with gaps from `doors` on."""
     line = np.zeros(SIZE_PX, bool)
     line[max(int(span[0]), 0) : int(span[1])] = True
     for door in doors:
@@ -160,7 +160,7 @@ def _paint_span(grid: BoolArray, along: int, at: float, span: tuple[float, float
 
 
 def _local(centre: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
-    """Coordinates of all pixel centres in a frame at `centre`, turned by `angle`."""
+    """Computes coordinates of all pixel centres in a frame at `centre`, turned by `angle`."""
     x, y = centre
     axis = np.arange(SIZE_PX) + 0.5
     dx, dy = (axis - x)[None, :], (axis - y)[:, None]
@@ -185,14 +185,12 @@ def _paint_triangle(grid: BoolArray, centre: FloatArray, size: FloatArray, angle
 def _paint_blob(
     grid: BoolArray, centre: FloatArray, size: FloatArray, _angle: float, *, rng: np.random.Generator
 ) -> None:
-    """A bush or a rock."""
+    """Paints a bush or a rock."""
     _paint_outline(grid, centre, float(np.mean(size)), _BLOB_WAVES * rng.normal(size=(2, len(_BLOB_WAVES))))
 
 
 def _paint_outline(grid: BoolArray, centre: FloatArray, radius: float, waves: FloatArray) -> None:
-    """Finds pixels within a radius that varies with the direction: cosines and sines (2, k) of two and more waves
-    round.
-    """
+    """Paints pixels within a radius that varies with the direction: cosines and sines (2, k) of two and more waves."""
     turn = np.linspace(-np.pi, np.pi, 4096)
     phase = turn[:, None] * np.arange(2, 2 + waves.shape[1])
     outline = radius * np.exp(np.cos(phase) @ waves[0] + np.sin(phase) @ waves[1])
@@ -209,4 +207,4 @@ _KINDS: dict[str, Callable[[BoolArray, np.random.Generator], None]] = {
     "grove": _build_grove,
     "crowd": _build_office,
 }
-"""How each kind is built; the first three are those of numbers."""
+"""Builders of the kinds; the first three are those of numbers."""

@@ -26,7 +26,7 @@ def error_boxes_figure(
 
     Args:
         panels: errors by measure (with its unit) and by method.
-        threshold: drawn as a line in the first panel: what counts as success.
+        threshold: limit of success, drawn as a line in the first panel.
 
     Returns:
         The figure.
@@ -132,7 +132,7 @@ def toy_figure(
 def endings_figure(
     x: ArrayLike, loss: ArrayLike, ends: Mapping[str, NDArray[np.floating]], shares: Mapping[str, float]
 ) -> Figure:
-    """Draws where the seeds end: L on top, then a histogram a method with the share that found the global minimum.
+    """Draws the final x of the seeds: L on top, then a histogram for each method with the share at the global minimum.
 
     Args:
         x: (k,) values of x; their range is shown.
@@ -172,7 +172,7 @@ class MatchedScans(NamedTuple):
         target: (m, 3) points in the target frame.
         source_matched: (k, 3) matched points of the source.
         target_matched: (k, 3) matched points of the target, row for row.
-        is_right: (k,) whether the true motion brings the two points of a match together.
+        is_right: (k,) True where the true motion maps the two points of a match onto each other.
     """
 
     source: ArrayLike

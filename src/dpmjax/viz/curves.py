@@ -99,7 +99,7 @@ def history_figure(history: History, unit: str) -> Figure:
 
 
 def _phases(names: Sequence[str], seconds: NDArray[np.floating]) -> list[_Phase]:
-    """Runs of equal names; a phase lasts from its predecessor's last record to its own last record."""
+    """Finds runs of equal names; a phase lasts from its predecessor's last record to its own last record."""
     borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
     return [
         _Phase(names[first], slice(first, last), (float(seconds[max(0, first - 1)]), float(seconds[last - 1])))

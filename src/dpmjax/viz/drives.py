@@ -99,7 +99,7 @@ def trajectory_figure(
 def height_map_figure(
     title: str, points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], path: Float[np.ndarray, "k 3"]
 ) -> Figure:
-    """Draws a map from above: what stands highest in each pixel, by its height above the lidar that passed there.
+    """Draws a map from above: the highest point of each pixel, by its height above the lidar that passed there.
 
     Under a roof, points more than a metre above the lidar are left out, so that the walls are visible.
 
@@ -117,7 +117,7 @@ def height_map_figure(
 
     if _is_roofed(points, heights_m, path):
         points, heights_m = points[heights_m < _ROOF_M], heights_m[heights_m < _ROOF_M]
-    # A few far points must not make the map small.
+    # Few far points must not determine the limits.
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
     limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
     width_in, height_in = size_in(limits)
@@ -176,7 +176,7 @@ def _is_roofed(
 def _raster(
     points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], limits: Limits, columns: int, rows: int
 ) -> UInt8[np.ndarray, "r c 3"]:
-    """The picture: the highest point of each pixel; pixels without points are white."""
+    """Makes the picture: the highest point of each pixel; pixels without points are white."""
     pixel, is_inside = pixels_of(points, limits, columns, rows)
     highest = np.full(rows * columns, -np.inf)
     np.maximum.at(highest, pixel, heights_m[is_inside])
@@ -198,5 +198,5 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
 
 
 def _style(track: Track, tracks: Sequence[Track]) -> dict[str, Any]:
-    """The last track is the one that counts."""
+    """Returns the line style of a track; the last track is the result."""
     return {"color": OURS, "lw": 1.5} if track is tracks[-1] else {"color": ODOMETRY, "lw": 1.1, "ls": (0, (4, 2))}

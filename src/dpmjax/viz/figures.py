@@ -58,7 +58,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) ->
 
 
 def style_axes(axes: Axes, x_label: str = "", y_label: str = "") -> None:
-    """Gives the axes of a curve their labels, a light grid, small ticks and a thin frame."""
+    """Adds labels, a light grid, small ticks and a thin frame to the axes of a curve."""
     axes.set_xlabel(x_label, fontsize=9, color=INK)
     axes.set_ylabel(y_label, fontsize=9, color=INK)
     axes.grid(color=FRAME, lw=0.6)
@@ -75,7 +75,7 @@ def annotate_corner(axes: Axes, text: str, offset: tuple[float, float], **style:
 
 
 def frame_map(axes: Axes, limits: Limits, unit: str | None = None) -> None:
-    """Gives a map panel equal axes, its limits, a thin frame instead of ticks, and a scale bar if there is a unit."""
+    """Sets equal axes, limits and a thin frame without ticks for a map panel; adds a scale bar if there is a unit."""
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(limits.x_min, limits.x_max)
     axes.set_ylim(limits.y_min, limits.y_max)
@@ -179,7 +179,7 @@ def draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"], label: str, color:
 def pixels_of(
     points: Float[np.ndarray, "n d"], limits: Limits, columns: int, rows: int
 ) -> tuple[Int64[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
-    """Returns the pixels of a flat raster over the limits, row by row, of the points inside; and which are inside."""
+    """Returns the pixels of the points inside the limits in a flat raster, row by row, and True for points inside."""
     place = (points[:, :2] - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
     column, row = np.floor(place).astype(np.int64).T
     is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)

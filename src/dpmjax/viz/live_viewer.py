@@ -23,7 +23,7 @@ class LiveViewer:
 
     Args:
         name: name of the recording.
-        path: file that is written where there is no screen; a throw-away, for viewers of other versions cannot read it.
+        path: file that is written without a screen, for viewers of the same version only.
 
     Raises:
         ValueError: rerun is not installed.
@@ -44,7 +44,7 @@ class LiveViewer:
         Args:
             number: number of the scan.
             points: metres, in the frame of the lidar.
-            T_world_scan: its pose.
+            T_world_scan: pose of the scan.
         """
         self._rerun.set_time("scan", sequence=number, recording=self._recording)
         self._log_pose("world/lidar", T_world_scan)
@@ -60,7 +60,7 @@ class LiveViewer:
 
         Args:
             T_world_keyframe: poses of all keyframes.
-            newest: points of the last one, metres, in the frame of the lidar.
+            newest: points of the last keyframe, metres, in the frame of the lidar.
             loops: positions of both ends of each accepted loop.
         """
         before, self._T_world_keyframe = self._T_world_keyframe, T_world_keyframe

@@ -43,7 +43,7 @@ class Panel:
     """One set of poses of the scans.
 
     Attributes:
-        title: what produced these poses.
+        title: name of the method of these poses.
         scans: points (n, b, 2) in the sensor frames, and mask (n, b), True where there is a point.
         poses: (n, 3) x, y, heading (radians) of the sensor in the world of this panel.
         ate: absolute trajectory error in the unit of the figure, or None.
@@ -72,17 +72,17 @@ class Panel:
 
     @property
     def trajectory_world(self) -> NDArray[np.float64]:
-        """(n, 2) sensor positions."""
+        """Sensor positions (n, 2)."""
         return np.asarray(self.poses, np.float64)[:, :2]
 
     @property
     def points_world(self) -> NDArray[np.float64]:
-        """(n, b, 2) the points where the poses put them."""
+        """Points (n, b, 2) in the world frame of the panel."""
         poses, points = np.asarray(self.poses, np.float64), np.asarray(self.scans.points, np.float64)
         return np.asarray(se2.transform_points(poses, points))
 
     def visible_points(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Returns the points (m, 2) that can be drawn, and the scan (m,) that each comes from."""
+        """Returns the points (m, 2) that can be drawn, and the index (m,) of the scan of each point."""
         points = self.points_world
         is_drawable = np.asarray(self.scans.mask, bool) & np.isfinite(points).all(axis=-1)
         return points[is_drawable], np.nonzero(is_drawable)[0]
@@ -195,7 +195,7 @@ def _draw_panel(axes: Axes, panel: Panel, unit: str, colormap: Colormap) -> None
 
 
 def _add_time_bar(figure: Figure, num_scans: int, colormap: Colormap) -> None:
-    """A thin bar under the panels that says which colour is which scan."""
+    """Adds a thin colour bar of the scans under the panels."""
     width_in = figure.get_figwidth()
     length_in = min(3.0, 0.5 * width_in)
     axes = add_axes(figure, (0.5 * (width_in - length_in), 0.24, length_in, 0.09))

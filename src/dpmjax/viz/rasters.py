@@ -1,4 +1,4 @@
-"""The world from above: the map that M-Net learned, errors of re-localisation, and clouds of depth images."""
+"""Pictures from above: the map of M-Net, errors of re-localisation, and clouds of depth images."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class ErrorMap(NamedTuple):
 
     Attributes:
         title: title of the network.
-        subtitle: its numbers.
+        subtitle: numbers of the network.
         error: (h, w) distance to the truth; NaN where no scan was taken. Row 0 has the smallest y.
     """
 
@@ -103,14 +103,14 @@ def error_maps_figure(
     *,
     worst: float,
 ) -> Figure:
-    """Draws errors of re-localisation in the manner of DeepMapping figure 7: black is right, the lighter the worse.
+    """Draws errors of re-localisation in the manner of DeepMapping figure 7; black is an error of zero.
 
     Args:
         maps: maps, at least one, all of one shape.
         extent: x_min, x_max, y_min, y_max of the grids' outer edges, in `unit`.
         trajectory_world: (n, 2) where the scans of the fit were taken.
         unit: unit of lengths.
-        worst: errors from here on have the last colour.
+        worst: least error of the last colour.
 
     Returns:
         The figure; the trajectory of the fit is cyan.
@@ -145,7 +145,7 @@ def error_maps_figure(
 def from_above_figure(
     panels: Sequence[tuple[str, ArrayLike]], points: ArrayLike, mask: ArrayLike, *, below_m: float = -0.9
 ) -> Figure:
-    """Draws depth images from above, without the ceiling, one colour an image, for several sets of poses.
+    """Draws depth images from above, without the ceiling, one colour for each image, for several sets of poses.
 
     Args:
         panels: title and (n, 4, 4) T_world_camera in metres; all are aligned with the last.
@@ -163,7 +163,7 @@ def from_above_figure(
         raise ValueError("panels: expected at least one")
     clouds, sensors = [], []
     cloud, valid = np.asarray(points, np.float64), np.asarray(mask, bool)
-    # The first camera is level in every panel: laying the first poses onto each other is enough to compare.
+    # The first camera is level in every panel, so the panels are aligned by the first poses.
     anchor = np.asarray(panels[-1][1], np.float64)[0]
     for _, poses in panels:
         T = anchor @ np.linalg.inv(np.asarray(poses, np.float64)[0]) @ np.asarray(poses, np.float64)

@@ -1,4 +1,4 @@
-"""Pictures of registrations: reliability of a confidence, pairs under found and true motions, scans placed in a map."""
+"""Pictures of registrations: reliability of a confidence, pairs under estimated and true motions, scans in a map."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def reliability_figure(
     title: str,
     labels: tuple[str, str] = ("confidence", "share of right registrations"),
 ) -> Figure:
-    """Draws how often a probability comes true, in ten bins; calibrated ones lie on the line.
+    """Draws a reliability diagram of probabilities in ten bins; calibrated ones lie on the line.
 
     Args:
         confidence: (n,) in [0, 1].
-        is_right: (n,) which of them are right.
+        is_right: (n,) True for correct registrations.
         title: title of the picture.
         labels: labels of both axes.
 
@@ -125,7 +125,7 @@ def localization_figure(
     points, path = np.asarray(points_map, float).reshape(-1, 3), np.asarray(T_map_keyframe, float)[:, :3, 3]
     T = np.asarray(T_map_scan, float).reshape(-1, 4, 4)
     wrong = np.zeros(len(T), bool) if is_wrong is None else np.asarray(is_wrong, bool)
-    # A few far points must not make the map small.
+    # Few far points must not determine the limits.
     shown = np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]])
     limits = plane_limits(np.percentile(shown, [0.5, 99.5], axis=0), 0.06)
     width_in, height_in = size_in(limits)

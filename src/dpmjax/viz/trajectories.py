@@ -1,4 +1,4 @@
-"""Pictures of several trajectories: of methods beside each other, and of agents in their maps; growth of maps."""
+"""Pictures of several trajectories, by methods or by agents in their maps, and of the growth of maps."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ _COLUMNS = 4
 _CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c")
 _MARGIN = 0.12
 _PANEL_IN, _LEGEND_IN, _ENTRY_IN = 3.1, 0.6, 1.9
-# A lost method must not make the remaining trajectories small.
+# Trajectories are cut at this share of the extent of the reference beyond it, so that a diverged one does not set the
+# limits.
 _SHARE_OUTSIDE = 0.5
 
 
@@ -102,7 +103,7 @@ def _add_legend(figure: Figure, entries: Mapping[str, Artist]) -> None:
 
 
 def _shown(panel: TrackPanel) -> NDArray[np.float64]:
-    """The reference sets the limits; a lost trajectory leaves the panel."""
+    """Returns the positions that set the limits; trajectories are clipped near the reference."""
     everything = np.concatenate([positions[:, :2] for positions in panel.tracks.values()] or [np.zeros((1, 2))])
     if panel.reference is None:
         return np.asarray(everything, np.float64)
@@ -114,7 +115,7 @@ def _shown(panel: TrackPanel) -> NDArray[np.float64]:
 def growth_figure(
     panels: Mapping[str, Mapping[str, tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]]],
 ) -> Figure:
-    """Draws how many bytes the forms of a map take against metres driven, on a logarithmic axis.
+    """Draws the bytes of the forms of a map over the metres driven, on a logarithmic axis.
 
     Args:
         panels: by name of the drive and of the form: metres driven, and bytes.
@@ -143,12 +144,12 @@ def growth_figure(
 
 
 COLORS = ("#1f4e8c", "#d1495b", "#2a9d5c", "#e08a1e", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
-"""Of the agents, in turn."""
+"""Colours of the agents, in turn."""
 
 GAP_IN, TITLE_IN, LEGEND_IN, DOTS_PER_IN = 0.2, 0.6, 0.8, 100
 
 MIN_HEIGHT_M = -1.0
-"""Lower points, below the lidar, are ground, which would hide everything."""
+"""Least height of drawn points relative to the lidar, which excludes the ground."""
 
 
 class AgentTrack(NamedTuple):
@@ -186,7 +187,7 @@ class AgentPanel(NamedTuple):
 
 
 def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
-    """Draws what agents have mapped, from above; agents that never met have panels of their own.
+    """Draws the maps of agents from above; unconnected agents have separate panels.
 
     Args:
         title: title of the picture.
@@ -237,7 +238,7 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
 
 
 def _limits_of(panel: AgentPanel) -> Limits:
-    """Limits of the trajectories and of most points: a few far points must not make the map small."""
+    """Returns the limits of the trajectories and of most points, without few far points."""
     shown = [agent.positions[:, :2] for agent in panel.agents]
     points = np.concatenate([agent.points[:, :2] for agent in panel.agents])
     if len(points):
@@ -246,7 +247,7 @@ def _limits_of(panel: AgentPanel) -> Limits:
 
 
 def _raster(panel: AgentPanel, limits: Limits, columns: int, rows: int) -> UInt8[np.ndarray, "r c 3"]:
-    """The picture: each pixel has the colour of those who have seen something there, stronger for more points."""
+    """Makes the picture: each pixel has the colour of the agents with points there, stronger for more points."""
     from matplotlib.colors import to_rgb
 
     color, total = np.zeros((rows * columns, 3)), np.zeros(rows * columns)

@@ -1,4 +1,4 @@
-"""Buildings as the ray caster sees them: walls with doors, ceilings, furniture, stairs, on a flat floor."""
+"""Buildings for the ray caster: walls with doors, ceilings, furniture and stairs."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class Building:
     Attributes:
         name: name with its seed, for titles.
         plan: rooms and doors.
-        route: (k, 2) points of the walk at steps of a decimetre, m; nothing stands in the way.
-        primitives: what a beam meets, on the device; the floor begins at z = 0.
+        route: (k, 2) points of the walk at steps of a decimetre, m, without obstacles.
+        primitives: bodies and floor for the ray caster, on the device; the floor begins at z = 0.
     """
 
     name: str
@@ -115,7 +115,7 @@ def _place(x: float, y: float, heading: float = 0.0) -> Place:
 
 
 def _walls(into: Collection, rng: np.random.Generator, room: Room, doors: list[Door]) -> None:
-    """Four walls inside of the room's border, each cut at its doors; outer walls may have windows."""
+    """Adds four walls inside of the room's border, with openings for doors; outer walls may have windows."""
     for axis in (0, 1):
         for at, inwards in ((room.low[axis], 1), (room.high[axis], -1)):
             cuts = sorted(
@@ -142,7 +142,7 @@ def _wall(
 
 
 def _ceiling(into: Collection, rng: np.random.Generator, room: Room) -> None:
-    """A ceiling with beams, ducts or lamps."""
+    """Adds a ceiling with beams, ducts or lamps."""
     middle = 0.5 * (np.array(room.low) + room.high)
     put_box(into, _place(*middle), room.size, (room.height, room.height + 0.3))
     deep, step = rng.uniform(0.06, 0.12) * room.height, rng.uniform(2.0, 6.0)
@@ -160,7 +160,7 @@ def _ceiling(into: Collection, rng: np.random.Generator, room: Room) -> None:
 
 
 def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray) -> None:
-    """Pillars or door frames along the walls of a corridor, often at equal steps, and few things between them."""
+    """Adds pillars or door frames along the walls of a corridor, often at equal steps, and few objects between."""
     step, deep, wide = rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.4), rng.uniform(0.15, 1.2)
     high = room.height if rng.random() < 0.5 else 2.2
     jitter = float(rng.choice([0.0, 0.25])) * step
@@ -178,7 +178,7 @@ def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: Flo
 
 
 def _parking(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray) -> None:
-    """Rows of parked cars between columns at equal steps."""
+    """Adds rows of parked cars between columns at equal steps."""
     step, taken, row_m = rng.uniform(4.8, 8.0), rng.uniform(0.2, 0.9), rng.uniform(8.0, 11.0)
     y_rows = np.arange(room.low[1] + 3.0, room.high[1] - 2.5, row_m)
     for y in y_rows:
@@ -192,7 +192,7 @@ def _parking(into: Collection, rng: np.random.Generator, room: Room, route: Floa
 
 
 def _steps(into: Collection, rng: np.random.Generator, room: Room, plan: Plan) -> None:
-    """Steps, a ceiling that rises with them, and pilasters along the walls, often at equal steps."""
+    """Adds steps, a ceiling that rises with them, and pilasters along the walls, often at equal steps."""
     deep, wide = rng.uniform(0.26, 0.34), 0.98 * room.size[1]
     for (start, low), (end, high) in itertools.pairwise(plan.floor):
         steps = np.arange(start, end, deep) if high > low else np.zeros(0)
@@ -211,7 +211,7 @@ def _steps(into: Collection, rng: np.random.Generator, room: Room, plan: Plan) -
 
 
 def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: FloatArray, *, is_hall: bool) -> None:
-    """Furniture along the walls and in the room, off the route."""
+    """Adds furniture along the walls and in the room, off the route."""
     area, inside = room.size[0] * room.size[1], np.minimum(1.0, 0.4 * np.array(room.size))
     beside: list[_Put] = [_put_cabinet, _put_cabinet, _put_desk, _put_plant]
     within: list[_Put] = (
@@ -234,7 +234,7 @@ def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: Fl
 def _put_if_free(
     into: Collection, rng: np.random.Generator, spot: tuple[FloatArray, float], route: FloatArray, puts: Sequence[_Put]
 ) -> None:
-    """Puts one of some things unless it would stand in the way; `spot` is its place and heading."""
+    """Adds one of several objects at `spot` (position and heading), unless it would block the route."""
     part = Collection()
     puts[int(rng.integers(len(puts)))](part, rng, _place(spot[0][0], spot[0][1], spot[1]))
     rows = np.array([*part.boxes, *part.cylinders, *part.spheroids])
@@ -296,7 +296,7 @@ def _put_plant(into: Collection, rng: np.random.Generator, place: Place) -> None
 
 
 def _put_stairs(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A flight of stairs with a rail."""
+    """Adds a flight of stairs with a rail."""
     wide, count = rng.uniform(1.0, 2.0), int(rng.integers(6, 16))
     for step in range(count):
         put_box(into, place.move(0.28 * step, 0.0), (0.28, wide), (0.0, 0.18 * (step + 1)))

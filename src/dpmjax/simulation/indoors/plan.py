@@ -40,8 +40,8 @@ class Door:
 
     Attributes:
         rooms: numbers of the rooms.
-        place: x and y of its middle, m.
-        axis: 0 where one walks through along x, 1 along y.
+        place: x and y of the middle of the opening, m.
+        axis: direction of passage, 0 along x, 1 along y.
         width: m.
         height: m.
     """
@@ -170,7 +170,7 @@ def _door(
 
 
 def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArray:
-    """Walks from room to room at random, round in each room; rooms are seen again in both directions.
+    """Draws a route from room to room at random, round in each room, with revisits in both directions.
 
     Args:
         rng: source of all choices.
@@ -200,7 +200,7 @@ def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArra
 
 
 def _round(rng: np.random.Generator, room: Room) -> list[FloatArray]:
-    """Some places of a room."""
+    """Draws positions in a room."""
     count = int(np.clip(round(min(room.size) / 4), 1, 4))
     margin = 0.3 * np.minimum(room.size, 4.0)
     return [rng.uniform(room.low + margin, room.high - margin) for _ in range(count)]

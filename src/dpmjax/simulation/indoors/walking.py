@@ -16,10 +16,10 @@ from dpmjax.simulation.town.streets import arc_lengths, at_way, smooth, tangents
 _WALK_STREAM = 8161
 _LOOK_AHEAD_M = 0.8
 _STEPS_PER_S = 1.8
-_SINK = 2.5  # Slow changes of the height, over those of a step.
+_SINK = 2.5  # Ratio of slow changes of the height to those of a step.
 _SPEED_M_S = 1.0
-# Of a person and of a robot: standard deviation of the angle between the sensor's x and the way, degrees, and rise and
-# fall of a step, m.
+# For a person and for a robot: standard deviation of the angle between the sensor's x and the direction of motion,
+# degrees, and vertical amplitude of a step, m.
 _PERSON, _ROBOT = (25.0, 0.03), (3.0, 0.0)
 
 
@@ -47,11 +47,11 @@ class WalkConfig:
 
 
 def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0) -> TimedPoses:
-    """Walks along the building's route.
+    """Simulates a walk along the building's route.
 
     Args:
         building: the building.
-        config: how.
+        config: settings of the motion.
         seed: seed of the sway.
 
     Returns:
@@ -75,6 +75,6 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
 
 
 def _slow(rng: np.random.Generator, times: FloatArray) -> FloatArray:
-    """Unit noise that changes over seconds."""
+    """Draws noise of unit variance that changes over seconds."""
     phases, periods = rng.uniform(0, 2 * np.pi, 4), rng.uniform(2.0, 11.0, 4)
     return np.sqrt(0.5) * np.sin(2 * np.pi * times[:, None] / periods + phases).sum(1)

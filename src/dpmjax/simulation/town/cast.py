@@ -1,8 +1,8 @@
-"""The ray caster: finds what each ray of a turn meets first, among the bodies of its sector and the ground.
+"""The ray caster: first hits of the rays of a turn among the bodies of each sector and the ground.
 
-A scan of 100,000 rays against 30,000 boxes would need 3e9 tests. The nearest bodies are picked once a scan, and each
-sector of some degrees has a list of them, nearest first. A band of rays goes through its list until all its rays have
-met something nearer than the remaining bodies.
+A scan of 100,000 rays against 30,000 boxes would need 3e9 tests. The nearest bodies are selected once for each scan,
+and each sector of some degrees has a list of them, nearest first. A band of rays is tested against its list until all
+its hits are nearer than the remaining bodies.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Rays(NamedTuple):
 
 
 class _Band(NamedTuple):
-    """Some rays with a common start, in axes of the world, and the bodies of their sector."""
+    """Rays with a common origin, in axes of the world, and the bodies of their sector."""
 
     directions: Float[Array, "n c b 3"]
     depths: Float[Array, "n c b"]
@@ -66,7 +66,7 @@ class _Band(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """First hits so far: the range, the body's row (of all kinds together) and the optical depth left."""
+    """First hits so far: range, row of the body (of all kinds together) and remaining optical depth."""
 
     ranges: Float[Array, "c b"]
     rows: Int[Array, "c b"]
@@ -74,7 +74,7 @@ class _Found(NamedTuple):
 
 
 def cast_turn(near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *, max_range: float) -> Hits:
-    """Follows all rays of a turn to their first hits, without noise and loss.
+    """Casts all rays of a turn to their first hits, without noise and loss.
 
     Args:
         near: bodies and ground near the sensor.
@@ -103,7 +103,7 @@ def cast_turn(near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *
     def cast_band(band: _Band) -> Hits:
         return _cast_band(near, bodies, T_world_lidar[2, 3], band, max_range)
 
-    # On a CPU, a band that is alone ends early and stays in the cache; a GPU takes all at once.
+    # On a CPU, a single band ends early and stays in the cache; a GPU takes all bands at once.
     hits = jax.lax.platform_dependent(bands, cpu=partial(jax.lax.map, cast_band), default=jax.vmap(cast_band))
     return jax.tree.map(lambda x: x.reshape(rays.depths.shape), hits)
 
@@ -153,7 +153,7 @@ def _meet_bodies(
 
 
 def _describe(found: _Found, bodies: Bodies, band: _Band, num_boxes: int) -> Hits:
-    """Ranges, angles and surfaces of the hits; boxes have windows, and the angle of a face counts unless it is soft."""
+    """Computes ranges, incidence cosines and surfaces of the hits, with windows of boxes."""
     is_body = found.rows >= 0
     body = jax.tree.map(lambda x: x[jnp.maximum(found.rows, 0)], bodies)
     body = body._replace(centres=body.centres - band.offset)

@@ -1,4 +1,4 @@
-"""Picks the bodies that a scan can meet: the nearest of each kind, the ground around, a list of bodies for each sector.
+"""Selection of the bodies for a scan: the nearest of each kind, the ground around, and a list for each sector.
 
 The selection has the same shapes in every world, so that the ray caster compiles once for each sensor.
 """
@@ -16,10 +16,10 @@ from jaxtyping import Array, Float, Int
 from dpmjax.geometry import rigid, se2
 from dpmjax.simulation.town.primitives import CELL_M, Bodies, Ground, TownPrimitives, traffic_boxes, turn_back
 
-# Nearest boxes, cylinders and spheroids that take part in a scan, and those of each that one sector of the turn holds.
+# Number of nearest boxes, cylinders and spheroids of a scan, and of those of one sector of the turn.
 _NUM_NEAR = (1024, 512, 2048)
 NUM_IN_SECTOR = (96, 48, 160)
-# Side of the square of ground around the sensor; its border goes on outside.
+# Side of the square of ground around the sensor; the heights of its border hold outside.
 _GROUND_M = 168
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 
@@ -29,7 +29,7 @@ class NearBodies(NamedTuple):
 
     Attributes:
         bodies: relative to the sensor.
-        distances: from the sensor to each body's surface at least, m; ascending, infinite for what does not exist.
+        distances: lower bounds of the distances from the sensor to the surfaces, m; ascending, infinite for padding.
     """
 
     bodies: Bodies
@@ -68,7 +68,7 @@ class SectorLists(NamedTuple):
 def near_world(
     town: TownPrimitives, start: Float[Array, " 3"], time: Float[Array, ""], *, max_range: float
 ) -> NearWorld:
-    """Picks what a scan can meet.
+    """Selects the bodies and the ground near the sensor.
 
     Args:
         town: the world.
@@ -97,11 +97,11 @@ def _near_ground(ground: Ground, start: Float[Array, " 3"]) -> Ground:
 
 
 def nearest_bodies(bodies: Bodies, capacity: int, max_range: float) -> NearBodies:
-    """The bodies with the nearest surfaces.
+    """Selects the bodies with the nearest surfaces.
 
     Args:
         bodies: all of the town, relative to the sensor.
-        capacity: how many to keep.
+        capacity: number of kept bodies.
         max_range: bodies beyond this are left out, m.
 
     Returns:
@@ -122,14 +122,14 @@ def sector_lists(
     capacity: int,
     way: Float[Array, ""],
 ) -> SectorLists:
-    """Gives each sector of a turn the list of the bodies that it sees.
+    """Lists the bodies of each sector of a turn.
 
     Args:
         near: the bodies.
         T_world_lidar: pose of the sensor; only its rotation counts.
         sector_azimuths: middles of equal sectors of the turn in the sensor frame, radians.
-        capacity: how many bodies a sector holds.
-        way: how far the sensor moves during the turn at most, m, turning by less than half a sector.
+        capacity: largest number of bodies of a sector.
+        way: largest translation of the sensor during the turn, m; it turns by less than half a sector.
 
     Returns:
         The lists.
@@ -149,8 +149,8 @@ def sector_lists(
 def _azimuth_intervals(
     bodies: Bodies, T_world_lidar: Float[Array, "4 4"]
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Middle and half-width of the azimuths of boxes in the sensor frame; pi for a box over or under the sensor."""
-    # A box is the hull of its corners, and so is its shadow on the sensor's x-y plane.
+    """Computes middle and half-width of the azimuths of boxes in the sensor frame; pi above or below the sensor."""
+    # A box is the convex hull of its corners, and so is its projection to the sensor's x-y plane.
     turn = jnp.zeros((4, 4), T_world_lidar.dtype).at[:3, :3].set(T_world_lidar[:3, :3].T).at[3, 3].set(1.0)
     local = jnp.asarray(_CORNERS)[None] * bodies.half_sizes[:, None]
     turned = turn_back(local, bodies.headings[:, None] * jnp.array([1.0, -1.0]))

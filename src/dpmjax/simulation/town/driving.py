@@ -30,10 +30,10 @@ class DriveConfig:
     """Settings of the drive.
 
     Attributes:
-        speed_m_s: on straight streets; in corners it is a third of that at least.
+        speed_m_s: speed on straight streets; in corners it is at least a third of that.
         rate_hz: scans per second.
-        length_m: way that is driven; None for once round (a closed route) or to the end.
-        is_reversed: drives the route from its end to its start, in the opposite lane.
+        length_m: length of the drive; None for once round (a closed route) or to the end.
+        is_reversed: True to drive the route from its end to its start, in the opposite lane.
         sensor_height_m: above the ground.
         max_turn_deg_s: the car slows down in corners until it turns no faster; cars turn at 20 to 40 degrees a second.
 
@@ -73,10 +73,10 @@ def simulate_lidar_sequence(
     sensor: LidarSensor = HDL64E,
     trajectory: ArrayLike | None = None,
 ) -> LidarSequence:
-    """A drive through a town of its own; a scan is simulated when it is read.
+    """Simulates a drive through a new town; a scan is simulated when it is read.
 
     Args:
-        seed: of the town, the drive and the noise: the same sequence every time.
+        seed: seed of the town, the drive and the noise.
         config: settings of the town.
         driving: settings of the drive; None takes the default with the sensor's own height.
         sensor: the lidar.
@@ -97,14 +97,14 @@ def simulate_lidar_sequence(
 def route_poses(
     rng: np.random.Generator, kind: str, length_m: float, *, block_m: float = 100.0, step_m: float = 1.0
 ) -> FloatArray:
-    """Draws a route through streets and puts a pose on its lane at every step; nothing is scanned.
+    """Draws a route through streets, and returns poses on its lane at equal steps.
 
     Args:
         rng: source of all choices.
         kind: of the route, see `make_streets`.
         length_m: wanted length of the route; met within a block or two.
         block_m: side of a block.
-        step_m: way between two poses.
+        step_m: distance between two poses.
 
     Returns:
         (n, 4, 4) poses on the ground, x forward, y left, z up.
@@ -128,7 +128,7 @@ def scan_along(
     sensor: LidarSensor,
     is_moving: bool = False,
 ) -> LidarSequence:
-    """Scans taken on the way through a world; each is simulated when it is read.
+    """Returns the scans at given poses in a world; each is simulated when it is read.
 
     Args:
         name: of the sequence.
@@ -136,7 +136,7 @@ def scan_along(
         way: poses and times.
         seed: of the noise.
         sensor: the lidar.
-        is_moving: the lidar moves during its turn, as fast as it goes to the next pose.
+        is_moving: True where the lidar moves during its turn, at the velocity to the next pose.
 
     Returns:
         The sequence.
@@ -154,7 +154,7 @@ def scan_along(
 
 
 def _motions(way: TimedPoses) -> FloatArray:
-    """(n, 6) twists of the sensor during a turn, on its way to the next pose; the last is that before."""
+    """Computes twists (n, 6) of the sensor during a turn towards the next pose; the last one is repeated."""
     poses = way.T_world_lidar
     if len(poses) < 2:
         return np.zeros((len(poses), 6))
@@ -167,11 +167,11 @@ def _motions(way: TimedPoses) -> FloatArray:
 
 
 def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> TimedPoses:
-    """Drives along the town's route.
+    """Simulates a drive along the town's route.
 
     Args:
         town: the town.
-        config: how.
+        config: settings of the drive.
         seed: of sway and shake.
 
     Returns:
@@ -191,7 +191,7 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
 
 
 def _timetable(lane: FloatArray, length: float, config: DriveConfig, is_closed: bool) -> tuple[FloatArray, FloatArray]:
-    """Ways along the lane and times of the scans."""
+    """Computes the path lengths along the lane and the times of the scans."""
     way = np.arange(0.0, length, 0.5)
     whole = arc_lengths(lane)[-1]
     at = way % whole if is_closed else way
@@ -214,7 +214,7 @@ def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
 
 
 def _slow_noise(rng: np.random.Generator, way: FloatArray) -> FloatArray:
-    """Unit noise that changes over tens of metres."""
+    """Draws noise of unit variance that changes over tens of metres."""
     phases = rng.uniform(0, 2 * np.pi, 3)
     waves = 2 * np.pi / np.array([31.0, 53.0, 97.0])
     return np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
@@ -223,7 +223,7 @@ def _slow_noise(rng: np.random.Generator, way: FloatArray) -> FloatArray:
 def _poses(
     town: Town, places: FloatArray, along: FloatArray, left: FloatArray, config: DriveConfig, rng: np.random.Generator
 ) -> FloatArray:
-    """Stands the car on its wheels: pitch and roll from the ground under the axles, and a little shaking."""
+    """Computes sensor poses with pitch and roll from the ground under the axles, and small vibrations."""
     height = town.terrain.height_at
     shake = np.radians(_SHAKE_DEG) * rng.normal(size=(2, len(places)))
     half = 0.5 * _WHEELBASE_M

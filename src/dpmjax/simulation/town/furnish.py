@@ -1,4 +1,4 @@
-"""Furnishes streets: both sides of each, plot by plot, in the manner of its quarter, and the land behind."""
+"""Objects along streets: both sides of each street, plot by plot, by the style of its quarter, and the land behind."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Side:
     plots: Plots
 
     def place(self, way: float, from_kerb: float) -> Place:
-        """The place beside the street; the street lies to the right of its heading."""
+        """Returns a place beside the street, with the street to the right of its heading."""
         spot = at_way(np.column_stack([self.path, self.along]), np.array([way]))[0]
         heading = float(np.arctan2(spot[3], spot[2]))
         left = from_kerb + self.half_width
@@ -40,12 +40,12 @@ class _Side:
 
 
 def furnish(rng: np.random.Generator, streets: Streets, plots: Plots, kind: Kind) -> Collection:
-    """Builds everything that stands in the town.
+    """Builds all objects of the town.
 
     Args:
         rng: source of all choices.
         streets: lines and widths of the streets.
-        plots: free ground; each new object takes its part of it.
+        plots: free ground; each new object occupies its part of it.
         kind: densities and sizes of the kind of place.
 
     Returns:
@@ -88,7 +88,7 @@ def _bridges(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 
 def _verge(into: Collection, rng: np.random.Generator, side: _Side) -> None:
-    """Bushes and tall grass along the kerb, and posts of a rail."""
+    """Adds bushes and tall grass along the kerb, and posts of a rail."""
     step = side.kind.verge_step
     for _ in range(rng.poisson(side.length / step) if step else 0):
         place = side.place(rng.uniform(0, side.length), rng.uniform(1.3, 5.0))
@@ -145,7 +145,7 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 
 def _garden(into: Collection, rng: np.random.Generator, side: _Side, plot: Size, front: float) -> None:
-    """Trees and bushes between the pavement and the house."""
+    """Adds trees and bushes between the pavement and the house."""
     (way, width), quarter = plot, side.quarter
     if front < PAVEMENT_M + 2.0:
         return
@@ -172,7 +172,7 @@ def _car_park(into: Collection, rng: np.random.Generator, side: _Side, plot: Siz
 
 
 def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
-    """Parked cars, half on the kerb, heading as the traffic on that side does, with gaps and drives left free."""
+    """Adds parked cars, half on the kerb, in the direction of the traffic of that side, with gaps."""
     way, rate = float(rng.uniform(3, 9)), side.quarter.parked_rate * rng.uniform(0.4, 1.3)
     while way < side.length - 3:
         if rng.random() < rate:
@@ -185,7 +185,7 @@ def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 
 def _pavement(into: Collection, rng: np.random.Generator, side: _Side) -> None:
-    """Lamps, signs, boxes, trees and people on the pavement."""
+    """Adds lamps, signs, boxes, trees and people on the pavement."""
     step = side.quarter.street_tree_step
     trees = np.arange(rng.uniform(2, 10), side.length, step) if step else np.zeros(0)
     lamps = np.arange(rng.uniform(4, 24), side.length, rng.uniform(22, 36))
@@ -205,7 +205,7 @@ def _pavement(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 
 def _put_cabinet(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A switch cabinet, a bin or a bench."""
+    """Adds a switch cabinet, a bin or a bench."""
     size = (float(rng.uniform(0.5, 1.5)), float(rng.uniform(0.35, 0.7)))
     objects.put_box(into, place, size, (-0.1, float(rng.uniform(0.7, 1.3))))
 

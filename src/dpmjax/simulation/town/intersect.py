@@ -1,8 +1,8 @@
 """Intersections of rays with boxes, their windows, cylinders, spheroids and the ground.
 
-Bodies are relative to the rays' common start. Solid and soft bodies share one rule: the way that is gone inside. A ray
-that starts inside a body enters it at a negative distance, which the caller treats as a miss: the sensor's own car is
-not seen.
+Bodies are relative to the common origin of the rays. Solid and soft bodies share one rule: the distance travelled
+inside. A ray that starts inside a body enters it at a negative distance, which the caller treats as a miss, so the
+sensor's own car is invisible.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from jaxtyping import Array, Float
 
 from dpmjax.simulation.town.primitives import Bodies, Ground, turn_back
 
-# Directions along an axis are nudged off zero by this: a thousandth of a millimetre at 100 m.
+# Replacement of zero components of directions: a thousandth of a millimetre at 100 m.
 _TINY = 1e-8
-# Ground: geometric steps of the search, then refinements of the interval found: millimetres at 20 m, less nearer.
+# Ground: number of geometric steps of the search, and of refinements of the interval: millimetres at 20 m, less nearer.
 _NUM_STEPS = 28
 _NUM_REFINEMENTS = 3
 _NEAREST_M = 1.0
-# Facades: windows and doors lie behind the wall, so that scans fix the position along a front.
+# Facades: windows and doors lie behind the wall, so that scans constrain the position along a front.
 _STOREY_M, _SILL_M, _LINTEL_M = 2.9, 0.9, 2.2
 _THIN_M = 1e-6
 
 
 class Crossing(NamedTuple):
-    """Distances along a ray of unit length: in and out of a convex body; entry > exit where it is missed.
+    """Distances along a ray of unit direction into and out of a convex body; entry > exit without a hit.
 
     Attributes:
-        entry: distance at which the ray goes in, m.
-        exit: distance at which it comes out, m.
+        entry: distance at which the ray enters, m.
+        exit: distance at which the ray leaves, m.
     """
 
     entry: Float[Array, "..."]
@@ -45,7 +45,7 @@ Cross = Callable[[Float[Array, "... 3"], Bodies], Crossing]
 
 
 def cross_box(direction: Float[Array, "... 3"], box: Bodies) -> Crossing:
-    """A ray from the origin through an upright box (the slab method, Kay and Kajiya 1986).
+    """Intersects a ray from the origin with an upright box (the slab method, Kay and Kajiya 1986).
 
     Args:
         direction: of the ray, unit length.
@@ -62,7 +62,7 @@ def cross_box(direction: Float[Array, "... 3"], box: Bodies) -> Crossing:
 
 
 def cross_cylinder(direction: Float[Array, "... 3"], cylinder: Bodies) -> Crossing:
-    """A ray from the origin through an upright cylinder with lids; see `cross_box`.
+    """Intersects a ray from the origin with an upright cylinder with lids; see `cross_box`.
 
     Args:
         direction: of the ray, unit length.
@@ -84,7 +84,7 @@ def cross_cylinder(direction: Float[Array, "... 3"], cylinder: Bodies) -> Crossi
 
 
 def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Bodies) -> Crossing:
-    """A ray from the origin through an ellipsoid of revolution about z; see `cross_box`.
+    """Intersects a ray from the origin with an ellipsoid of revolution about z; see `cross_box`.
 
     Args:
         direction: of the ray, unit length.
@@ -104,7 +104,7 @@ def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Bodies) -> Crossi
 
 
 def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body: Bodies) -> tuple[Array, Array, Array]:
-    """Takes rays that have reached a face on to the window pane behind it, or to the side of the opening.
+    """Extends rays that have hit a face to the window pane behind it, or to the side of the opening.
 
     Each side face of a box with windows is divided into bays of 2 to 4 m (a width of its own) and storeys of 2.9 m. The
     middle of a bay is open; on the ground floor every third opening is a door.
@@ -116,7 +116,7 @@ def recess(ranges: Float[Array, "..."], directions: Float[Array, "... 3"], body:
 
     Returns:
         Distances, m, behind the face where a ray goes into a window; cosines of the angle between ray and normal;
-        whether the ray ends at a window or door.
+        True where the ray ends at a window or door.
     """
     offset = turn_back(ranges[..., None] * directions - body.centres, body.headings)
     along = turn_back(directions, body.headings)
@@ -151,14 +151,14 @@ def _split(vectors: Float[Array, "... 3"]) -> tuple[Array, Array, Array]:
 
 
 def _slab(centre: Array, half_size: Array, direction: Array) -> tuple[Array, Array]:
-    """Distances between which a ray is between two parallel planes: |t * direction - centre| <= half_size."""
+    """Computes the interval of a ray between two parallel planes: |t * direction - centre| <= half_size."""
     inverse = 1.0 / jnp.where(jnp.abs(direction) < _TINY, _TINY, direction)
     middle, reach = centre * inverse, half_size * jnp.abs(inverse)
     return middle - reach, middle + reach
 
 
 def ground_height(ground: Ground, positions: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    """Height of the ground at places in the world.
+    """Interpolates the height of the ground at positions in the world.
 
     Args:
         ground: the height field.
@@ -181,7 +181,7 @@ def ground_height(ground: Ground, positions: Float[Array, "... 2"]) -> Float[Arr
 def cross_ground(
     ground: Ground, start: Float[Array, " 3"], direction: Float[Array, "*c b 3"], max_range: float
 ) -> Float[Array, "*c b"]:
-    """Distance at which rays first go below the ground.
+    """Computes the distance at which rays first go below the ground.
 
     The ground under each column of rays is sampled once, at distances that grow. The first interval at whose end a ray
     lies below is refined along the ray itself by the false position method (Illinois).
@@ -190,7 +190,7 @@ def cross_ground(
         ground: the height field.
         start: common start of the rays, in the world, m.
         direction: of the rays, unit length, in the world; the b rays of a column have nearly the same azimuth.
-        max_range: rays are followed so far, m.
+        max_range: largest distance, m.
 
     Returns:
         Distance, m; infinite where a ray stays above the ground.
@@ -227,8 +227,8 @@ def _false_position(bracket: tuple[Array, Array, Array, Array], margin: float) -
 def _narrow(
     bracket: tuple[Array, Array, Array, Array], middle: Float[Array, "..."], here: Float[Array, "..."]
 ) -> tuple[Array, Array, Array, Array]:
-    """The part of the bracket that holds the crossing: (near, far, height at near, height at far)."""
-    # Illinois: the end that stays counts half the next time, or it would stay for ever.
+    """Returns the part of the bracket with the crossing: (near, far, height at near, height at far)."""
+    # Illinois: the height of the retained end is halved, so that this end cannot be retained for ever.
     near, far, above, below = bracket
     is_above = here > 0
     return (

@@ -1,4 +1,4 @@
-"""Kinds of place: what streets look like, how the land lies, and what grows and drives there."""
+"""Kinds of place: settings of streets, land, vegetation and traffic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes towns by seed: the ground with its slopes, kerbs and meadows, what stands on it, and the traffic."""
+"""Towns by seed: the ground with slopes, kerbs and meadows, the objects on it, and the traffic."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Town:
         name: with its seed, for titles.
         streets: the streets and the route, on the host.
         terrain: the ground, on the host.
-        primitives: bodies and ground that a beam meets, on the device.
+        primitives: bodies and ground for the ray caster, on the device.
     """
 
     name: str
@@ -126,7 +126,7 @@ def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, 
 def _users(
     rng: np.random.Generator, lane: int, length: float, half_width: float, kind: Kind
 ) -> list[tuple[float, ...]]:
-    """Rows of the road users of a lane: lane, way, speed, distance to the left, half sizes."""
+    """Draws rows of the road users of a lane: lane, path length, speed, distance to the left, half sizes."""
 
     def vehicle() -> tuple[float, float, float]:
         if rng.random() < kind.trucks:

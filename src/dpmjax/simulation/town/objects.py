@@ -1,6 +1,6 @@
 """Objects of a town as rows of primitives: houses, cars, hedges, poles, people, car parks, bridges.
 
-Every builder gets a place on the ground and a heading (the street's direction; the street lies to the object's right)
+Each builder takes a place on the ground with a heading (the street's direction; the street lies to the object's right)
 and appends rows to a `Collection`.
 """
 
@@ -80,7 +80,7 @@ def put_box(
 def put_house(
     into: Collection, rng: np.random.Generator, place: Place, size: Size, height: float, *, is_plain: bool
 ) -> None:
-    """A house: body with windows, stepped roof, and bays, steps and balconies towards the street.
+    """Adds a house to the objects: body with windows, stepped roof, and bays, steps and balconies towards the street.
 
     Args:
         into: where to.
@@ -115,7 +115,7 @@ def put_house(
 
 
 def put_car(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A parked car, van or lorry: body, cabin, a gap below.
+    """Adds a parked car, van or lorry to the objects: body, cabin, a gap below.
 
     Args:
         into: where to.
@@ -142,7 +142,7 @@ def put_car(into: Collection, rng: np.random.Generator, place: Place) -> None:
 
 
 def put_pole(into: Collection, place: Place, radius: float, height: float) -> None:
-    """An upright cylinder that stands on the ground.
+    """Adds a pole to the objects: an upright cylinder on the ground.
 
     Args:
         into: where to.
@@ -157,13 +157,13 @@ def put_pole(into: Collection, place: Place, radius: float, height: float) -> No
 def _put_tuft(
     into: Collection, place: Place, level: float, radius: float, half_height: float, softness: float = 0.0
 ) -> None:
-    """A spheroid with its centre `level` above the ground, m."""
+    """Adds a spheroid to the objects, with its centre `level` above the ground, m."""
     size = (radius, radius, half_height)
     into.spheroids.append((place.x, place.y, place.ground + level, *size, 0.0, softness, 0.0))
 
 
 def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A post with a plate across the street's direction.
+    """Adds a sign to the objects: a post with a plate across the street's direction.
 
     Args:
         into: where to.
@@ -176,7 +176,7 @@ def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
 
 
 def put_border(into: Collection, rng: np.random.Generator, place: Place, length: float, kind: str) -> None:
-    """A hedge, wall or fence along the street, in pieces, with an open gate.
+    """Adds a hedge, wall or fence along the street to the objects, in pieces, with an open gate.
 
     Args:
         into: where to.
@@ -204,7 +204,7 @@ def put_border(into: Collection, rng: np.random.Generator, place: Place, length:
 
 
 def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None:
-    """A standing person: a body and a head.
+    """Adds a standing person to the objects: a body and a head.
 
     Args:
         into: where to.
@@ -217,7 +217,7 @@ def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None
 
 
 def put_car_park(into: Collection, rng: np.random.Generator, place: Place, size: Size) -> None:
-    """Rows of parked cars, lamps and a few trolleys or bollards between them.
+    """Adds a car park to the objects: rows of parked cars, lamps and a few trolleys or bollards between them.
 
     Args:
         into: where to.
@@ -239,7 +239,7 @@ def put_car_park(into: Collection, rng: np.random.Generator, place: Place, size:
 
 
 def put_bridge(into: Collection, rng: np.random.Generator, place: Place, half_width: float) -> None:
-    """A bridge over the street: a deck with parapets on piers, high enough for the traffic.
+    """Adds a bridge over the street to the objects: a deck with parapets on piers, above the traffic.
 
     Args:
         into: where to.

@@ -18,7 +18,7 @@ from dpmjax.sequences import FloatArray
 LANE_STEP_M = 2.0
 CELL_M = 0.5
 """Distance of the nodes of the ground."""
-# Road users nearer to the sensor than this are left out: the sensor's own car is there.
+# Road users nearer to the sensor than this are left out, because the sensor's own car is there.
 _CLEARANCE_M = 4.0
 # Least and largest half length of cars. Shorter road users are people, longer ones are lorries: one box above the
 # street.
@@ -26,7 +26,7 @@ _CAR_LENGTH_M = (0.5, 2.9)
 
 
 NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
-"""What a ray can meet."""
+"""Kinds of surfaces."""
 
 
 class Bodies(NamedTuple):
@@ -36,10 +36,10 @@ class Bodies(NamedTuple):
         centres: in the world, m.
         half_sizes: along the box's own x, y, z, m; of a round body: radius, radius, half height.
         headings: cosine and sine of the angle from the world's x to the box's x.
-        softness: mean way, m, that a beam goes into hedges, fences and foliage before it is reflected; 0 if solid.
-        window_depth: how far windows and doors lie behind the faces of a box, m; 0 for faces without any.
+        softness: mean depth, m, of a beam in hedges, fences and foliage before it is reflected; 0 if solid.
+        window_depth: distance of windows and doors behind the faces of a box, m; 0 for faces without any.
         surface: SOLID, SOFT, POLE or MOVING.
-        mask: which bodies exist.
+        mask: True for bodies, False for padding.
     """
 
     centres: Float[Array, "n 3"]
@@ -52,7 +52,7 @@ class Bodies(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """Heights on a square grid, bilinear between the nodes; outside, the border goes on.
+    """Heights on a square grid, bilinear between the nodes; outside, those of the nearest border.
 
     Attributes:
         heights: heights[i, j] is z at origin + cell * (j, i), m.
@@ -72,11 +72,11 @@ class RoadUsers(NamedTuple):
         lane_points: x, y, z of each lane at equal steps; lanes are padded to one length by repeating their end.
         lane_lengths: length of each lane, m.
         lanes: lane of each road user.
-        starts: way along the lane at time 0, m.
+        starts: path length along the lane at time 0, m.
         speeds: m/s, positive; at the end of the lane a road user starts again.
         sides: distance to the left of the lane, m.
         half_sizes: of the box around the road user, m; cars (longer than 1 m) get a cabin on top.
-        mask: which road users exist.
+        mask: True for road users, False for padding.
     """
 
     lane_points: Float[Array, "k s 3"]
@@ -90,14 +90,14 @@ class RoadUsers(NamedTuple):
 
 
 class TownPrimitives(NamedTuple):
-    """Everything that a beam can meet.
+    """All surfaces of a town for the ray caster.
 
     Attributes:
-        boxes: what stands still and is angular.
+        boxes: boxes of static objects.
         cylinders: poles and trunks.
         spheroids: foliage.
         ground: streets, pavements and meadows.
-        traffic: what moves.
+        traffic: moving objects.
     """
 
     boxes: Bodies
@@ -121,7 +121,7 @@ def capacity_for(count: int, *, least: int = 64) -> int:
 
 
 def padded(rows: FloatArray, capacity: int) -> jax.Array:
-    """The rows as float32, followed by zeros up to the capacity.
+    """Pads the rows with zeros up to the capacity, as float32.
 
     Args:
         rows: (n, ...) values.
@@ -136,12 +136,12 @@ def padded(rows: FloatArray, capacity: int) -> jax.Array:
 
 
 def mask_of(count: int, capacity: int) -> jax.Array:
-    """True for the first `count` of `capacity` entries."""
+    """Returns True for the first `count` of `capacity` entries."""
     return jnp.asarray(np.arange(capacity) < count)
 
 
 def pack_bodies(table: FloatArray, surface: int) -> Bodies:
-    """Bodies of one kind out of rows.
+    """Makes bodies of one kind from rows.
 
     Args:
         table: (n, 9) x y z, half sizes, heading in radians, softness, window depth.
@@ -159,7 +159,7 @@ def pack_bodies(table: FloatArray, surface: int) -> Bodies:
 
 
 def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
-    """Vectors in the axes of a box that is turned about z.
+    """Rotates vectors into the axes of a box that is turned about z.
 
     Args:
         vectors: in axes of the world.
@@ -175,7 +175,7 @@ def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) ->
 
 
 def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Array, ""]) -> Bodies:
-    """The road users at a time.
+    """Computes the boxes of the road users at a time.
 
     Args:
         traffic: lanes and users.
@@ -211,13 +211,13 @@ def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Ar
 
 
 def _car_levels(half_height: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Half heights of body and cabin of a car, m: they share its height above 0.25 m as 3 : 2."""
+    """Returns the half heights of body and cabin of a car, m, which divide the height above 0.25 m as 3 : 2."""
     room = half_height - 0.125
     return 0.6 * room, 0.4 * room
 
 
 def _on_lane(traffic: RoadUsers, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
-    """Points of the lanes, linear between their samples."""
+    """Interpolates points of the lanes linearly."""
     at = jnp.clip(way / LANE_STEP_M, 0.0, traffic.lane_points.shape[1] - 1.001)
     low = jnp.floor(at).astype(jnp.int32)
     part = (at - low)[:, None]

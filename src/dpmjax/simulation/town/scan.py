@@ -24,15 +24,15 @@ from dpmjax.types import AnyArray, PointCloud
 
 # Reflectivity of each surface (nothing, ground, solid, soft, pole, moving): asphalt is dark, leaves and paint are not.
 _REFLECTIVITY = np.array([0.0, 0.17, 0.35, 0.4, 0.35, 0.3], np.float32)
-# Unevenness of each of them: shutters, plaster and paintwork are no planes.
+# Roughness of each surface, for shutters, plaster and paintwork.
 _ROUGHNESS_M = np.array([0.0, 0.0, 0.025, 0.0, 0.01, 0.02], np.float32)
 _BIAS_STREAM = 8152
 _GLASS_RETURNS = 0.35
 # Largest number of sectors of a turn, and of bands of elevation of a sector.
 _MAX_SECTORS, _MAX_BANDS = 72, 2
-# How sharply returns end at that range, in natural logarithms of range.
+# Width of the transition at the range of half loss, in natural logarithms of range.
 _FADE = 0.18
-# Steps in range that the length of a pulse can mix, m.
+# Least and largest step in range that the length of a pulse can mix, m.
 _EDGE_M = (0.2, 2.5)
 
 
@@ -45,14 +45,14 @@ class LidarSensor:
     Attributes:
         name: for titles and files.
         elevations_deg: angle of each beam above the horizontal, highest first.
-        num_azimuths: columns in a turn; they go clockwise from straight behind, as a range image is looked at.
+        num_azimuths: number of columns of a turn, clockwise from straight behind, as in a range image.
         min_range_m: nearer surfaces return nothing.
         max_range_m: farther surfaces return nothing.
         range_noise_m: standard deviation of a range.
-        drop_rate: share of the returns that is lost at any range.
+        drop_rate: share of lost returns at any range.
         half_loss_m: range at which half of the returns of a surface of 20 % reflectivity, met head-on, are lost.
         height_m: mounting height above the ground, for drives.
-        beam_bias_m: standard deviation of the constant range errors of the beams, which calibration leaves.
+        beam_bias_m: standard deviation of the constant range errors of the beams after calibration.
         mixed_rate: share of the beams on an edge that return a range between foreground and background.
         view_deg: width of the view around straight ahead; less than 360 for a lidar that does not spin.
 
@@ -84,11 +84,11 @@ class LidarSensor:
 
     @property
     def num_rays(self) -> int:
-        """Rays in a turn."""
+        """Number of rays of a turn."""
         return len(self.elevations_deg) * self.num_azimuths
 
     def with_azimuths(self, num_azimuths: int) -> LidarSensor:
-        """The same sensor with fewer or more columns: cheaper scans for training."""
+        """Returns the same sensor with another number of columns."""
         return replace(self, num_azimuths=num_azimuths)
 
 
@@ -122,10 +122,10 @@ def scan_town(
     sensor: LidarSensor,
     motion: AnyArray | None = None,
 ) -> PointCloud:
-    """Takes one scan.
+    """Simulates one scan.
 
-    Ranges carry Gaussian noise; beams on an edge may mix both ranges; returns are lost with distance, dark surface and
-    grazing angle, behind glass, and at random. The kernel of the rays compiles once for each sensor, whatever the town.
+    Ranges have Gaussian noise; beams on an edge may mix both ranges; returns are lost with distance, dark surface and
+    grazing angle, behind glass, and at random. The kernel of the rays compiles once for each sensor.
 
     Args:
         town: the world, from `make_town` or `make_interior`.
@@ -155,7 +155,7 @@ def scan_town(
 def _scan_near(near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray, sensor: LidarSensor) -> PointCloud:
     key_phase, key_rays = jax.random.split(key)
     phase = jax.random.uniform(key_phase, (), minval=0.0, maxval=2 * np.pi / sensor.num_azimuths)
-    # One draw for all: each draw of its own would take a second to compile.
+    # One draw for all, because each separate draw would take a second to compile.
     depth, noise, loss, mix, part = jax.random.uniform(key_rays, (5, sensor.num_rays), minval=1e-6, maxval=1.0)
     rays = make_rays(sensor, phase, twist)
     rays = rays._replace(depths=-jnp.log(depth).reshape(rays.depths.shape))
@@ -171,19 +171,19 @@ def _scan_near(near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray,
 
 
 def _beam_bias(sensor: LidarSensor) -> NDArray[np.float32]:
-    """Constant error of the range of each ray, m; the same in every scan."""
+    """Draws the constant error of the range of each ray, m; the same in every scan."""
     biases = np.random.default_rng(_BIAS_STREAM).normal(size=len(sensor.elevations_deg))
     return np.repeat(np.float32(sensor.beam_bias_m) * biases.astype(np.float32), sensor.num_azimuths)
 
 
 def _is_in_view(sensor: LidarSensor) -> NDArray[np.bool_]:
-    """True for the rays within the view."""
+    """Returns True for the rays within the view."""
     azimuths_deg = 180 - 360 / sensor.num_azimuths * (np.arange(sensor.num_azimuths) + 0.5)
     return np.tile(np.abs(azimuths_deg) <= 0.5 * sensor.view_deg, len(sensor.elevations_deg))
 
 
 def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, part: Array) -> Float[Array, " b"]:
-    """Ranges between foreground and background for beams beside an edge; `choice` and `part` are uniform draws."""
+    """Mixes foreground and background ranges of beams beside an edge; `choice` and `part` are uniform draws."""
     grid = ranges.reshape(-1, sensor.num_azimuths)
     gap = jnp.roll(grid, 1, axis=1) - grid
     is_edge = (jnp.abs(gap) > _EDGE_M[0]) & (jnp.abs(gap) < _EDGE_M[1])
@@ -192,11 +192,11 @@ def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, p
 
 
 def make_rays(sensor: LidarSensor, phase: Float[Array, ""], motion: Float[Array, " 6"]) -> Rays:
-    """The rays of a turn, by sectors of whole columns; foliage is met at its surface.
+    """Makes the rays of a turn, by sectors of whole columns; foliage is hit at its surface.
 
     Args:
         sensor: the lidar.
-        phase: by how much the turn is turned to the left, radians.
+        phase: offset of the azimuths to the left, radians.
         motion: twist of the sensor during the turn, in its own frame.
 
     Returns:
@@ -221,17 +221,17 @@ def make_rays(sensor: LidarSensor, phase: Float[Array, ""], motion: Float[Array,
 
 
 def _ray_shape(sensor: LidarSensor) -> tuple[int, int]:
-    """Number of sectors, the largest of whole columns, and of bands, the largest of whole beams."""
+    """Returns the largest number of sectors of whole columns, and of bands of whole beams."""
     num_beams = len(sensor.elevations_deg)
     sectors = max(count for count in range(1, _MAX_SECTORS + 1) if sensor.num_azimuths % count == 0)
     return sectors, max(count for count in range(1, _MAX_BANDS + 1) if num_beams % count == 0)
 
 
 def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s g c b"]:
-    """Probability that a ray comes back; 0 for nothing."""
+    """Computes the probability of a return of each ray; 0 without a hit."""
     # Half of the returns are lost at `half_loss_m`, scaled by the root of the reflectivity (the energy falls with the
-    # square of the range) and by the fourth root of the cosine: real surfaces are rough, and asphalt is seen farther
-    # than a smooth one would be.
+    # square of the range) and by the fourth root of the cosine, because rough asphalt is visible farther than a smooth
+    # surface.
     reflectivity = jnp.asarray(_REFLECTIVITY)[hits.surfaces]
     half_loss = sensor.half_loss_m * jnp.sqrt(reflectivity / 0.2) * jnp.maximum(hits.cosines, 1e-4) ** 0.25
     excess = jnp.log(jnp.maximum(half_loss, 1e-3)) - jnp.log(jnp.minimum(hits.ranges, 1e6))
@@ -241,6 +241,6 @@ def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s g c 
 
 
 def _by_beam(values: Array, sensor: LidarSensor) -> Array:
-    """Values (s, g, c, b, ...) by sector and band in the order of points, (beams * azimuths, ...): beam by beam."""
+    """Reorders values (s, g, c, b, ...) by sector and band beam by beam, as points: (beams * azimuths, ...)."""
     order = (1, 3, 0, 2, *range(4, values.ndim))
     return jnp.transpose(values, order).reshape(sensor.num_rays, *values.shape[4:])

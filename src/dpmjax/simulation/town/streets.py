@@ -26,7 +26,7 @@ class Streets:
     Attributes:
         paths: (k, 2) points of each street at steps of half a metre, from side street to side street.
         half_widths: from the middle to the kerb, m, of each street.
-        lanes: (k, 2) points of the long ways of the traffic, in one direction; traffic drives in both directions.
+        lanes: (k, 2) points of the lanes of the traffic, in one direction; traffic drives in both directions.
         route: (k, 2) points of the drive's middle line at steps of half a metre.
         is_closed: the route ends where it began.
     """
@@ -41,12 +41,12 @@ class Streets:
 def make_streets(
     rng: np.random.Generator, kind: str, length: float, block: float, half_width: tuple[float, float] = (4.6, 5.6)
 ) -> Streets:
-    """Lays out blocks and a closed route round them.
+    """Draws blocks and a closed route round them.
 
     Args:
         rng: source of all choices.
-        kind: route. "loop" goes once round some blocks. "there_and_back" goes down a street, round a block, back on the
-            opposite side of the street, and round a block there. "wander" goes at random, and home by the shortest way.
+        kind: kind of route. "loop" goes once round some blocks. "there_and_back" goes along a street, round a block,
+            back on the opposite side, and round a block there. "wander" is a random walk and the shortest way back.
         length: wanted length of the route, m; met within a block or two.
         block: side of a block, m.
         half_width: narrowest and widest street, from the middle to the kerb, m.
@@ -80,14 +80,14 @@ def make_streets(
 
 
 def streets_along(trajectory: FloatArray, rng: np.random.Generator) -> Streets:
-    """A street along a driven trajectory, which is its right lane.
+    """Makes streets along a driven trajectory, which is the right lane.
 
     Args:
         trajectory: (n, 2) positions of the car, m, in order.
         rng: source of the widths.
 
     Returns:
-        One street for every 120 m or so of way, each with its own width.
+        One street for about every 120 m, each with its own width.
 
     Raises:
         ValueError: the trajectory is shorter than 20 m.
@@ -105,7 +105,7 @@ def streets_along(trajectory: FloatArray, rng: np.random.Generator) -> Streets:
 
 
 def _bend(rng: np.random.Generator, block: float) -> Callable[[FloatArray], FloatArray]:
-    """A smooth displacement of the plane, which bends straight streets by some metres."""
+    """Draws a smooth displacement of the plane, which bends straight streets by some metres."""
     waves = rng.normal(size=(4, 2)) / (4 * block)
     sway = rng.normal(size=(4, 2)) * 0.05 * block
     phases = rng.uniform(0, 2 * np.pi, 4)
@@ -117,7 +117,7 @@ def _bend(rng: np.random.Generator, block: float) -> Callable[[FloatArray], Floa
 
 
 def _plan(rng: np.random.Generator, kind: str, num_blocks: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Corners of a closed route on the lattice, and the size of the lattice."""
+    """Draws the corners of a closed route on the lattice, and returns the size of the lattice."""
     if kind == "loop":
         around = max(num_blocks // 2, 2)
         high = int(rng.integers(max(around // 3, 1), max(2 * around // 3, 1) + 1))
@@ -141,7 +141,7 @@ def _rectangle(high: int, wide: int) -> list[tuple[int, int]]:
 
 
 def _wander(rng: np.random.Generator, side: int, num_blocks: int) -> list[tuple[int, int]]:
-    """A random walk that never turns on the spot, and home; drawn again if it comes in the way it went out."""
+    """Draws a random walk without U-turns, and back to its start; drawn again if it ends on its first street."""
     while True:
         route = [(0, 0), (0, 1)]
         while len(route) < 0.85 * num_blocks:
@@ -164,7 +164,7 @@ def _neighbours(route: list[tuple[int, int]], side: int) -> list[tuple[int, int]
 
 
 def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
-    """The right lane of the route.
+    """Returns the right lane of the route.
 
     Args:
         streets: with the route.
@@ -178,7 +178,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
 
 
 def arc_lengths(path: FloatArray) -> FloatArray:
-    """Way from the start to each point.
+    """Computes the path length from the start to each point.
 
     Args:
         path: (k, 2) points, m.
@@ -190,10 +190,10 @@ def arc_lengths(path: FloatArray) -> FloatArray:
 
 
 def at_way(path: FloatArray, way: FloatArray) -> FloatArray:
-    """Points at given ways along the path, linear between its points.
+    """Interpolates points linearly at given path lengths.
 
     Args:
-        path: (k, d) points; the way counts x and y only.
+        path: (k, d) points; path lengths are those of x and y.
         way: (m,) m, clipped to the path.
 
     Returns:
@@ -204,7 +204,7 @@ def at_way(path: FloatArray, way: FloatArray) -> FloatArray:
 
 
 def resample(path: FloatArray, step: float) -> FloatArray:
-    """The path at (nearly) equal steps, both ends kept.
+    """Resamples a path at (nearly) equal steps, with both ends.
 
     Args:
         path: (k, d) points.
@@ -218,10 +218,10 @@ def resample(path: FloatArray, step: float) -> FloatArray:
 
 
 def tangents(path: FloatArray) -> FloatArray:
-    """Unit directions along the path.
+    """Computes unit directions along the path.
 
     Args:
-        path: (k, 2) points, none of them twice in a row.
+        path: (k, 2) points; consecutive ones differ.
 
     Returns:
         (k, 2).
@@ -231,7 +231,7 @@ def tangents(path: FloatArray) -> FloatArray:
 
 
 def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
-    """The path moved to its left.
+    """Shifts a path to its left.
 
     Args:
         path: (k, 2) points.
@@ -253,7 +253,7 @@ def smooth(path: FloatArray, sigma: float, *, is_closed: bool) -> FloatArray:
         is_closed: the last point is the first one again.
 
     Returns:
-        (k, d); ends stay where they are, unless the path is closed.
+        (k, d); the ends are unchanged, unless the path is closed.
     """
     from scipy.ndimage import gaussian_filter1d
 

@@ -1,4 +1,4 @@
-"""The ground of a town: heights, equal ones where a trajectory comes back; distances from streets; what is taken."""
+"""The ground of a town: heights, equal at revisits of a trajectory, distances from streets, and occupied plots."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PAVEMENT_M = 2.2
 _MARGIN_M = 70.0
 _TILE = 256
 _KERB_M = 0.12
-# Passes of a place lie this near to each other, with this much way between them.
+# Largest distance of two passes of a place, least path length between them, and number of neighbours searched.
 _NEAR_M, _LEAST_WAY_M, _NUM_NEAR = 6.0, 30.0, 64
 _STEEPEST = 0.2
-# Against the weight 1 of each step: places of two passes lie up to half a metre apart along the way.
+# Weight of equal heights of two passes relative to a step; the passes lie up to half a metre apart along the path.
 _TIE_WEIGHT = 0.01
 
 
@@ -43,7 +43,7 @@ class Terrain:
     street_distance: FloatArray = field(repr=False)
 
     def height_at(self, positions: FloatArray) -> FloatArray:
-        """Ground heights (m,) at (m, 2) places, bilinear."""
+        """Interpolates ground heights (m,) at (m, 2) positions, bilinearly."""
         at = (np.atleast_2d(positions)[:, :2] - self.origin) / CELL_M
         return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
@@ -51,13 +51,13 @@ class Terrain:
 def make_terrain(
     rng: np.random.Generator, streets: Streets, support: FloatArray | None, kind: Kind = KINDS["suburb"]
 ) -> Terrain:
-    """Shapes the ground.
+    """Makes the ground.
 
     Args:
         rng: source of all choices.
-        streets: where the streets are.
-        support: (n, 3) points that the streets must go through, m; None lets the land roll at random.
-        kind: how steep and rough the land is.
+        streets: streets of the town.
+        support: (n, 3) points that the streets must go through, m; None: random hills.
+        kind: kind of place, with steepness and roughness of the land.
 
     Returns:
         The terrain; its grid is a whole number of tiles of 128 m, so that kernels see few shapes.
@@ -77,7 +77,7 @@ def make_terrain(
 
 
 def _street_distance(streets: Streets, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Distance from the nearest kerb; streets of different width count by their own."""
+    """Computes the distance from the nearest kerb, with the width of each street."""
     widths = np.round(np.array(streets.half_widths), 1)
     nearest = np.full(shape, np.inf)
     for width in np.unique(np.round(widths * 2) / 2):
@@ -100,7 +100,7 @@ def _rolling(rng: np.random.Generator, x: FloatArray, y: FloatArray, steepness: 
 
 
 def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Land through given points: inverse distances on a coarse grid, smoothed, then brought to the fine one."""
+    """Interpolates land through given points by inverse distances on a coarse grid, smoothed and resampled."""
     coarse = 8
     rows, columns = (count // coarse + 2 for count in shape)
     step = CELL_M * coarse
@@ -115,14 +115,14 @@ def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) ->
 
 
 def _cross_section(distance: FloatArray) -> FloatArray:
-    """A cambered street, a kerb, a pavement, and gardens a little higher."""
+    """Computes the profile of a cambered street, a kerb, a pavement, and gardens a little higher."""
     camber = 0.02 * np.clip(-distance, 0, 5)
     kerb = _KERB_M * np.clip((distance + 0.25) / 0.5, 0, 1)
     return camber + kerb + 0.15 * np.clip((distance - PAVEMENT_M) / 2.0, 0, 1)
 
 
 def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
-    """A centimetre on streets, several and gentle mounds beside them."""
+    """Draws roughness: a centimetre on streets, several centimetres and gentle mounds beside them."""
     fine = rng.normal(size=distance.shape)
     mounds = gaussian_filter(rng.normal(size=distance.shape), 8.0) * 28.0
     is_garden = np.clip((distance - PAVEMENT_M) / 2.0, 0, 1)
@@ -130,7 +130,7 @@ def _roughness(rng: np.random.Generator, distance: FloatArray) -> FloatArray:
 
 
 class Plots:
-    """The ground that is taken.
+    """The occupied ground.
 
     It changes while a town is made.
 
@@ -143,12 +143,12 @@ class Plots:
         self._is_taken = np.zeros(terrain.heights.shape, bool)
 
     def claim(self, place: Place, size: Size, kerb_distance: float) -> bool:
-        """Takes a rectangle if it is free.
+        """Occupies a rectangle if it is free.
 
         Args:
             place: its middle.
             size: along and across its heading, m.
-            kerb_distance: no part may be nearer than this to a kerb, m; negative allows to stand on the street.
+            kerb_distance: least distance of all parts from a kerb, m; negative: the object may stand on the street.
 
         Returns:
             True if it was free.
@@ -163,7 +163,7 @@ class Plots:
         return True
 
     def are_free(self, positions: FloatArray, kerb_distance: float) -> BoolArray:
-        """Finds the free places.
+        """Finds the free positions.
 
         Args:
             positions: (n, 2) x and y, m, on the terrain.
@@ -186,16 +186,16 @@ class Plots:
 
 
 def with_equal_passes(positions: FloatArray) -> FloatArray:
-    """Returns the trajectory with heights that are equal where it passes a place again; slopes change least.
+    """Returns the trajectory with equal heights at revisits of a place, at the least change of slopes.
 
     A sparse least-squares problem keeps the steps of height, and sets those between two passes to zero. Slopes are
-    limited to 20 %, because the height of a receiver that stands still may drift by metres.
+    limited to 20 %, because the height of a stationary receiver may drift by metres.
 
     Args:
         positions: (n, 3) m, in order, at least 1 m long.
 
     Returns:
-        (m, 3) positions on the same way at steps of a metre.
+        (m, 3) positions on the same path at steps of a metre.
     """
     positions = resample(positions, 1.0)
     count = len(positions)
@@ -207,7 +207,7 @@ def with_equal_passes(positions: FloatArray) -> FloatArray:
     wanted = np.concatenate([climbs, np.zeros(len(pairs))])
     rows = np.repeat(np.arange(len(ends)), 2)
     difference = sp.csr_array((np.tile([-1.0, 1.0], len(ends)), (rows, ends.ravel())), (len(ends), count))
-    # The first height stays, so that the system has one solution.
+    # The first height is fixed, so that the system has one solution.
     inner = difference[:, 1:]
     normal = (inner.T @ sp.diags_array(weights) @ inner).tocsc()
     change = spsolve(normal, inner.T @ (weights * (wanted - difference @ positions[:, 2])))
@@ -216,7 +216,7 @@ def with_equal_passes(positions: FloatArray) -> FloatArray:
 
 
 def _passes(places: FloatArray, way: FloatArray) -> np.ndarray:
-    """(m, 2) rows of each place and of the nearest one of another pass."""
+    """Returns rows (m, 2) of each revisited position and of the nearest position of another pass."""
     distances, rows = KDTree(places).query(places, min(_NUM_NEAR, len(places)), distance_upper_bound=_NEAR_M)
     is_found, rows = np.isfinite(distances), np.asarray(rows)
     is_other = is_found & (np.abs(way[np.where(is_found, rows, 0)] - way[:, None]) > _LEAST_WAY_M)

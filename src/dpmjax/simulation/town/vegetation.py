@@ -1,4 +1,4 @@
-"""Plants woods, trees and undergrowth: trunks, and rough volumes that beams enter before they are reflected."""
+"""Woods, trees and undergrowth: trunks, and soft volumes that beams enter before they are reflected."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from dpmjax.simulation.town.objects import Collection
 from dpmjax.simulation.town.primitives import CELL_M
 from dpmjax.simulation.town.terrain import Plots
 
-_FARTHEST_M = 65.0  # From the nearest kerb: what grows farther away is not seen.
+_FARTHEST_M = 65.0  # Largest distance of plants from the nearest kerb.
 _PATCH_M = 14.0
 _NUM_TUFTS = 5
 _BASE = 0.15  # Most of a conifer's crown begins at this part of its height.
 
 
 def plant_land(into: Collection, rng: np.random.Generator, plots: Plots, kind: Kind) -> None:
-    """Plants the free land outside of streets and plots, in patches.
+    """Adds plants on the free land outside of streets and plots, in patches.
 
     Args:
         into: where to.
         rng: source of all choices.
-        plots: the ground that is free.
-        kind: how much grows, and what.
+        plots: free ground.
+        kind: kind of place, with densities of plants.
     """
     is_wooded = _patches(rng, plots.terrain.heights.shape, kind.woodland)
     for density, clear in ((kind.trees_per_ha, 2.5), (kind.bushes_per_ha, 1.6)):
@@ -44,7 +44,7 @@ def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> 
 
 
 def _scatter(rng: np.random.Generator, plots: Plots, per_ha: float, is_wooded: BoolArray) -> FloatArray:
-    """(n, 2) places in woods not far from streets."""
+    """Draws positions (n, 2) in woods near streets."""
     terrain = plots.terrain
     size = CELL_M * (np.array(terrain.heights.shape)[::-1] - 1)
     places = rng.uniform(0, 1, (rng.poisson(per_ha * size.prod() / 1e4), 2)) * size
@@ -59,7 +59,7 @@ def _on_ground(plots: Plots, places: FloatArray) -> FloatArray:
 def plant_trees(
     into: Collection, rng: np.random.Generator, feet: FloatArray, height: Span, *, conifers: float = 0.0
 ) -> None:
-    """Trees: a trunk, and a crown of tufts, no two alike.
+    """Adds trees of random shape: a trunk, and a crown of tufts.
 
     Args:
         into: where to.
@@ -90,7 +90,7 @@ def plant_trees(
 
 
 def plant_bushes(into: Collection, rng: np.random.Generator, feet: FloatArray) -> None:
-    """Bushes, undergrowth and tall grass: one tuft each.
+    """Adds bushes, undergrowth and tall grass: one tuft each.
 
     Args:
         into: where to.
