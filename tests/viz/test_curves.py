@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.viz import History, history_figure, save_figure, size_figure
+from dpmjax.viz import History, history_figure, save_figure
 
 
 def example(num_records=30):
@@ -53,20 +53,3 @@ def test_a_single_record_and_missing_losses_still_give_a_picture(tmp_path):
 def test_columns_of_different_lengths_are_refused():
     with pytest.raises(ValueError, match=r"\[3, 3, 2\]"):
         history_figure(History(np.zeros(3), np.zeros(3), ["a", "b"]), "px")
-
-
-def test_seconds_and_memory_are_drawn_apart_with_the_limit():
-    curves = {"num_scans": [64, 256, 1024], "step (s)": [0.1, 0.2, 0.2], "peak memory (GB)": [0.5, 0.6, 0.9]}
-    left, right = size_figure(curves, memory_limit_gb=4.0).axes
-    assert [line.get_label() for line in left.lines] == ["step (s)"]
-    np.testing.assert_array_equal(left.lines[0].get_xydata(), [[64, 0.1], [256, 0.2], [1024, 0.2]])
-    memory, limit = right.lines
-    np.testing.assert_array_equal(memory.get_ydata(), [0.5, 0.6, 0.9])
-    assert set(limit.get_ydata()) == {4.0}
-    assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "linear")
-    assert [text.get_text() for text in left.get_xticklabels()] == ["64", "256", "1024"]
-
-
-def test_a_curve_of_another_length_is_refused():
-    with pytest.raises(ValueError, match="curves: expected"):
-        size_figure({"num_scans": [64, 256], "step (s)": [0.1]}, memory_limit_gb=4.0)

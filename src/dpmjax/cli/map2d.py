@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration2d, simulation
-from dpmjax.cli.command import StopFlag, check_least, run_command
+from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.map2d_files import draw_map, draw_occupancy, registered_scans, scan_set_of, write_trajectories
@@ -280,8 +280,3 @@ def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
-
-
-def run(args: Sequence[str] | None = None) -> int:
-    """Runs the subcommand; returns the exit code."""
-    return run_command(main, Config, name=NAME, description=__doc__, args=args)

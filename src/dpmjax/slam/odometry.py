@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.encoding import thin_scan
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.deeppointmap.verification import MIN_COSINE, PLANE_DISTANCE_M, MeasuredScan
 from dpmjax.scans.free_space import range_image, view_points
 from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.preprocess import first_of_each_voxel
@@ -20,9 +20,6 @@ from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.interfaces import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
-
-PLANE_DISTANCE_M = 0.15
-"""Largest distance between an element and the plane of the map that it meets."""
 
 TILTS_DEG = (-8.0, 8.0)
 """Turns about the x and y axes among the further starts."""
@@ -35,9 +32,6 @@ MIN_NUM_POINTS = 100
 
 NUM_SAMPLES = 1000
 """Number of surface elements that the score of a pose compares."""
-
-MIN_COSINE = 0.7
-"""Smallest cosine between the normals of an element and of the plane it meets."""
 
 CONTRADICTION_WEIGHT = 2.0
 """Weight of the share of points in free space in the score."""

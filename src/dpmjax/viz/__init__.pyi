@@ -7,7 +7,6 @@ from .comparison import toy_figure as toy_figure
 from .curves import History as History
 from .curves import curves_figure as curves_figure
 from .curves import history_figure as history_figure
-from .curves import size_figure as size_figure
 from .drives import Track as Track
 from .drives import height_colors as height_colors
 from .drives import height_map_figure as height_map_figure

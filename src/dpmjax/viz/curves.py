@@ -21,7 +21,6 @@ LOSS_COLOR = "#30638e"
 RATIO_FOR_LOG_AXIS = 10.0
 _FEW_DECADES = 2
 SMOOTHED_PART = 0.03
-SIZE_COLORS = (LOSS_COLOR, ACCENT, "#2a9d6f", "#e09f3e")
 
 
 @dataclass(frozen=True)
@@ -144,42 +143,6 @@ def _label_log_axis(axes: Axes, values: NDArray[np.floating]) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,), numticks=8))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def size_figure(curves: Mapping[str, ArrayLike], *, memory_limit_gb: float) -> Figure:
-    """Draws seconds on the left and memory on the right.
-
-    Args:
-        curves: "num_scans" (k,), and by name other (k,) values: in GB where the name ends so, else in seconds.
-        memory_limit_gb: a line on the right.
-
-    Returns:
-        The figure.
-
-    Raises:
-        ValueError: no size, or a curve of another length.
-    """
-    sizes = np.asarray(curves["num_scans"], np.float64)
-    others = {name: np.asarray(values, np.float64) for name, values in curves.items() if name != "num_scans"}
-    if len(sizes) == 0 or any(values.shape != sizes.shape for values in others.values()):
-        raise ValueError(f"curves: expected one or more sizes and curves as long; got {len(sizes)} sizes")
-    figure = new_figure(9.0, 3.9)
-    left, right = figure.subplots(1, 2)
-    colors = itertools.cycle(SIZE_COLORS)
-    for name, values in others.items():
-        is_memory = name.endswith("(GB)")
-        color = SIZE_COLORS[0] if is_memory else next(colors)
-        (right if is_memory else left).plot(sizes, values, "-o", ms=4, lw=1.4, color=color, label=name)
-    right.axhline(memory_limit_gb, color=MUTED, ls=":", lw=1.0)
-    right.set_ylim(bottom=0.0, top=1.15 * memory_limit_gb)
-    left.set_yscale("log")
-    for axes in (left, right):
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(sizes, [f"{int(size)}" for size in sizes])
-        axes.legend(fontsize=8, frameon=False)
-        style_axes(axes, "scans")
-    figure.tight_layout()
-    return figure
 
 
 def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
