@@ -13,8 +13,9 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
 from dpmjax.registration2d.planar_scans import PlanarScans
 from dpmjax.registration2d.range_profiles import make_profiles
+from dpmjax.registration2d.sequence_search import align_arcs
 from dpmjax.registration2d.step_scores import MotionPrior, fitting_scans, interpolate, pair_scores, weak_steps
-from dpmjax.simulation import simulate_sequence
+from dpmjax.simulation import make_world, scan_world, simulate_sequence
 
 NUM_SCANS, METRES_A_PX = 24, 0.05
 STANDING, REPEATED, SWAPPED = (5, 6, 7), 12, 17
@@ -91,6 +92,33 @@ def test_usual_motion_surprises_least() -> None:
     assert (surprise[1:] > 0.5).all()
     np.testing.assert_allclose(prior.expected(2), [2.0, 0.0, 0.0], atol=0.05)
     assert MotionPrior.of(np.zeros((0, 3)), 5.0).forward == 0.0
+
+
+def test_arcs_bend_by_half_their_turn_and_have_the_usual_lengths() -> None:
+    prior = MotionPrior(1.0, 0.9)
+    arcs = prior.arcs()
+    moved = arcs[np.hypot(arcs[:, 0], arcs[:, 1]) > 0]
+    np.testing.assert_allclose(np.arctan2(moved[:, 1], moved[:, 0]), moved[:, 2] / 2, atol=1e-9)
+    straight = arcs[arcs[:, 2] == 0, 0]
+    assert straight.min() == 0.0
+    assert straight.max() > 1.0
+    np.testing.assert_allclose(MotionPrior(1.0, -0.9).arcs()[:, :2], -arcs[:, :2], atol=1e-12)
+
+
+@pytest.mark.parametrize(("place", "turn"), [((846.5, 698.5, -2.3), -1.36), ((564.5, 620.5, 0.2), 1.17)])
+def test_a_step_with_little_overlap_is_among_the_hypotheses(place, turn) -> None:
+    """The exhaustive search prefers poses with more overlap, and misses the step."""
+    length = 1.5 / METRES_A_PX * np.sinc(turn / (2 * np.pi))
+    step = np.array([length * np.cos(turn / 2), length * np.sin(turn / 2), turn])
+    poses = np.stack([np.array(place), se2.compose(np.array(place), step)])
+    world, rng = make_world(0), np.random.default_rng(0)
+    points, _ = scan_world(world.is_obstacle, poses, num_beams=512, range_noise_px=0.2, rng=rng)
+    ahead = np.arange(-80, 80) % 512
+    scans = planar_scans(METRES_A_PX * points[:, ahead])
+    truth = step * [METRES_A_PX, METRES_A_PX, 1.0]
+    found = align_arcs(scans, make_profiles(scans), np.array([1]), MotionPrior(1.0, 1.0))
+    off = found.poses - truth
+    assert (np.hypot(off[:, 0], off[:, 1]) + np.abs(off[:, 2])).min() < 0.3
 
 
 def test_interpolation_keeps_what_is_given_and_stands_still_outside() -> None:

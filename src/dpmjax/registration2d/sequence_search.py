@@ -1,7 +1,8 @@
 """Poses of a sequence of scans by beam search: each scan against the last placed scans, with several hypotheses.
 
 A step between two scans that share few beams has several poses that fit. An exhaustive search of the pair finds these
-hypotheses (`pair_search.py`). Their score is matched less contradicting beams against all of the last placed scans; the
+hypotheses (`pair_search.py`); it prefers poses with much overlap, so alignments from the arcs of the usual motion give
+more. Their score is matched less contradicting beams against all of the last placed scans; the
 fitness of an ICP ignores contradicting beams. The best sequences of poses are kept from scan to scan. A scan that fits
 none of the last placed scans (a swapped line of the log, a covered lens) stays unregistered, and the sequence continues
 with the next scan.
@@ -52,6 +53,8 @@ _NUM_SAME, _SAME_SHAPE = 4, (0.05, 0.05)
 _LEFT_OUT, _GUESSED = 0.05, -1.0
 # Weight of the motion prior.
 _PRIOR_WEIGHT = 0.1
+# Number of hypotheses of a step that are kept of the alignments from arcs.
+_NUM_ARCS = 3
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class SequenceResult(NamedTuple):
     is_registered: NDArray[np.bool_]
 
 
-class _Hypotheses(NamedTuple):
+class StepHypotheses(NamedTuple):
     """Relative poses of pairs: (h,) rows, (h, 3) T_target_source, (h,) scores of the pair alone."""
 
     source: Indices
@@ -127,7 +130,7 @@ def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _find_hypotheses(
     scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches, config: SequenceConfig
-) -> _Hypotheses:
+) -> StepHypotheses:
     """Returns the steps, and candidates of a search for steps that are not clear."""
     num_scans = len(scans)
     later = np.arange(1, num_scans)
@@ -137,7 +140,9 @@ def _find_hypotheses(
     is_clear = (best > _CLEAR_SCORE) & (steps.fitness > _CLEAR_FITNESS)
     is_clear &= contradicted_share(profiles, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
     is_clear &= steps.weakest_eigenvalue() > _CLEAR_EIGENVALUE * num_beams
-    found = [_Hypotheses(later, later - 1, steps.poses, scores)]
+    found = [StepHypotheses(later, later - 1, steps.poses, scores)]
+    usual = MotionPrior.of(steps.poses[is_clear], scans.typical_range)
+    found.append(align_arcs(scans, profiles, later[~is_clear & (scores < _CLEAR_SCORE)], usual))
     open_steps, searched = later[~is_clear], set[tuple[int, int]]()
     for span, limit in ((1, np.inf), (_WEAK_SPAN, WEAK_SCORE), (_BAD_SPAN, _BAD_SCORE)):
         open_steps = open_steps[best[open_steps - 1] < limit]
@@ -159,12 +164,12 @@ def _find_hypotheses(
     source, target = (np.concatenate([getattr(x, name) for x in found]) for name in ("source", "target"))
     poses, scores = (np.concatenate([getattr(x, name) for x in found]) for name in ("poses", "scores"))
     order = np.lexsort((-scores, source))
-    return _Hypotheses(source[order], target[order], poses[order], scores[order])
+    return StepHypotheses(source[order], target[order], poses[order], scores[order])
 
 
 def _search(
     scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64], config: SequenceConfig
-) -> _Hypotheses:
+) -> StepHypotheses:
     """Finds candidates of pairs (p, 2), each aligned by ICP where the score does not fall."""
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(config.search.num_turns) / config.search.num_turns)
@@ -176,7 +181,37 @@ def _search(
     before, after = (pair_scores(profiles, source, target, x) for x in (poses, aligned))
     is_better = after > before - 0.02
     poses = np.where(is_better[:, None], aligned, poses)
-    return _Hypotheses(source, target, poses, np.where(is_better, after, before))
+    return StepHypotheses(source, target, poses, np.where(is_better, after, before))
+
+
+def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usual: MotionPrior) -> StepHypotheses:
+    """Aligns steps from the arcs of the usual motion.
+
+    Args:
+        scans: n scans in time order.
+        profiles: of the scans.
+        later: (k,) rows of the scans at the ends of the steps.
+        usual: motion prior.
+
+    Returns:
+        Distinct hypotheses of each step with the best scores under the motion prior.
+    """
+    arcs = usual.arcs()
+    source, guesses = np.repeat(later, len(arcs)), np.tile(arcs, (len(later), 1))
+    poses = match_pairs(scans.take(source), scans.take(source - 1), guesses[:, None], FINE).poses
+    poses[:, 2] = se2.wrap_angle(poses[:, 2])
+    scores = pair_scores(profiles, source, source - 1, poses)
+    values = scores - _PRIOR_WEIGHT * usual.surprise(poses, np.ones(len(source), np.int64))
+    values, off = values.reshape(len(later), -1), poses.reshape(len(later), len(arcs), 3)
+    rows, kept = np.arange(len(later)), []
+    for _ in range(_NUM_ARCS if len(later) else 0):
+        best = values.argmax(axis=1)
+        kept.append(rows * len(arcs) + best)
+        apart = np.abs(off - off[rows, best][:, None])
+        is_same = np.hypot(apart[..., 0], apart[..., 1]) < _SAME_SHAPE[0] * scans.typical_range
+        values = np.where(is_same & (np.abs(se2.wrap_angle(apart[..., 2])) < _SAME_SHAPE[1]), -np.inf, values)
+    chosen = np.concatenate([*kept, np.zeros(0, np.int64)])
+    return StepHypotheses(source[chosen], source[chosen] - 1, poses[chosen], scores[chosen])
 
 
 class _Sequences(NamedTuple):
@@ -214,7 +249,7 @@ class _Beam:
     """The beam search over the hypotheses of a sequence."""
 
     def __init__(
-        self, profiles: RangeProfiles, hypotheses: _Hypotheses, prior: MotionPrior, config: SequenceConfig
+        self, profiles: RangeProfiles, hypotheses: StepHypotheses, prior: MotionPrior, config: SequenceConfig
     ) -> None:
         self.profiles, self.hypotheses, self.prior, self.config = profiles, hypotheses, prior, config
         self.unit, self.width = profiles.scans.typical_range, config.num_compared + _BAD_SPAN

@@ -22,6 +22,8 @@ LEAST_VISIBLE = 0.3
 WEAK_SCORE = 0.25
 # Scales of the motion prior: deviations backward, forward and sideways in usual steps; radians.
 _SHORT, _LONG, _SIDEWAYS, _TURN = 0.6, 1.5, 0.5, 0.8
+# Turns (radians) of the arcs that a robot may drive in a step, and their lengths in usual steps.
+_ARC_TURNS, _ARC_LENGTHS = np.radians(np.arange(-90.0, 91.0, 15.0)), (0.0, 0.5, 1.0, 1.5)
 # Score above which two scans fit each other, and the largest number of steps between them. Largest size of an outlier
 # group.
 _FITTING_SCORE, _FITTING_SPAN, _SMALL_GROUP = 0.0, 3, 3
@@ -85,6 +87,13 @@ class MotionPrior(NamedTuple):
     def expected(self, gap: int) -> Floats:
         """Returns the usual motion (3,) over `gap` scans, without a turn."""
         return np.array([self.forward * self.length * gap, 0.0, 0.0])
+
+    def arcs(self) -> Floats:
+        """Returns the steps (h, 3) along arcs of the usual lengths, for all turns up to a right angle."""
+        turn, length = (x.ravel() for x in np.meshgrid(_ARC_TURNS, np.array(_ARC_LENGTHS) * self.length))
+        # The chord of an arc is turned by half the turn; np.sinc(x) is sin(pi x) / (pi x).
+        chord = length * np.sinc(turn / (2 * np.pi)) * (1.0 if self.forward >= 0 else -1.0)
+        return np.stack([chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn], axis=1)
 
     def surprise(self, steps: Floats, gap: Indices) -> Floats:
         """Computes the heavy-tailed cost (m,) of motions (m, 3) over `gap` scans each."""
