@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d import PlanarScans, assess_trajectory, planar_scans, refine
+from dpmjax.registration2d import PlanarScans, assess_trajectory, incremental_icp, planar_scans, refine
 from dpmjax.registration2d.joint_alignment import JointAlignmentConfig
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.range_profiles import make_profiles
@@ -136,3 +136,14 @@ def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
     assert found is not None
     off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0
+
+
+def test_a_calibrated_prior_does_not_hold_a_clear_step_that_slipped(scans, truth) -> None:
+    """Most steps of the odometry are exact, so their deviations are small; one step in a room has a wrong turn."""
+    slipped, expected = 3, steps_of(truth)
+    expected[slipped, 2] += 0.3
+    odometry = se2.compose(truth[0], se2.chain(expected))
+    prior = StepPrior(expected, np.broadcast_to([0.2, 0.2, 0.003], expected.shape))
+    found = incremental_icp(scans, odometry=odometry, prior=prior.loosened(scans.typical_range)).steps.poses
+    assert abs(found[slipped, 2] - steps_of(truth)[slipped, 2]) < 0.02
+    np.testing.assert_array_equal(prior.loosened(scans.typical_range).steps, prior.steps)

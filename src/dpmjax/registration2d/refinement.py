@@ -98,8 +98,8 @@ def refine(
     fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
-        # Steps re-aligned from the initial ones, with the prior along unconstrained directions.
-        chained, steps = incremental_icp(scans, odometry=start, prior=prior)
+        # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
+        chained, steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range))
         rows = np.flatnonzero(fitting_scans(scans, chained))
         if len(rows) < len(scans):
             some = scans.take(rows).replace(is_ordered=True)

@@ -51,6 +51,15 @@ class StepPrior(NamedTuple):
         chi2 = ((off / self.deviations.reshape(shape)) ** 2).sum(-1)
         return np.asarray(step_cost(chi2), np.float64)
 
+    def loosened(self, typical_range: float) -> StepPrior:
+        """Returns the prior with at least the usual deviations.
+
+        Calibrated deviations are those of most steps. The normal prior of an alignment needs larger ones, because some
+        steps slip, and in fast turns odometry and scans have different times.
+        """
+        usual = StepPrior.of_poses(se2.chain(self.steps), typical_range).deviations
+        return self._replace(deviations=np.maximum(self.deviations, usual))
+
     def as_pose_prior(self, residual: float | Floats) -> PosePrior:
         """Returns the prior of alignments whose beams have this standard deviation `residual`, unit of the points."""
         return PosePrior(self.steps, (residual / self.deviations) ** 2)
