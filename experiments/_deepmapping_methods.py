@@ -105,7 +105,7 @@ def _refined_icp(task: Task) -> Candidates:
 
 def _direct_lbfgs(task: Task) -> Floats:
     """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
-    from experiments.baselines.direct import optimize_directly
+    from experiments._baselines import optimize_directly
 
     num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
     key = jax.random.key(task.seed)
@@ -129,13 +129,13 @@ def _direct(task: Task, *, has_windows: bool) -> Floats:
 
 
 def _multiway(task: Task) -> Floats:
-    from experiments.baselines.multiway import multiway
+    from experiments._baselines import multiway
 
     return multiway(task.scans)
 
 
 def _swarm(task: Task) -> Floats:
-    from experiments.baselines.direct import swarm_chain
+    from experiments._baselines import swarm_chain
 
     return swarm_chain(task.scans, key=jax.random.key(task.seed))
 

@@ -86,7 +86,7 @@ def evaluate_refinement(drive: Drive, methods: SlamMethods, method: str, seed: i
         T = refined.slam_map.T_world_keyframe
         numbers = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
     elif len(T) > 1:
-        from experiments.baselines.multiway import multiway_clouds
+        from experiments._baselines import multiway_clouds
 
         T = multiway_clouds([read_keyframe(row) for row in range(len(T))], T)
     seconds = time.perf_counter() - clock

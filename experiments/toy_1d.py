@@ -108,7 +108,7 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.f
     import jax
     import jax.numpy as jnp
 
-    from experiments.baselines.direct import minimize_toy
+    from experiments._baselines import minimize_toy
 
     runs = descend_both(toy, config)
     network, direct = map(path, runs)

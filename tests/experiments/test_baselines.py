@@ -12,8 +12,7 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments.baselines.direct import Swarms, swarm_chain
-from experiments.baselines.multiway import multiway, multiway_clouds, multiway_images
+from experiments._baselines import Swarms, multiway, multiway_clouds, multiway_images, swarm_chain
 from tests.optional import import_or_skip
 
 QUICK = Swarms(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)

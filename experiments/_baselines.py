@@ -1,0 +1,316 @@
+"""Baselines of the DeepMapping paper that stand on other packages (extra `baselines`).
+
+L-BFGS by jaxopt on DeepMapping's loss without L-Net, and solvers of jaxopt on the toy. A chain of scans by particle
+swarms of evosax. Multiway registration by Open3D: pairs are registered by iterated closest points; neighbours in time
+are sure edges of a pose graph, all further pairs uncertain ones, and a line process removes wrong edges (Choi, Zhou and
+Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with the
+settings of `as_direct`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
+
+from dpmjax import ScanSet
+from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem, toy_loss
+from dpmjax.geometry import rigid, se2, typical_range
+from dpmjax.losses import chamfer_distance
+
+Floats = NDArray[np.float64]
+
+
+def optimize_directly(
+    scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array
+) -> NDArray[np.float64]:
+    """Returns poses from zero by L-BFGS on the loss at the end of the last warm phase, its random samples held.
+
+    Args:
+        scans: n planar scans.
+        config: settings; its last warm phase gives the loss.
+        num_iterations: number of iterations of L-BFGS.
+        key: key for the map's weights and the samples.
+
+    Returns:
+        (n, 3) poses, unit of the scans.
+    """
+    import jaxopt
+
+    data, unit = mapping_data(scans, np.zeros((len(scans.points), 3)))
+    phase = replace(config.warm_phases[-1], scans_per_step=len(scans.points))
+    problem = mapping_problem(replace(config, warm_phases=(phase,)), data)
+    start = init(problem, data, key=key).params
+
+    def loss(moving: tuple[Array, Any]) -> Float[Array, ""]:
+        params = replace(start, poses=moving[0], occupancy=moving[1])
+        return problem.loss(problem.config, phase, params, data, jnp.asarray(phase.num_steps), key)[0]
+
+    solver = jaxopt.LBFGS(loss, maxiter=num_iterations, history_size=10, linesearch="backtracking", maxls=20)
+    solution, _ = solver.run((start.poses, start.occupancy))
+    return np.asarray(solution[0], np.float64) * [unit, unit, 1.0]
+
+
+def minimize_toy(
+    x0: Float[Array, ""], method: Literal["gradient-descent", "lbfgs", "bfgs"], *, max_iterations: int = 1000
+) -> Float[Array, ""]:
+    """Solves the direct form of the toy by a solver of jaxopt with its own line search.
+
+    Args:
+        x0: where to start.
+        method: "gradient-descent" (with line search and momentum), "lbfgs" or "bfgs".
+        max_iterations: the largest number of iterations.
+
+    Returns:
+        The end of the descent.
+
+    Raises:
+        ValueError: the method is unknown.
+    """
+    import jaxopt
+
+    solvers = {"gradient-descent": jaxopt.GradientDescent, "lbfgs": jaxopt.LBFGS, "bfgs": jaxopt.BFGS}
+    if method not in solvers:
+        raise ValueError(f"method: expected one of {', '.join(solvers)}, got {method!r}")
+    return solvers[method](fun=toy_loss, maxiter=max_iterations).run(x0).params
+
+
+# Particles start within this: translation along each axis in typical ranges, and radians.
+_SPREAD = (0.15, 0.5)
+# Pairs that are worked on together.
+_PAIRS_AT_ONCE = 32
+
+
+class Swarms(NamedTuple):
+    """Sizes of the swarms.
+
+    Attributes:
+        num_particles: relative poses that are tried at a time.
+        num_iterations: number of iterations of a swarm.
+        num_rounds: swarms from fresh particles; the best round of each pair is kept.
+        num_beams: beams of each scan that are compared.
+    """
+
+    num_particles: int = 32
+    num_iterations: int = 60
+    num_rounds: int = 3
+    num_beams: int = 86
+
+
+SWARMS = Swarms()
+
+
+def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> NDArray[np.float64]:
+    """Returns poses of planar scans, each onto the one before by a swarm on their Chamfer distance (eq. 5).
+
+    A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
+    ends in a ModuleNotFoundError.
+
+    Args:
+        scans: n scans in order of time.
+        sizes: of the swarms.
+        key: key of the swarms.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+    """
+    points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
+    stride = max(1, -(-mask.shape[1] // sizes.num_beams))
+    unit = typical_range(scans.points, scans.mask)
+    widths = jnp.array([_SPREAD[0] * unit, _SPREAD[0] * unit, _SPREAD[1]])
+    steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, sizes=sizes)
+    return se2.chain(np.asarray(steps, np.float64))
+
+
+@partial(jax.jit, static_argnames="sizes")
+def _swarm_pairs(
+    points: Float[Array, "n b 2"],
+    mask: Bool[Array, "n b"],
+    widths: Float[Array, " 3"],
+    key: jax.Array,
+    *,
+    sizes: Swarms,
+) -> Float[Array, "m 3"]:
+    """Returns T_before_scan of every scan but the first."""
+
+    def best_of_rounds(pair: tuple[jax.Array, ...]) -> Array:
+        before, before_mask, after, after_mask, pair_key = pair
+
+        def misfit(pose: Float[Array, " 3"]) -> Array:
+            return chamfer_distance(se2.transform_points(pose, after), before, after_mask, before_mask)
+
+        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), sizes=sizes)
+        found, values = jax.lax.map(swarm, jax.random.split(pair_key, sizes.num_rounds))
+        return found[values.argmin()] * widths
+
+    keys = jax.random.split(key, len(mask) - 1)
+    pairs = (points[:-1], mask[:-1], points[1:], mask[1:], keys)
+    return jax.lax.map(best_of_rounds, pairs, batch_size=_PAIRS_AT_ONCE)
+
+
+def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+    """Returns the best particle of one swarm in the box from -1 to 1, and its misfit."""
+    from evosax.algorithms import PSO
+
+    start_key, init_key, key = jax.random.split(key, 3)
+    algorithm = PSO(population_size=sizes.num_particles, solution=jnp.zeros(3))
+    particles = jax.random.uniform(start_key, (sizes.num_particles, 3), minval=-1.0, maxval=1.0)
+    state = algorithm.init(init_key, particles, misfit(particles), algorithm.default_params)
+
+    def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
+        ask_key, tell_key = jax.random.split(key)
+        particles, state = algorithm.ask(ask_key, state, algorithm.default_params)
+        state, _ = algorithm.tell(tell_key, particles, misfit(particles), state, algorithm.default_params)
+        return state, None
+
+    state, _ = jax.lax.scan(iterate, state, jax.random.split(key, sizes.num_iterations))
+    return state.best_solution, state.best_fitness
+
+
+# Largest distances of matched points in the first round, and in the second round and the graph, in typical ranges of
+# the scans: from a rough start, and from a good one.
+_FROM_ROUGH, _FROM_GOOD = (0.09, 0.0225), (0.03, 0.01)
+# Scans that the start puts nearer than this share of the typical range are matched too.
+_RADIUS = 0.3
+# Doubtful edges below this confidence are removed.
+_PRUNE = 0.25
+# Points of a lidar cloud are thinned to this share of the typical range: 0.3 m in a street.
+_VOXEL_SHARE = 0.01
+
+
+def multiway(scans: ScanSet) -> Floats:
+    """Returns poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        scans: n scans in order of time.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+    """
+    unit = typical_range(scans.points, scans.mask)
+    points = [p[m] for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
+    flat = [np.concatenate([p, np.zeros((len(p), 1))], axis=1) for p in points]
+    clouds = [_cloud(p) for p in flat]
+    poses = _registered(clouds, unit, _FROM_ROUGH, is_planar=True)
+    planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
+    return se2.relative(planar[0], planar)
+
+
+def multiway_images(
+    points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"]
+) -> Float[NDArray[np.float64], "n 4 4"]:
+    """Returns poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        points: points of n images in order of time, each in the frame of its camera.
+        mask: True where something was measured.
+
+    Returns:
+        T_world_camera, the first one the identity.
+    """
+    unit = typical_range(points, mask)
+    clouds = [_cloud(p[m]) for p, m in zip(np.asarray(points), np.asarray(mask), strict=True)]
+    for cloud in clouds:
+        cloud.estimate_normals()
+    return _registered(clouds, unit, _FROM_ROUGH, is_planar=False)
+
+
+def multiway_clouds(
+    clouds: Sequence[Float[NDArray[np.floating], "_n 3"]],
+    T_world_cloud: Float[NDArray[np.float64], "n 4 4"],
+) -> Float[NDArray[np.float64], "n 4 4"]:
+    """Polishes the poses of lidar clouds by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        clouds: points of n clouds in order of time, each in the frame of its lidar.
+        T_world_cloud: where they start.
+
+    Returns:
+        T_world_cloud; the first one stays.
+    """
+    unit = float(np.median([np.percentile(np.linalg.norm(points, axis=1), 90) for points in clouds]))
+    thinned = [_cloud(points).voxel_down_sample(_VOXEL_SHARE * unit) for points in clouds]
+    for cloud in thinned:
+        cloud.estimate_normals()
+    T_first_cloud = rigid.inverse(T_world_cloud[0]) @ T_world_cloud
+    return T_world_cloud[0] @ _registered(thinned, unit, _FROM_GOOD, is_planar=False, start=T_first_cloud)
+
+
+def _registered(
+    clouds: list[Any], unit: float, shares: tuple[float, float], *, is_planar: bool, start: Floats | None = None
+) -> Floats:
+    """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes.
+
+    Without a start, each cloud is matched from where the one before is.
+    """
+    import open3d
+
+    coarse, fine = (share * unit for share in shares)
+    registration = open3d.pipelines.registration
+    estimation = registration.TransformationEstimationPointToPlane()
+    if is_planar:  # planes of flat clouds leave three directions open
+        estimation = registration.TransformationEstimationPointToPoint()
+    graph = registration.PoseGraph()
+    T_world = [np.eye(4)]
+    graph.nodes.append(_node(T_world[0]))
+    for scan in range(1, len(clouds)):
+        guess = np.eye(4) if start is None else rigid.inverse(start[scan]) @ start[scan - 1]
+        graph.edges.append(_edge(clouds, (scan - 1, scan), guess, (coarse, fine), estimation, is_doubtful=False))
+        # An edge maps its source, the earlier scan, into the later one.
+        T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
+        graph.nodes.append(_node(T_world[-1]))
+    placed = np.stack(T_world) if start is None else start
+    apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
+    for source, target in np.argwhere(np.triu(apart < _RADIUS * unit, k=2)).tolist():
+        guess = rigid.inverse(placed[target]) @ placed[source]
+        graph.edges.append(_edge(clouds, (source, target), guess, (coarse, fine), estimation, is_doubtful=True))
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        registration.global_optimization(
+            graph,
+            registration.GlobalOptimizationLevenbergMarquardt(),
+            registration.GlobalOptimizationConvergenceCriteria(),
+            registration.GlobalOptimizationOption(
+                max_correspondence_distance=fine, edge_prune_threshold=_PRUNE, reference_node=0
+            ),
+        )
+    return np.stack([node.pose for node in graph.nodes])
+
+
+def _cloud(points: NDArray[np.floating]) -> Any:
+    import open3d
+
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+
+
+def _node(T_world_scan: Floats) -> Any:
+    import open3d
+
+    return open3d.pipelines.registration.PoseGraphNode(T_world_scan)
+
+
+def _edge(
+    clouds: list[Any],
+    pair: tuple[int, int],
+    T_guess: Floats,
+    distances: tuple[float, float],
+    estimation: Any,
+    *,
+    is_doubtful: bool,
+) -> Any:
+    """Returns the motion of a pair of source and target, with its information."""
+    import open3d
+
+    registration = open3d.pipelines.registration
+    source, target = (clouds[row] for row in pair)
+    T = T_guess
+    for distance in distances:
+        T = registration.registration_icp(source, target, distance, T, estimation).transformation
+    information = registration.get_information_matrix_from_point_clouds(source, target, distances[-1], T)
+    return registration.PoseGraphEdge(*pair, T, information, uncertain=is_doubtful)
