@@ -9,7 +9,6 @@ settings of `as_direct`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -175,14 +174,12 @@ def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, 
 
 
 # Largest distances of matched points in the first round, and in the second round and the graph, in typical ranges of
-# the scans: from a rough start, and from a good one.
-_FROM_ROUGH, _FROM_GOOD = (0.09, 0.0225), (0.03, 0.01)
+# the scans.
+_COARSE, _FINE = 0.09, 0.0225
 # Scans that the start puts nearer than this share of the typical range are matched too.
 _RADIUS = 0.3
 # Doubtful edges below this confidence are removed.
 _PRUNE = 0.25
-# Points of a lidar cloud are thinned to this share of the typical range: 0.3 m in a street.
-_VOXEL_SHARE = 0.01
 
 
 def multiway(scans: ScanSet) -> Floats:
@@ -198,7 +195,7 @@ def multiway(scans: ScanSet) -> Floats:
     points = [p[m] for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
     flat = [np.concatenate([p, np.zeros((len(p), 1))], axis=1) for p in points]
     clouds = [_cloud(p) for p in flat]
-    poses = _registered(clouds, unit, _FROM_ROUGH, is_planar=True)
+    poses = _registered(clouds, unit, is_planar=True)
     planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
     return se2.relative(planar[0], planar)
 
@@ -219,40 +216,17 @@ def multiway_images(
     clouds = [_cloud(p[m]) for p, m in zip(np.asarray(points), np.asarray(mask), strict=True)]
     for cloud in clouds:
         cloud.estimate_normals()
-    return _registered(clouds, unit, _FROM_ROUGH, is_planar=False)
+    return _registered(clouds, unit, is_planar=False)
 
 
-def multiway_clouds(
-    clouds: Sequence[Float[NDArray[np.floating], "_n 3"]],
-    T_world_cloud: Float[NDArray[np.float64], "n 4 4"],
-) -> Float[NDArray[np.float64], "n 4 4"]:
-    """Polishes the poses of lidar clouds by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
-
-    Args:
-        clouds: points of n clouds in order of time, each in the frame of its lidar.
-        T_world_cloud: where they start.
-
-    Returns:
-        T_world_cloud; the first one stays.
-    """
-    unit = float(np.median([np.percentile(np.linalg.norm(points, axis=1), 90) for points in clouds]))
-    thinned = [_cloud(points).voxel_down_sample(_VOXEL_SHARE * unit) for points in clouds]
-    for cloud in thinned:
-        cloud.estimate_normals()
-    T_first_cloud = rigid.inverse(T_world_cloud[0]) @ T_world_cloud
-    return T_world_cloud[0] @ _registered(thinned, unit, _FROM_GOOD, is_planar=False, start=T_first_cloud)
-
-
-def _registered(
-    clouds: list[Any], unit: float, shares: tuple[float, float], *, is_planar: bool, start: Floats | None = None
-) -> Floats:
+def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> Floats:
     """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes.
 
-    Without a start, each cloud is matched from where the one before is.
+    Each cloud is matched from where the one before is.
     """
     import open3d
 
-    coarse, fine = (share * unit for share in shares)
+    coarse, fine = _COARSE * unit, _FINE * unit
     registration = open3d.pipelines.registration
     estimation = registration.TransformationEstimationPointToPlane()
     if is_planar:  # planes of flat clouds leave three directions open
@@ -261,12 +235,11 @@ def _registered(
     T_world = [np.eye(4)]
     graph.nodes.append(_node(T_world[0]))
     for scan in range(1, len(clouds)):
-        guess = np.eye(4) if start is None else rigid.inverse(start[scan]) @ start[scan - 1]
-        graph.edges.append(_edge(clouds, (scan - 1, scan), guess, (coarse, fine), estimation, is_doubtful=False))
+        graph.edges.append(_edge(clouds, (scan - 1, scan), np.eye(4), (coarse, fine), estimation, is_doubtful=False))
         # An edge maps its source, the earlier scan, into the later one.
         T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
         graph.nodes.append(_node(T_world[-1]))
-    placed = np.stack(T_world) if start is None else start
+    placed = np.stack(T_world)
     apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
     for source, target in np.argwhere(np.triu(apart < _RADIUS * unit, k=2)).tolist():
         guess = rigid.inverse(placed[target]) @ placed[source]
