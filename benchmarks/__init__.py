@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 import jax
 
-from dpmjax.cli import environment, peak_rss_gb
+from dpmjax.cli import environment
 
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data"))
 """Folder of recorded data; without it the cases that need them are left out."""
@@ -72,7 +72,8 @@ def in_new_process(function: Callable[..., Any], *arguments: object, **environme
 def run_benchmark(name: str, quick: bool) -> tuple[list[Row], dict[str, Any]]:
     """Returns the rows of a benchmark, with the peak memory of this process, and the machine."""
     rows = importlib.import_module(f"benchmarks.{name}").run(quick)
-    return [*rows, Row("whole process", "peak memory", peak_rss_gb(), "GB")], environment()
+    machine = environment()
+    return [*rows, Row("whole process", "peak memory", machine.pop("peak_rss_gb"), "GB")], machine
 
 
 class Timing(NamedTuple):

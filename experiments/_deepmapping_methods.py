@@ -20,6 +20,7 @@ from dpmjax import ScanSet, cli, registration2d
 from dpmjax import deepmapping as dm
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
+from experiments._baselines import multiway, optimize_directly, swarm_chain
 
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
@@ -52,6 +53,11 @@ class Task:
     def scans(self) -> ScanSet:
         """Returns the scans without their names and reference."""
         return ScanSet(self.sequence.points, self.sequence.mask)
+
+    @property
+    def key(self) -> jax.Array:
+        """Returns the key of everything random."""
+        return jax.random.key(self.seed)
 
 
 def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | None = None, seed: int = 0) -> Task:
@@ -95,8 +101,8 @@ def _fit(task: Task, start: Floats | None, config: dm.DeepMappingConfig | None =
     """Returns poses by DeepMapping from a start, or from zero poses."""
     settings = config or dm.preset("fast")
     settings = settings if task.steps is None else dm.with_steps(settings, task.steps)
-    key = jax.random.key(task.seed)
-    return registration2d.fit_in_order(task.scans, settings, key=key, start=start, is_ordered=task.is_ordered).poses
+    ordered = task.is_ordered
+    return registration2d.fit_in_order(task.scans, settings, key=task.key, start=start, is_ordered=ordered).poses
 
 
 def _refined_icp(task: Task) -> Candidates:
@@ -105,11 +111,8 @@ def _refined_icp(task: Task) -> Candidates:
 
 def _direct_lbfgs(task: Task) -> Floats:
     """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
-    from experiments._baselines import optimize_directly
-
     num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
-    key = jax.random.key(task.seed)
-    return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=key)
+    return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=task.key)
 
 
 def _lnet_from_icp(task: Task) -> Candidates:
@@ -126,18 +129,6 @@ def _direct(task: Task, *, has_windows: bool) -> Floats:
         phases = tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases)
         config = replace(config, cold_phases=phases)
     return _fit(task, None, config)
-
-
-def _multiway(task: Task) -> Floats:
-    from experiments._baselines import multiway
-
-    return multiway(task.scans)
-
-
-def _swarm(task: Task) -> Floats:
-    from experiments._baselines import swarm_chain
-
-    return swarm_chain(task.scans, key=jax.random.key(task.seed))
 
 
 def _global_deepmapping(task: Task) -> Candidates:
@@ -194,8 +185,10 @@ METHODS: dict[str, Method] = {
     "icp-point": Method(START_NAMES["icp-point"], partial(incremental, metric="point")),
     "icp-plane": Method(START_NAMES["icp-plane"], incremental),
     "icp-refined": Method("incremental ICP, refined", _refined_icp),
-    "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
-    "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
+    "multiway": Method("multiway registration of Open3D", lambda task: multiway(task.scans), "open3d"),
+    "particle-swarm": Method(
+        "particle swarms, each scan onto the one before", lambda task: swarm_chain(task.scans, key=task.key), "evosax"
+    ),
     "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),
     "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
     "search": Method(START_NAMES["global"], search),

@@ -32,13 +32,11 @@ ELEMENTS = (256, 512, 768, 1024)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class Config(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="scenes|PATH ...")] = ("scenes",)
     """Folders of scans with poses, or simulated scenes."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     pairs: Annotated[int, arg(metavar="N")] = 20
     """Pairs for each distance."""
 

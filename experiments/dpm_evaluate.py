@@ -72,8 +72,6 @@ class Config(cli.DriveOptions):
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     slam: FlagCreatePairsOff[bool] = False
     """Compare SLAM on whole drives instead of registrations of pairs."""
     pairs: Annotated[int, arg(metavar="N")] = 30

@@ -15,8 +15,6 @@ of each drive, and table.md a row a drive. A file of poses (TUM, KITTI) stands f
 
 from __future__ import annotations
 
-import collections
-import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,10 +27,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from dpmjax import cli, load_model, metrics, viz, write_g2o
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from dpmjax.slam import AgentsResult, Loop, SlamMethods, as_pose_graph, join_agents, make_methods, take_component
+from dpmjax.slam import AgentsResult, SlamMethods, as_pose_graph, join_agents, make_methods, take_component
 
 EXPERIMENT = "dpm_multiagent"
-LOOP_COLUMNS = ("kind", "agent", "scan", "other_agent", "other_scan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +46,6 @@ class Config(cli.DriveOptions):
     """Number of parts that one drive is cut into."""
     overlap: Annotated[float, arg(metavar="SHARE")] = 0.05
     """By this share of its length a part is longer at each end."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -160,27 +155,26 @@ def write_agents(
             cli.write_map_file(folder / f"map_{component + 1}.npz", slam_map)
     if len(result.joined.slam_map):
         write_g2o(folder / "graph.g2o", as_pose_graph(result.joined.slam_map))
-    cli.write_table(folder / "loops.csv", (*LOOP_COLUMNS, *cli.LOOP_CELLS), loop_rows(result))
+    columns = ("kind", "agent", "scan", "other_agent", "other_scan", *cli.LOOP_CELLS)
+    cli.write_table(folder / "loops.csv", columns, loop_rows(result))
     return sizes
 
 
 def loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
     """Returns candidates within agents, then those between them, by agents counted from 1 and their scans."""
-
-    def row(kind: str, loop: Loop, ends: Sequence[tuple[int, int]]) -> dict[str, Any]:
-        cells = (kind, *ends[loop.source], *ends[loop.target])
-        return dict(zip(LOOP_COLUMNS, cells, strict=True)) | cli.loop_cells(loop)
-
-    ends = [[(number, int(scan)) for scan in agent.keyframes] for number, agent in enumerate(result.agents, start=1)]
-    within = [row("within", loop, own) for own, agent in zip(ends, result.agents, strict=True) for loop in agent.loops]
-    joined = list(itertools.chain(*ends))
-    return within + [row("between", loop, joined) for loop in result.joined.loops]
+    joined: list[dict[str, int]] = []
+    within: list[dict[str, Any]] = []
+    for number, agent in enumerate(result.agents, start=1):
+        ends = [{"agent": number, "scan": int(scan)} for scan in agent.keyframes]
+        within += cli.loop_rows(agent.loops, ends)
+        joined += ends
+    kinds = {"within": within, "between": cli.loop_rows(result.joined.loops, joined)}
+    return [{"kind": kind, **row} for kind, rows in kinds.items() for row in rows]
 
 
 def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> dict[str, Any]:
     """Returns what `metrics.json` says: errors of each component in its one frame, of each agent, and bytes."""
     references = [sequence.T_world_lidar for sequence in sequences]
-    accepted = [loop for loop in result.joined.loops if loop.status == "accepted"]
     agents = [
         {
             "agent": number,
@@ -188,7 +182,7 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
             "component": result.component[number - 1] + 1,
             "num_scans": len(T_world_scan),
             "num_keyframes": len(agent.keyframes),
-            "num_loops": sum(loop.status == "accepted" for loop in agent.loops),
+            "num_loops": len(cli.accepted_ends(agent.loops)),
             **cli.trajectory_errors(T_world_scan, reference),
             **cli.trajectory_errors(agent.T_world_scan, reference, "_alone"),
             **traffic._asdict(),
@@ -208,34 +202,24 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
     return {
         "num_agents": len(agents),
         "num_components": len(components),
-        "num_loops_between": len(accepted),
-        "num_wrong_loops_between": num_wrong(result, accepted, references),
-        "meetings": meetings(result, accepted),
+        "num_loops_between": len(cli.accepted_ends(result.joined.loops)),
+        "num_wrong_loops_between": num_wrong(result, references),
+        "meetings": [{"agents": pair, "num_loops": num} for pair, num in cli.count_meetings(result.joined)],
         "ate_m": components[0]["ate_m"] if len(components) == 1 else None,
         "components": components,
         "agents": agents,
     }
 
 
-def meetings(result: AgentsResult, accepted: Sequence[Loop]) -> list[dict[str, Any]]:
-    """Returns which two agents have met, and by how many loops."""
-    agent_of = result.joined.map_of_keyframe
-    met = collections.Counter(tuple(sorted(int(agent_of[row]) + 1 for row in loop[:2])) for loop in accepted)
-    return [{"agents": list(pair), "num_loops": number} for pair, number in sorted(met.items())]
-
-
-def num_wrong(result: AgentsResult, accepted: Sequence[Loop], references: Sequence[np.ndarray | None]) -> int | None:
+def num_wrong(result: AgentsResult, references: Sequence[np.ndarray | None]) -> int | None:
     """Returns how many loops between agents are wrong beyond 2 m or 5 degrees; None without a reference for each."""
-    known = [
-        reference[agent.keyframes]
-        for agent, reference in zip(result.agents, references, strict=True)
-        if reference is not None
-    ]
+    known = [reference for reference in references if reference is not None]
     if len(known) < len(references):
         return None
-    T = np.concatenate(known)
-    source, target = (np.array([loop[end] for loop in accepted], int) for end in (0, 1))
-    found = np.reshape([loop.T_target_source for loop in accepted], (-1, 4, 4))
+    T = np.concatenate([reference[agent.keyframes] for reference, agent in zip(known, result.agents, strict=True)])
+    source, target = cli.accepted_ends(result.joined.loops).T
+    accepted = [loop.T_target_source for loop in result.joined.loops if loop.status == "accepted"]
+    found = np.reshape(accepted, (-1, 4, 4))
     return int((~metrics.registration_recall(found, rigid.inverse(T[target]) @ T[source]).is_right).sum())
 
 
@@ -249,11 +233,18 @@ def members_of(result: AgentsResult) -> list[list[int]]:
 
 def joint_ate_m(result: AgentsResult, references: Sequence[np.ndarray | None], members: Sequence[int]) -> float | None:
     """Returns the ATE of agents in their one frame; None without a reference for each, or from different drives."""
-    known = [(result.T_world_scan[number], references[number]) for number in members]
-    pairs = [(found[:, :3, 3], reference[:, :3, 3]) for found, reference in known if reference is not None]
-    if len(pairs) < len(known) or sum(len(found) for found, _ in pairs) < 2:
+    pairs = _positions(result, references, members)
+    return None if pairs is None or len(pairs[0]) < 2 else metrics.absolute_trajectory_error(*pairs)
+
+
+def _positions(
+    result: AgentsResult, references: Sequence[np.ndarray | None], members: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns (n, 3) positions of agents and of their references, metres; None without a reference for each."""
+    known = [reference[:, :3, 3] for number in members if (reference := references[number]) is not None]
+    if len(known) < len(members):
         return None
-    return metrics.absolute_trajectory_error(*(np.concatenate(side) for side in zip(*pairs, strict=True)))
+    return np.concatenate([result.T_world_scan[number][:, :3, 3] for number in members]), np.concatenate(known)
 
 
 def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> list[viz.AgentPanel]:
@@ -261,18 +252,17 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
     panels = []
     map_of_row, T_keyframe = result.joined.map_of_keyframe, result.joined.slam_map.T_world_keyframe
     for members in members_of(result):
-        alignment = _alignment(result, sequences, members)
+        pairs = _positions(result, [sequence.T_world_lidar for sequence in sequences], members)
+        T_shown_reference = None if pairs is None else metrics.align_rigid(*reversed(pairs))
         tracks = []
         for number in members:
-            agent, sequence, T = result.agents[number], sequences[number], result.T_world_scan[number]
-            reference = None
-            if alignment is not None and sequence.T_world_lidar is not None:
-                reference = sequence.T_world_lidar[:, :3, 3] @ alignment[:3, :3].T + alignment[:3, 3]
-            scans = agent.keyframes
+            scans, sequence, T = result.agents[number].keyframes, sequences[number], result.T_world_scan[number]
             cloud = cli.gather_map(T[scans], lambda row, read=sequence.read_points, scans=scans: read(int(scans[row])))
-            label = f"agent {number + 1}, {len(T)} scans"
-            color = viz.COLORS[number % len(viz.COLORS)]
-            tracks.append(viz.AgentTrack(label, color, T[:, :3, 3], reference, cloud.points, cloud.heights_m))
+            track = cli.map_track(f"agent {number + 1}, {len(T)} scans", number, T, cloud)
+            if T_shown_reference is not None and sequence.T_world_lidar is not None:
+                R, t = T_shown_reference[:3, :3], T_shown_reference[:3, 3]
+                track = track._replace(reference=sequence.T_world_lidar[:, :3, 3] @ R.T + t)
+            tracks.append(track)
         # Rows lie in the frame of the map, trajectories begin at their own origin.
         T_shown_map = _shown_frame(result, members)
         ends = cli.accepted_ends(result.joined.loops)
@@ -282,16 +272,6 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
         title = drives + (", in one frame" if len(members) > 1 else ", in a frame of its own")
         panels.append(viz.AgentPanel(title, tracks, loops))
     return panels
-
-
-def _alignment(result: AgentsResult, sequences: Sequence[LidarSequence], members: Sequence[int]) -> np.ndarray | None:
-    """Returns the motion that brings the references of agents to their trajectories; None where one has none."""
-    references = [sequences[number].T_world_lidar for number in members]
-    known = [reference[:, :3, 3] for reference in references if reference is not None]
-    if len(known) < len(references):
-        return None
-    found = np.concatenate([result.T_world_scan[number][:, :3, 3] for number in members])
-    return np.asarray(metrics.align_rigid(np.concatenate(known), found))
 
 
 def _shown_frame(result: AgentsResult, members: Sequence[int]) -> np.ndarray:

@@ -52,8 +52,6 @@ class Config(cli.DriveOptions):
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")]
     """Folders of scans with poses, or files of poses."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
 
 
 def main(config: Config) -> list[cli.Row]:

@@ -72,7 +72,6 @@ def main(config: Config) -> dict[str, Any]:
             "share_at_global_minimum": {name: share_at_minimum(x) for name, x in ends.items()},
             "variants": variants,
             "seconds": measure_seconds(paper, config),
-            "peak_rss_gb": cli.peak_rss_gb(),
         }
         cli.write_metrics(folder, metrics, seed=config.seed)
         x = np.linspace(-VIEW, VIEW, 2401)

@@ -28,7 +28,7 @@ from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import Source, find_sources
 from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, markdown, run_table
-from dpmjax.cli.run_folder import RunFolder, RunOptions
+from dpmjax.cli.run_folder import ModelOptions, RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 
 NAME = "evaluate"
@@ -47,13 +47,11 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(ModelOptions, RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, or simulated towns."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     pairs: Annotated[int, arg(metavar="N")] = 15
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N")] = 1

@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,23 +33,21 @@ from tyro.conf import Positional, arg
 from dpmjax import deepmapping, io, registration2d, simulation
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
-from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.map2d_files import draw_map, draw_occupancy, registered_scans, scan_set_of, write_trajectories
-from dpmjax.cli.map2d_numbers import (
+from dpmjax.cli.map2d_results import (
     ate_of,
     before_and_after,
     corrected_numbers,
+    draw_map,
+    draw_occupancy,
     planar_errors,
+    registered_scans,
     relation_numbers,
     report,
+    scan_set_of,
 )
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.run_folder import (
-    RunOptions,
-    open_run_folder,
-    recording,
-    write_metrics,
-)
+from dpmjax.cli.result_files import write_poses
+from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fit
@@ -69,7 +67,6 @@ class Config(RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
-    old_names: ClassVar[Mapping[str, str]] = {"--polish": "--refine", "--no-polish": "--no-refine"}
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Without it: the built-in world."""
@@ -83,19 +80,17 @@ class Config(RunOptions):
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
-    """Also align all scans together, point to line, from the start and from the fit (--polish is the same)."""
+    """Also align all scans together, point to line, from the start and from the fit."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Stop after N steps; without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S")] = None
     """Stop the fit after S seconds of run time, compile time not counted."""
-    start: Annotated[int, arg(metavar="N")] = 0
-    """First scan to use."""
     relations: Annotated[Path | None, arg(metavar="FILE")] = None
     """Hand-checked relations of a log, to measure the result by."""
     corrected: Annotated[Path | None, arg(metavar="LOG")] = None
     """A log of the same drive with corrected poses, to measure the result by at scans of the same time."""
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use N scans; without it, all."""
+    """Use the first N scans, after --jump; without it, all."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
     """Use every Nth scan."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
@@ -106,7 +101,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=1, n_scans=1, jump=1, start=0, range_noise_px=0)
+        check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
         if self.seconds is not None and not self.seconds > 0.0:
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
         if not self.ordered and self.init != "global":
@@ -129,14 +124,11 @@ def main(config: Config) -> dict[str, Any]:
         metrics = {
             **map_numbers(sequence, result, config, measure),
             **notes,
-            "fit_s": recorder.run_s,
-            "compile_s": recorder.compile_s,
-            "steps": recorder.steps,
-            "peak_rss_gb": peak_rss_gb(),
+            **recorder.numbers,
             "is_interrupted": stop.is_requested,
         }
         # Numbers first, so that they are written even if a picture fails.
-        write_trajectories(folder, sequence, result.poses)
+        write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         registered = registered_scans(sequence, result)
         limits = draw_map(folder, registered, result, metrics)
@@ -239,14 +231,15 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
 
 
 def read_scans(config: Config) -> ScanSequence:
-    """Returns the scans of DATA or of the built-in world, sub-range and stride applied."""
-    stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
+    """Returns the chosen scans of DATA or of the built-in world."""
+    stop = None if config.n_scans is None else config.n_scans * config.jump
+    chosen = slice(None, stop, config.jump)
     if config.data is not None:
-        return io.read_sequence(config.data, selection=slice(config.start, stop, config.jump), topic=config.topic)
+        return io.read_sequence(config.data, selection=chosen, topic=config.topic)
     sequence = simulation.simulate_sequence(
         config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )
-    return sequence.take(slice(config.start, stop, config.jump))
+    return sequence.take(chosen)
 
 
 def starting_poses(config: Config, sequence: ScanSequence) -> Any:

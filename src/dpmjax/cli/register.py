@@ -22,7 +22,7 @@ from tyro.conf import Positional, arg
 from dpmjax import deeppointmap, io, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import report_notes
-from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import ModelOptions, OutputOptions, RunFolder, open_run_folder, recording, write_metrics
 
 NAME = "register"
 # Least calibrated probability of a certain motion.
@@ -31,15 +31,13 @@ SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OutputOptions):
+class Config(ModelOptions, OutputOptions):
     """Options of the run."""
 
     source: Annotated[Positional[Path], arg(metavar="A")]
     """Scan whose points are moved."""
     target: Annotated[Positional[Path], arg(metavar="B")]
     """Scan in whose frame they end."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     columns: Annotated[int | None, arg(metavar="N")] = None
     """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     refine: bool = True

@@ -31,7 +31,7 @@ from dpmjax.cli import slam_files as files
 from dpmjax.cli import slam_numbers as numbers
 from dpmjax.cli.command import StopFlag, progress_bar
 from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, report_notes
-from dpmjax.cli.machine import peak_rss_gb, require_importable
+from dpmjax.cli.info import require_importable
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
 from dpmjax.sequences import InputError, LidarSequence
 
@@ -49,8 +49,6 @@ class Config(DriveOptions):
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
     preset: Literal["default", "paper"] = "default"
@@ -97,7 +95,7 @@ def main(config: Config) -> dict[str, Any]:
         metrics = write_results(folder, config, drive, run, result)
         if config.refine and run.failure is None and not stop.is_requested:
             metrics |= refine_trajectory(folder, config, drive, result, lambda: stop.is_requested)
-        metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
+        metrics["is_interrupted"] = stop.is_requested or run.failure is not None
         metrics |= {**notes, "status": numbers.run_status(metrics), "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
         tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
