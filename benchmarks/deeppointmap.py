@@ -22,18 +22,8 @@ from numpy.typing import NDArray
 
 import dpmjax
 from benchmarks import DATA, Row, in_new_process, measure
+from dpmjax import deeppointmap as dpm
 from dpmjax.cli import peak_rss_gb
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    SampleMaker,
-    ScanStore,
-    init_training,
-    make_step,
-    merge_clouds,
-    prepare_drive,
-    pyramid_of_cloud,
-    training_preset,
-)
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
@@ -71,10 +61,10 @@ def time_encoding(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     rows = []
     for name, points in read_scans(folder).items():
         cloud = preprocess_scan_on_host(points, None, model.config.preprocess)
-        pyramid = pyramid_of_cloud(cloud, model.config)
+        pyramid = dpm.pyramid_of_cloud(cloud, model.config)
         parts: dict[str, Callable[[], object]] = {
             "preprocess": partial(preprocess_scan_on_host, points, None, model.config.preprocess),
-            "pyramid": partial(pyramid_of_cloud, cloud, model.config),
+            "pyramid": partial(dpm.pyramid_of_cloud, cloud, model.config),
             "network": partial(dpmjax.encode_pyramid, model, pyramid),
             "preprocess + encode": partial(dpmjax.encode, model, points),
         }
@@ -117,18 +107,18 @@ def time_overlap(folder: Path, quick: bool, *, preset: str) -> list[Row]:
 
 def time_training(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     """Returns times of a training step on pairs of scans, as the curriculum begins, and the scans a second."""
-    settings = training_preset(preset)
+    settings = dpm.training_preset(preset)
     num_scans = 4 if quick else settings.sampling.num_scans
     sampling = replace(settings.sampling, num_scans=num_scans)
-    settings = replace(settings, curriculum=(CurriculumStage(2, 1),), sampling=sampling, num_variants=1)
+    settings = replace(settings, curriculum=(dpm.CurriculumStage(2, 1),), sampling=sampling, num_variants=1)
     points = read_scans(folder)["town"]
     T_world_lidar = np.tile(np.eye(4), (num_scans, 1, 1))
     T_world_lidar[:, 0, 3] = np.linspace(0, 10, num_scans)
     drive = LidarSequence("town", ("town",) * num_scans, lambda _: points, T_world_lidar)
-    with SampleMaker(ScanStore([prepare_drive(drive, settings)]), settings, seed=0) as maker:
+    with dpm.SampleMaker(dpm.ScanStore([dpm.prepare_drive(drive, settings)]), settings, seed=0) as maker:
         batch = maker(0)
-    step = make_step(settings)
-    state = init_training(jax.random.key(0), settings)
+    step = dpm.make_step(settings)
+    state = dpm.init_training(jax.random.key(0), settings)
     timing = measure(step, state, batch, repeats=3 if quick else 12)
     case = f"{preset}, K = 2, {num_scans} scans: training step"
     return [*timing.rows(case), Row(case, "speed", num_scans / timing.median_s, "scans/s")]
@@ -144,7 +134,7 @@ def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     jax.block_until_ready(
         (
             dpmjax.register(model, cloud, scan),
-            dpmjax.register(model, cloud, merge_clouds(stacked, poses)),
+            dpmjax.register(model, cloud, dpm.merge_clouds(stacked, poses)),
             dpmjax.overlap(model, cloud, cloud),
         )
     )

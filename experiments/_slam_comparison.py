@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,21 +52,6 @@ SIZES = {
 LOCALIZATION = "localization, "
 
 
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Rows that are made of each drive.
-
-    Attributes:
-        weights: name of a shipped model, or a file.
-        seed: of the refinement and of the scans that are looked for.
-        num_localized: number of scans that are looked for in the map of the first half; 0 for no such row.
-    """
-
-    weights: str
-    seed: int
-    num_localized: int
-
-
 def open_drives(
     paths: Sequence[str], options: cli.DriveOptions, towns: Mapping[int, float] | None = None
 ) -> list[LidarSequence]:
@@ -108,23 +92,30 @@ def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
 
 
 def compare(
-    config: cli.RunOptions, experiment: str, comparison: Comparison, sequences: Sequence[LidarSequence]
+    config: cli.DriveOptions, experiment: str, sequences: Sequence[LidarSequence], num_localized: int
 ) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
-    methods = make_methods(load_model(comparison.weights), weights=comparison.weights)
+    methods = make_methods(load_model(config.weights), weights=config.weights)
     missing = {name: reason for name in PEERS if (reason := why_missing(name)) is not None}
     by_name = {sequence.name: sequence for sequence in sequences}
 
     def work(run: cli.TableRun, sequence: str, method: str) -> cli.Row:
         drive = evaluation.open_folder(run.folder, by_name[sequence], run.is_stopped)
-        if method != ODOMETRY:
-            return evaluate(comparison, drive, methods, method)
+        if method in PEERS:
+            return evaluation.evaluate_peer(drive, method)
+        if method.startswith(LOCALIZATION):
+            precision = next(name for name in PRECISIONS if method.endswith(name))
+            return evaluate_localization(drive, methods, precision, num_localized, config.seed)
+        if method == NETWORK:
+            return evaluation.evaluate_network(drive, methods)
         case, ours = {"sequence": sequence, "method": OURS}, partial(evaluation.evaluate_ours, drive, methods)
-        return evaluation.odometry_row(drive, cli.do_row(run.folder.path, case, ours, seed=comparison.seed))
+        if method == OURS:
+            return ours()
+        return evaluation.odometry_row(drive, cli.do_row(run.folder.path, case, ours, seed=config.seed))
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         notes = (f"{name} was not run: {why}." for name, why in missing.items())
-        numbers = {"weights": comparison.weights, "peers_left_out": missing}
+        numbers = {"weights": config.weights, "peers_left_out": missing}
         draw_rows = partial(draw, sequences=sequences, rows=rows)
         return cli.Summary(numbers, "\n\n".join([tables(rows), *notes]), draw_rows)
 
@@ -135,19 +126,9 @@ def compare(
         {"sequence": sequence.name, "method": f"{LOCALIZATION}{precision}"}
         for sequence in sequences
         for precision in PRECISIONS
-        if comparison.num_localized and sequence.T_world_lidar is not None
+        if num_localized and sequence.T_world_lidar is not None
     ]
     return cli.run_table(config, experiment, cases, work, report)
-
-
-def evaluate(comparison: Comparison, drive: Drive, methods: SlamMethods, method: str) -> cli.Row:
-    """Returns the row of a drive and a method."""
-    if method in PEERS:
-        return evaluation.evaluate_peer(drive, method)
-    if method.startswith(LOCALIZATION):
-        precision = next(name for name in PRECISIONS if method.endswith(name))
-        return evaluate_localization(drive, methods, precision, comparison.num_localized, comparison.seed)
-    return (evaluation.evaluate_ours if method == OURS else evaluation.evaluate_network)(drive, methods)
 
 
 def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precision, num: int, seed: int) -> cli.Row:

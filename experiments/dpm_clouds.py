@@ -114,14 +114,7 @@ def first_elements(cloud: DescriptorCloud, num: int | None) -> DescriptorCloud:
     """Returns the cloud with its first elements; None leaves the descriptors without elements."""
     if num is None:
         return cloud.described
-    assert cloud.normals is not None
-    assert cloud.planarity is not None
-    return cloud.replace(
-        positions=cloud.positions[:num],
-        mask=cloud.mask[:num],
-        normals=cloud.normals[:num],
-        planarity=cloud.planarity[:num],
-    )
+    return cloud.replace(**{name: getattr(cloud, name)[:num] for name in ("positions", "mask", "normals", "planarity")})
 
 
 def table(rows: Sequence[cli.Row], stages: Sequence[str]) -> str:

@@ -36,14 +36,7 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, load_model, registration_recall
-from dpmjax.deeppointmap import (
-    VerificationConfig,
-    choose_motion,
-    draw_scan_pairs,
-    measure_scan,
-    read_scan_pairs,
-    refine_motion,
-)
+from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import mcnemar_p_value, wilson_interval
 
@@ -106,11 +99,10 @@ def evaluate_slam(config: Config) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
     from experiments import _slam_comparison as comparison
 
-    compared = comparison.Comparison(weights=config.weights, seed=config.seed, num_localized=config.localize)
     seeds = range(cli.FIRST_TOWN, cli.FIRST_TOWN + config.num_towns)
     lengths_m = np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist()
     drives = comparison.open_drives(config.paths, config, dict(zip(seeds, lengths_m, strict=True)))
-    return comparison.compare(config, EXPERIMENT, compared, drives)
+    return comparison.compare(config, EXPERIMENT, drives, config.localize)
 
 
 def evaluate_pairs(config: Config) -> list[cli.Row]:
@@ -164,11 +156,11 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return T
 
 
-def search_alone(source: np.ndarray, target: np.ndarray, config: VerificationConfig) -> np.ndarray:
+def search_alone(source: np.ndarray, target: np.ndarray, config: dpm.VerificationConfig) -> np.ndarray:
     """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
-    measured = measure_scan(source, config), measure_scan(target, config)
-    chosen = choose_motion(*measured, np.eye(4)[None], config)
-    return refine_motion(*measured, chosen, config).T_target_source
+    measured = dpm.measure_scan(source, config), dpm.measure_scan(target, config)
+    chosen = dpm.choose_motion(*measured, np.eye(4)[None], config)
+    return dpm.refine_motion(*measured, chosen, config).T_target_source
 
 
 def evaluate_matcher(
@@ -176,7 +168,7 @@ def evaluate_matcher(
 ) -> cli.Row:
     """Returns errors and seconds of another matcher on the same pairs."""
     motions, seconds, true = [], [], []
-    for pair in read_scan_pairs(drive, draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
+    for pair in dpm.read_scan_pairs(drive, dpm.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
         started = time.perf_counter()
         motions.append(matcher(pair.source, pair.target))
         seconds.append(time.perf_counter() - started)

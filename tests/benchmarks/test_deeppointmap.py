@@ -28,7 +28,7 @@ from tests.deeppointmap import toy
 def folder(tmp_path, monkeypatch):
     """Two scans of a ring of posts, for a toy model."""
     monkeypatch.setattr(deeppointmap.dpmjax, "model_preset", lambda name: toy.MODEL)
-    monkeypatch.setattr(deeppointmap, "training_preset", lambda name: toy.TRAINING)
+    monkeypatch.setattr(deeppointmap.dpm, "training_preset", lambda name: toy.TRAINING)
     angles = np.linspace(0, 2 * np.pi, 400)
     for name, radius in (("town", 20.0), ("KITTI", 30.0)):
         heights = np.tile(np.linspace(0, 3, 8), 50)

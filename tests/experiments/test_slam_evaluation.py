@@ -119,7 +119,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
     assert f"| toy 1 | {NUM_SCANS}, 10 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
-    monkeypatch.setattr(_slam_evaluation, "map_drive", None)
+    monkeypatch.setattr("dpmjax.cli.map_drive", None)
     monkeypatch.setattr(SteadyPeer, "step", None)
     assert run("--resume", "-o", out) == EXIT_OK
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]

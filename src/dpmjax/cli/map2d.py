@@ -31,20 +31,9 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration2d, simulation
+from dpmjax.cli import map2d_results as results
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
-from dpmjax.cli.map2d_results import (
-    ate_of,
-    before_and_after,
-    corrected_numbers,
-    draw_map,
-    draw_occupancy,
-    planar_errors,
-    registered_scans,
-    relation_numbers,
-    report,
-    scan_set_of,
-)
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
 from dpmjax.cli.result_files import write_poses
 from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
@@ -130,14 +119,14 @@ def main(config: Config) -> dict[str, Any]:
         # Numbers first, so that they are written even if a picture fails.
         write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
-        registered = registered_scans(sequence, result)
-        limits = draw_map(folder, registered, result, metrics)
+        registered = results.registered_scans(sequence, result)
+        limits = results.draw_map(folder, registered, result, metrics)
         if recorder.has_map:
-            draw_occupancy(folder, registered, result, limits)
+            results.draw_occupancy(folder, registered, result, limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
-        summary = report(sequence.unit, metrics)
+        summary = results.report(sequence.unit, metrics)
         LOGGER.info(summary)
         print(summary, f"results in {folder.path}", sep="\n")
     return metrics
@@ -159,10 +148,10 @@ def register_sequence(
         if len(rows) < len(sequence):
             print(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
-        return partial(recorder, measure=ate_of(fitted, typical_range(fitted.points, fitted.mask)))
+        return partial(recorder, measure=results.ate_of(fitted, typical_range(fitted.points, fitted.mask)))
 
     return registration2d.register_scans(
-        scan_set_of(sequence),
+        results.scan_set_of(sequence),
         registration_settings(config, sequence),
         key=jax.random.key(config.seed),
         start=start,
@@ -178,7 +167,7 @@ def map_numbers(
     measure: Callable[[Floats, str], dict[str, float]],
 ) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
-    registered = registered_scans(sequence, result)
+    registered = results.registered_scans(sequence, result)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
 
     def title(name: str) -> str:
@@ -187,13 +176,13 @@ def map_numbers(
     return {
         "num_scans": len(sequence),
         "num_registered": len(registered),
-        **before_and_after(registered, start, kept),
+        **results.before_and_after(registered, start, kept),
         **measure(result.recording.between(start), "_initial"),
         **measure(result.poses, ""),
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
-            title(name): planar_errors(registered, candidate.poses) | candidate.score._asdict()
+            title(name): results.planar_errors(registered, candidate.poses) | candidate.score._asdict()
             for name, candidate in result.candidates.items()
         },
         "assessment": result.assessment._asdict(),
@@ -222,8 +211,8 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
         raise ValueError(f"{sequence.name}: its scans have no times, which relations and a corrected log need")
 
     def measure(poses: Floats, suffix: str) -> dict[str, float]:
-        by_relations = {} if relations is None else relation_numbers(times, poses, relations, suffix)
-        return by_relations | ({} if corrected is None else corrected_numbers(times, poses, corrected, suffix))
+        by_relations = {} if relations is None else results.relation_numbers(times, poses, relations, suffix)
+        return by_relations | ({} if corrected is None else results.corrected_numbers(times, poses, corrected, suffix))
 
     # Files of another drive are refused before any long work.
     measure(np.zeros((len(sequence), 3)), "")

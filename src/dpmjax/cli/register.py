@@ -62,6 +62,8 @@ def main(config: Config) -> dict[str, Any]:
         clock = time.perf_counter()
         found = deeppointmap.register(model, source, target, refine=config.refine)
         T = np.asarray(found.T_target_source, np.float64)
+        names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
+        shares = {name: float(getattr(found.verification, name)) for name in names}
         metrics = {
             "source": config.source.name,
             "target": config.target.name,
@@ -70,7 +72,7 @@ def main(config: Config) -> dict[str, Any]:
             **motion_numbers(T),
             "confidence": float(found.confidence),
             "num_inliers": int(found.num_inliers),
-            **match_shares(found.verification),
+            **shares,
             "is_calibrated": model.config.calibration is not None,
             "register_s": time.perf_counter() - clock,
         }
@@ -95,12 +97,6 @@ def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
         "translation_m": float(np.linalg.norm(T_target_source[:3, 3])),
         "rotation_deg": float(np.degrees(angle)),
     }
-
-
-def match_shares(verification: Any) -> dict[str, float]:
-    """Returns the shares of points that the confidence is based on; empty without a verification."""
-    names = () if verification is None else ("visible_share", "matched_share", "contradicted_share")
-    return {name: float(getattr(verification, name)) for name in names}
 
 
 def write_motion(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:

@@ -26,7 +26,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import slam, weights
+from dpmjax import io, slam, viz, weights
 from dpmjax.cli import slam_files as files
 from dpmjax.cli import slam_numbers as numbers
 from dpmjax.cli.command import StopFlag, progress_bar
@@ -154,7 +154,7 @@ def write_results(
         metrics |= files.write_map_file(folder / "map.npz", slam_map)
     write_metrics(folder, metrics, seed=config.seed)  # numbers first, even if a picture fails
     cloud = files.gather_map(slam_map.T_world_keyframe, lambda row: drive.read_keyframe(slam_map, row))
-    files.write_map(folder / "map.ply", cloud)
+    io.write_ply(folder / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
     files.draw_pictures(folder.path, sequence, result, cloud, drive.num_keyframes_before)
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
 

@@ -170,11 +170,6 @@ def write_map_file(path: Path, slam_map: slam.KeyframeMap) -> dict[str, int]:
     return {"map_bytes": path.stat().st_size, "map_bytes_int8": len(saved_maps.map_bytes(slam_map, "int8"))}
 
 
-def write_map(path: Path, cloud: Cloud) -> None:
-    """Writes the thinned map, coloured by height."""
-    io.write_ply(path, cloud.points, colors=viz.height_colors(cloud.heights_m))
-
-
 def draw_pictures(
     folder: Path, sequence: LidarSequence, result: slam.SlamResult, cloud: Cloud, num_keyframes_before: int = 0
 ) -> None:
