@@ -1,10 +1,10 @@
 """Baselines of the DeepMapping paper that stand on other packages (extra `baselines`).
 
 L-BFGS by jaxopt on DeepMapping's loss without L-Net, and solvers of jaxopt on the toy. A chain of scans by particle
-swarms of evosax. Multiway registration by Open3D: pairs are registered by iterated closest points; neighbours in time
-are sure edges of a pose graph, all further pairs uncertain ones, and a line process removes wrong edges (Choi, Zhou and
-Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with the
-settings of `as_direct`.
+swarms of evosax. Multiway registration by Open3D, whose pairs are registered by iterated closest points. Neighbours in
+time are sure edges of a pose graph, and all further pairs uncertain ones. A line process removes wrong edges (Choi,
+Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with
+the settings of `as_direct`.
 """
 
 from __future__ import annotations

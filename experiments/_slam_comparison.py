@@ -73,8 +73,7 @@ def open_drives(
         if entry == TOWN and not Path(entry).exists():
             routes = enumerate((towns or {}).items())
             simulated = [cli.keep_scans(town_drive(seed, number, length_m)) for number, (seed, length_m) in routes]
-            rows = slice(None, None, options.jump)
-            drives += [drive.take(rows).take(slice(options.n_scans)) for drive in simulated]
+            drives += [drive.take(options.selection) for drive in simulated]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [cli.open_drive(Path(entry), options, name) for name in names]

@@ -26,7 +26,7 @@ from tyro.conf import Positional, arg
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
 from dpmjax.cli.result_files import write_poses
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import RunFolder, RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Registered
@@ -41,7 +41,7 @@ _LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(ScanOptions, RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
@@ -49,10 +49,6 @@ class Config(RunOptions):
     simulated apartment."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use the first N images, after --jump; without it, all."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth image."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -92,12 +88,11 @@ def read_images(config: Config) -> DepthSequence:
     """Returns the chosen images of DATA or of a simulated walk."""
     from dpmjax import io, simulation
 
-    stop = None if config.n_scans is None else config.n_scans * config.jump
     if config.data is None:
-        sequence = simulation.simulate_depth_sequence(0, stop or _NUM_SIMULATED, seed=config.seed)
+        sequence = simulation.simulate_depth_sequence(0, config.selection.stop or _NUM_SIMULATED, seed=config.seed)
     else:
         sequence = io.read_pose_folder(config.data)
-    chosen = sequence.take(slice(None, stop, config.jump))
+    chosen = sequence.take(config.selection)
     if len(chosen) < 2:
         raise ValueError(f"{sequence.name}: {len(chosen)} of {len(sequence)} images are chosen; choose two or more")
     return chosen

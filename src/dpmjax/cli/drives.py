@@ -18,7 +18,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
 from dpmjax.cli.command import check_least
-from dpmjax.cli.run_folder import RESULTS, ModelOptions, RunOptions
+from dpmjax.cli.run_folder import RESULTS, ModelOptions, RunOptions, ScanOptions
 from dpmjax.sequences import InputError, LidarSequence, Note
 
 LOGGER = logging.getLogger("dpmjax.drives")
@@ -33,7 +33,7 @@ TURN_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveOptions(ModelOptions, RunOptions):
+class DriveOptions(ScanOptions, ModelOptions, RunOptions):
     """Options of every command that reads the scans of whole drives."""
 
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
@@ -42,10 +42,6 @@ class DriveOptions(ModelOptions, RunOptions):
     """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use the first N scans, after --jump."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -79,7 +75,7 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
         drive = open_path(data, options.seed, sequence=sequence, bin_columns=options.columns, topic=options.topic)
     if options.kitti_angle_correction:
         drive = with_raised_beams(drive)
-    part = drive.take(np.arange(len(drive))[:: options.jump][: options.n_scans])
+    part = drive.take(options.selection)
     io.require_whole_files(part, bin_columns=options.columns)
     note = io.unit_note(part.read_points(0), part.sources[0])
     return part if note is None else replace(part, notes=(*part.notes, note))

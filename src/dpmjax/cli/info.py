@@ -1,8 +1,8 @@
-"""The machine of a run and what is installed on it: versions, device, memory, cores, weights, packages of the extras.
+"""Describes the machine of a run: versions, device, memory, cores, shipped weights, and optional packages.
 
     dpmjax info
 
-`dpmjax info` prints it; a bug report begins with that.
+A bug report begins with what this prints.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
 from dpmjax.cli.result_files import write_poses
-from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fit
@@ -52,7 +52,7 @@ _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(ScanOptions, RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
@@ -78,10 +78,6 @@ class Config(RunOptions):
     """Hand-checked relations of a log, to measure the result by."""
     corrected: Annotated[Path | None, arg(metavar="LOG")] = None
     """A log of the same drive with corrected poses, to measure the result by at scans of the same time."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use the first N scans, after --jump; without it, all."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
     """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
     crowd: an office in which people walk about."""
@@ -221,12 +217,11 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
 
 def read_scans(config: Config) -> ScanSequence:
     """Returns the chosen scans of DATA or of the built-in world."""
-    stop = None if config.n_scans is None else config.n_scans * config.jump
-    chosen = slice(None, stop, config.jump)
+    chosen = config.selection
     if config.data is not None:
         return io.read_sequence(config.data, selection=chosen, topic=config.topic)
     sequence = simulation.simulate_sequence(
-        config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
+        config.world, chosen.stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )
     return sequence.take(chosen)
 

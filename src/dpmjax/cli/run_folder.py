@@ -47,6 +47,21 @@ class OutputOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """Options of every command that reads scans or images in a row."""
+
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Use the first N scans, after --jump; without it, all."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
+
+    @property
+    def selection(self) -> slice:
+        """Returns the rows of the scans to use."""
+        return slice(None, None if self.n_scans is None else self.n_scans * self.jump, self.jump)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ModelOptions:
     """Options of every command that uses trained weights."""
 

@@ -67,7 +67,7 @@ def loop_rows(loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> 
 
     Args:
         loops: the candidates.
-        ends: cells of each keyframe, in the rows of the map; those of the other end get names with `other_`.
+        ends: cells of each keyframe, in the order of the rows of the map; names of the target begin with `other_`.
 
     Returns:
         The rows.
