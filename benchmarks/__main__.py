@@ -19,18 +19,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.rows import COLUMNS, Row, format_table, in_new_process, run_benchmark
+from benchmarks import COLUMNS, Row, format_table, in_new_process, run_benchmark
 
-BENCHMARKS = {
-    "core": ("core", "run"),
-    "deepmapping": ("deepmapping", "run"),
-    "deepmapping_zero": ("deepmapping", "run_from_zero"),
-    "deeppointmap": ("deeppointmap", "run"),
-    "pose_graph": ("pose_graph", "run"),
-    "slam": ("slam", "run"),
-    "toy": ("deepmapping", "run_toy"),
-}
-"""Module and function of each benchmark."""
+BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "slam")
+"""Modules, each with a function `run`."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +52,7 @@ def main(config: Config) -> int:
     for name in config.only or BENCHMARKS:
         print(f"running {name} ...", file=sys.stderr, flush=True)
         try:
-            rows, machine = in_new_process(run_benchmark, *BENCHMARKS[name], config.quick)
+            rows, machine = in_new_process(run_benchmark, name, config.quick)
         except Exception:
             traceback.print_exc()
             failed.append(name)

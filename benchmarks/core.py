@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
 
 import dpmjax
-from benchmarks.rows import Row, measure
+from benchmarks import Row, measure
 
 TEMPERATURE = 0.1
 
@@ -45,16 +46,15 @@ def cases(quick: bool) -> list[Case]:
     rng = np.random.default_rng(0)
     num_pairs, num_points, num_descriptors = (256, 1024, 256) if quick else (4096, 16384, 1024)
     source = rng.normal(size=(num_pairs, 3)).astype(np.float32)
-    target = (source @ rotation_about_z(0.3).T + [1.0, 2.0, 3.0] + 0.01 * rng.normal(size=source.shape)).astype(
-        np.float32
-    )
+    turned = Rotation.from_euler("z", 0.3).apply(source)
+    target = (turned + [1.0, 2.0, 3.0] + 0.01 * rng.normal(size=source.shape)).astype(np.float32)
     weights = rng.uniform(size=num_pairs).astype(np.float32)
     queries, points = rng.uniform(0.0, 50.0, (2, num_points, 3)).astype(np.float32)
     scan_a, scan_b = rng.uniform(0.0, 500.0, (2, 256, 2)).astype(np.float32)
     descriptors, keys = rng.normal(size=(2, num_descriptors, 128)).astype(np.float32)
     positives = rng.permutation(num_descriptors).astype(np.int32)
     return [
-        Case(f"weighted_svd {num_pairs}x3", dpmjax.weighted_svd, "NumPy", weighted_svd, (source, target, weights)),
+        Case(f"weighted_svd {num_pairs}x3", dpmjax.weighted_svd, "SciPy", weighted_svd, (source, target, weights)),
         Case(
             f"k_nearest k=8 {num_points}x{num_points}", near_distances, "SciPy tree", tree_distances, (queries, points)
         ),
@@ -67,12 +67,6 @@ def difference(case: Case) -> float:
     """Returns the largest entry of the difference to the peer on the same numbers in float64."""
     exact = (array.astype(np.float64) if array.dtype == np.float32 else array for array in case.arguments)
     return float(np.max(np.abs(np.asarray(case.ours(*case.arguments)) - np.asarray(case.peer(*exact)))))
-
-
-def rotation_about_z(angle: float) -> NDArray[np.float64]:
-    """Returns a (3, 3) rotation by `angle` radians."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def near_distances(queries: NDArray[np.float32], points: NDArray[np.float32]) -> object:
@@ -91,13 +85,11 @@ def info_nce(queries: NDArray[np.float32], keys: NDArray[np.float32], positives:
 
 
 def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], weights: NDArray[np.floating]) -> object:
-    """Returns T_target_source by NumPy's SVD."""
-    shares = (weights / weights.sum())[:, None]
-    source_centre, target_centre = (shares * source).sum(axis=0), (shares * target).sum(axis=0)
-    U, _, Vt = np.linalg.svd((shares * (target - target_centre)).T @ (source - source_centre))
-    T = np.eye(4, dtype=source.dtype)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    T[:3, 3] = target_centre - T[:3, :3] @ source_centre
+    """Returns T_target_source by SciPy's alignment of vectors."""
+    source_centre, target_centre = (np.average(points, axis=0, weights=weights) for points in (source, target))
+    turn, _ = Rotation.align_vectors(target - target_centre, source - source_centre, weights)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn.as_matrix(), target_centre - turn.apply(source_centre)
     return T
 
 

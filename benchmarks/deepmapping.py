@@ -1,4 +1,4 @@
-"""DeepMapping: ATE after 15, 30, 60 s of run time, beside ICP and the refinement; six walks from zero poses; the toy.
+"""DeepMapping: ATE after 15, 30, 60 s of run time, beside ICP and the refinement.
 
 The authors' trajectory (v1_pose0) and its poor start are used where they lie in `$DPMJAX_DATA/deepmapping_2d`
 (default `../shared/data`); the built-in world always.
@@ -6,41 +6,32 @@ The authors' trajectory (v1_pose0) and its poor start are used where they lie in
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.rows import Row, measure
-from dpmjax import ScanSet, fit_deepmapping
+from benchmarks import DATA, Row, measure
+from dpmjax import ScanSet
 from dpmjax import deepmapping as dm
-from dpmjax.cli import why_not_importable
-from dpmjax.deepmapping import Progress, ToyConfig, fit, mapping_data, mapping_problem, toy_problem
+from dpmjax.deepmapping import Progress, fit, mapping_data, mapping_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import PlanarScans, incremental_icp, planar_scans, refine
 from dpmjax.simulation import simulate_sequence
-from experiments.toy_1d import FORMS, share_at_minimum, torch_seconds
 
-DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "deepmapping_2d"
+RECORDED = DATA / "deepmapping_2d"
 _MARKS_S = (15.0, 30.0, 60.0, 120.0, 180.0)
-# The walks from zero are not those of the suite.
-_FIRST_SEED = 700
-# Section 4.1: a run below this ATE is a success; numbers of the paper.
-_SUCCESS_PX, _PAPER = 20.0, {"success": 0.842, "median ate": 5.7, "median wall": 1740.0}
 
 
 def run(quick: bool) -> list[Row]:
     """Measures ICP and refinement with and without noise, the fit from a poor start and from zero, the paper's step."""
     rows: list[Row] = []
     sequences = [simulate_sequence(0, 64 if quick else 256, seed=0)]
-    if DATA.is_dir():
-        sequences.insert(0, read_sequence(DATA / "v1_pose0.tar", selection=slice(64 if quick else None)))
+    if RECORDED.is_dir():
+        sequences.insert(0, read_sequence(RECORDED / "v1_pose0.tar", selection=slice(64 if quick else None)))
     for sequence in sequences:
         for noise_px in (0.0, 1.0, 3.0):
             rows += _classical(_with_noise(sequence, noise_px), f"{sequence.name}, noise {noise_px:g} px", quick)
@@ -53,7 +44,7 @@ def run(quick: bool) -> list[Row]:
 
 def _poor_start(sequence: ScanSequence) -> NDArray[np.float64]:
     """Returns the start that comes with the authors' trajectory; elsewhere a drift of its size."""
-    file = DATA / "start_16px.txt"
+    file = RECORDED / "start_16px.txt"
     if file.exists() and sequence.name.startswith("v1_pose0"):
         return np.loadtxt(file)[: len(sequence)]
     assert sequence.reference_poses is not None
@@ -138,54 +129,3 @@ def _paper_step(sequence: ScanSequence) -> list[Row]:
     case = f"{sequence.name}, paper preset"
     step_s = float(np.diff(run_s).min())
     return [Row(case, "compile", done.compile_s, "s"), Row(case, "one step of 128 scans", step_s, "s")]
-
-
-def run_from_zero(quick: bool) -> list[Row]:
-    """Returns success, error and wall seconds of the networks alone on six walks, compilation among them."""
-    lengths = (64,) * 2 if quick else (128, 128, 128, 128, 256, 256)
-    rows, calls = [], []
-    for number, length in enumerate(lengths):
-        sequence = simulate_sequence(number % 3, length, seed=_FIRST_SEED + number)
-        calls.append(_call(sequence))
-        rows += _call_rows(f"{sequence.name}, {length} scans, from zero", *calls[-1])
-    ates, seconds = np.array(calls).T
-    ours = {"success": np.mean(ates < _SUCCESS_PX), "median ate": np.median(ates), "median wall": np.median(seconds)}
-    units = {"success": "", "median ate": "px", "median wall": "s"}
-    rows += [Row(f"{len(lengths)} walks, from zero", name, float(value), units[name]) for name, value in ours.items()]
-    rows += [Row("the paper's 75 walks (GPU)", name, value, units[name]) for name, value in _PAPER.items()]
-    if DATA.is_dir():
-        sequence = read_sequence(DATA / "v1_pose0.tar", selection=slice(64 if quick else None))
-        rows += _call_rows(f"{sequence.name}, from zero", *_call(sequence))
-    return rows
-
-
-def _call(sequence: ScanSequence) -> tuple[float, float]:
-    begun = time.perf_counter()
-    fitted = fit_deepmapping(ScanSet(sequence.points, sequence.mask), key=jax.random.key(0))
-    seconds = time.perf_counter() - begun
-    return _ate(sequence, np.asarray(fitted.poses)), seconds
-
-
-def _call_rows(case: str, ate: float, seconds: float) -> list[Row]:
-    return [Row(case, "ate", ate, "px"), Row(case, "wall", seconds, "s")]
-
-
-def run_toy(quick: bool) -> list[Row]:
-    """Times both forms of the toy for one seed and for many, and the usual loop in PyTorch for one."""
-    toy = ToyConfig(num_steps=100 if quick else 1000)
-    rows: list[Row] = []
-    for num_seeds in (1, 100) if quick else (1, 1000):
-        for form in FORMS:
-
-            def ends(form: str = form, num_seeds: int = num_seeds) -> jax.Array:
-                problem = toy_problem(replace(toy, form=form))
-                return fit(problem, None, key=jax.random.key(0), num_starts=num_seeds).poses
-
-            case = f"{form} form, {num_seeds} seeds x {toy.num_steps} steps"
-            rows += measure(ends, repeats=3).rows(f"{case}: dpmjax")
-            if num_seeds > 1:
-                rows.append(Row(f"{case}: dpmjax", "share at global minimum", share_at_minimum(ends()), ""))
-    if why_not_importable("torch") is None:
-        seconds = min(torch_seconds(toy, seed) for seed in range(3))
-        rows.append(Row(f"network form, 1 seeds x {toy.num_steps} steps: PyTorch", "min", 1e3 * seconds, "ms"))
-    return rows

@@ -6,16 +6,14 @@ its own. GTSAM gets a tight prior on the first node, which adds nothing to the c
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import dpmjax
-from benchmarks.rows import Row, Timing, measure
+from benchmarks import DATA, Row, Timing, measure
 from dpmjax.cli import why_not_importable
 
-DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data")) / "g2o"
 GRAPHS = ("intel", "M3500", "parking-garage", "sphere2500")
 
 
@@ -27,7 +25,7 @@ def run(quick: bool) -> list[Row]:
     if no_peer is not None:
         print(f"no peer: {no_peer}", file=sys.stderr)
     for name in GRAPHS[:2] if quick else GRAPHS:
-        path = DATA / f"{name}.g2o"
+        path = DATA / "g2o" / f"{name}.g2o"
         if not path.exists():
             print(f"{path} is not there: skipped; set DPMJAX_DATA", file=sys.stderr)
             continue

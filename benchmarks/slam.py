@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.rows import Row
+from benchmarks import Row
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error, registration_recall
 from dpmjax.simulation import route_poses
@@ -105,13 +105,8 @@ def judged(result: SlamResult, truth: np.ndarray) -> Proof:
 
 def proof_rows(case: str, proof: Proof) -> list[Row]:
     """Returns the rows of one drive."""
-    return [
-        Row(case, "ATE", proof.ate_m, "m"),
-        Row(case, "ATE of odometry", proof.ate_odometry_m, "m"),
-        Row(case, "loops", proof.num_loops, ""),
-        Row(case, "loops, other direction", proof.num_opposite, ""),
-        Row(case, "wrong loops", proof.num_wrong, ""),
-    ]
+    names = ("ATE", "ATE of odometry", "loops", "wrong loops", "loops, other direction")
+    return [Row(case, name, value, "m" if "ATE" in name else "") for name, value in zip(names, proof[1:], strict=True)]
 
 
 def summary_rows(case: str, proofs: Sequence[Proof]) -> list[Row]:
@@ -147,11 +142,9 @@ def growth_rows() -> list[Row]:
     _, (early, late) = costs(truth, (EARLY, LATE)), costs(truth, (EARLY, LATE))
     rows = []
     for number, cost in ((EARLY, early), (LATE, late)):
-        case = f"around scan {number}"
-        rows.append(Row(case, "CPU time a scan, parts replaced", cost.cpu_ms, "ms"))
-        rows.append(Row(case, "map and loop candidates", cost.map_mb, "MB"))
-        rows.append(Row(case, "front end", cost.front_end_mb, "MB"))
-        rows.append(Row(case, "memory of the process", cost.resident_mb, "MB"))
+        names = ("CPU time a scan, parts replaced", "map and loop candidates", "front end", "memory of the process")
+        units = ("ms", "MB", "MB", "MB")
+        rows += [Row(f"around scan {number}", *named) for named in zip(names, cost, units, strict=True)]
     ratio = (REPLACED_MS + late.cpu_ms) / (REPLACED_MS + early.cpu_ms)
     rows.append(Row(f"scan {LATE} / scan {EARLY}", f"cost a scan, with {REPLACED_MS:g} ms for the parts", ratio, ""))
     return rows

@@ -1,4 +1,4 @@
-"""The methods that the tables of DeepMapping compare: baselines, parts of the pipeline, and their combinations.
+"""Tables of methods by sets of planar scans: baselines, parts of the pipeline, and their combinations.
 
 A candidate is a set of poses under the name of its method. "DeepMapping" is the name for results of L-Net or M-Net.
 A search, an ICP or a refinement has its own name.
@@ -6,20 +6,21 @@ A search, an ICP or a refinement has its own name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax import ScanSet, registration2d
+from dpmjax import ScanSet, cli, registration2d
 from dpmjax import deepmapping as dm
-from dpmjax.cli import planar_errors
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
+from experiments._baselines import multiway, optimize_directly, swarm_chain
 
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
@@ -53,6 +54,11 @@ class Task:
         """Returns the scans without their names and reference."""
         return ScanSet(self.sequence.points, self.sequence.mask)
 
+    @property
+    def key(self) -> jax.Array:
+        """Returns the key of everything random."""
+        return jax.random.key(self.seed)
+
 
 def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | None = None, seed: int = 0) -> Task:
     """Prepares scans for the methods; where they are not ordered, they are shuffled first."""
@@ -82,7 +88,7 @@ def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str,
     """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration2d.choose_trajectory(task.planar, candidates)
     return kept, {
-        name: planar_errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()
+        name: cli.planar_errors(task.sequence, candidates[name]) | score._asdict() for name, score in scores.items()
     }
 
 
@@ -95,8 +101,8 @@ def _fit(task: Task, start: Floats | None, config: dm.DeepMappingConfig | None =
     """Returns poses by DeepMapping from a start, or from zero poses."""
     settings = config or dm.preset("fast")
     settings = settings if task.steps is None else dm.with_steps(settings, task.steps)
-    key = jax.random.key(task.seed)
-    return registration2d.fit_in_order(task.scans, settings, key=key, start=start, is_ordered=task.is_ordered).poses
+    ordered = task.is_ordered
+    return registration2d.fit_in_order(task.scans, settings, key=task.key, start=start, is_ordered=ordered).poses
 
 
 def _refined_icp(task: Task) -> Candidates:
@@ -105,11 +111,8 @@ def _refined_icp(task: Task) -> Candidates:
 
 def _direct_lbfgs(task: Task) -> Floats:
     """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
-    from experiments.baselines.direct import optimize_directly
-
     num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
-    key = jax.random.key(task.seed)
-    return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=key)
+    return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=task.key)
 
 
 def _lnet_from_icp(task: Task) -> Candidates:
@@ -126,18 +129,6 @@ def _direct(task: Task, *, has_windows: bool) -> Floats:
         phases = tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases)
         config = replace(config, cold_phases=phases)
     return _fit(task, None, config)
-
-
-def _multiway(task: Task) -> Floats:
-    from experiments.baselines.multiway import multiway
-
-    return multiway(task.scans)
-
-
-def _swarm(task: Task) -> Floats:
-    from experiments.baselines.direct import swarm_chain
-
-    return swarm_chain(task.scans, key=jax.random.key(task.seed))
 
 
 def _global_deepmapping(task: Task) -> Candidates:
@@ -194,8 +185,10 @@ METHODS: dict[str, Method] = {
     "icp-point": Method(START_NAMES["icp-point"], partial(incremental, metric="point")),
     "icp-plane": Method(START_NAMES["icp-plane"], incremental),
     "icp-refined": Method("incremental ICP, refined", _refined_icp),
-    "multiway": Method("multiway registration of Open3D", _multiway, "open3d"),
-    "particle-swarm": Method("particle swarms, each scan onto the one before", _swarm, "evosax"),
+    "multiway": Method("multiway registration of Open3D", lambda task: multiway(task.scans), "open3d"),
+    "particle-swarm": Method(
+        "particle swarms, each scan onto the one before", lambda task: swarm_chain(task.scans, key=task.key), "evosax"
+    ),
     "lnet-zero": Method("L-Net and M-Net from zero", lambda task: {DEEPMAPPING: _fit(task, None)}),
     "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
     "search": Method(START_NAMES["global"], search),
@@ -207,3 +200,106 @@ METHODS: dict[str, Method] = {
     "all": Method("ICP, global registration, DeepMapping from it, and each refined", _all_candidates),
     "refined-deepmapping": Method("ICP or global registration, then DeepMapping, refined", _refined_deepmapping),
 }
+
+
+NOT_RUN = {
+    "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "
+    "build with today's setuptools, py-simple-go-icp-interface took 20 s for one pair of flat scans and gave up",
+}
+"""Baselines of the paper that have no column, and why."""
+# A candidate whose ATE is larger than the least by no more than this is as good.
+_AS_GOOD_PX = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableOptions(cli.RunOptions):
+    """Options of a comparison of methods."""
+
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Columns; of all of them, those whose package cannot be imported are left out and named."""
+    steps: int | None = None
+    """Steps of the fit; without it, the preset decides."""
+
+    def __post_init__(self) -> None:
+        """Checks names and ranges."""
+        cli.check_names("--methods", self.methods, METHODS)
+        cli.check_least(self, steps=2)
+
+
+def run_method(name: str, task: Task) -> cli.Row:
+    """Returns one row: errors, time and assessment of the kept candidate, and the numbers of every candidate."""
+    method = METHODS[name]
+    begun, begun_cpu = time.perf_counter(), time.process_time()
+    found = method.run(task)
+    candidates = found if isinstance(found, dict) else {method.title: found}
+    # The choice belongs to a method that has several candidates, and to its time.
+    chosen = choose(task, candidates) if len(candidates) > 1 else None
+    seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - begun_cpu
+    kept, measured = chosen or choose(task, candidates)
+    return {
+        **cli.planar_errors(task.sequence, candidates[kept]),
+        "success": measured[kept]["ate_px"] < SUCCESS_PX,
+        "seconds": seconds,
+        "cpu_s": cpu_seconds,
+        "kept": kept,
+        "candidates": measured,
+        **assess(task, candidates[kept]),
+    }
+
+
+def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns how many maps were trusted, and the share of these that are right."""
+    trusted = [row["success"] for row in rows if row["is_trusted"]]
+    return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
+
+
+def best_kept(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns how many rows have several candidates, and of how many the best one was kept, or one nearly as good."""
+    regrets = [
+        row["ate_px"] - min(numbers["ate_px"] for numbers in row["candidates"].values())
+        for row in rows
+        if len(row["candidates"]) > 1
+    ]
+    return {"num_choices": len(regrets), "num_best_kept": sum(regret <= _AS_GOOD_PX for regret in regrets)}
+
+
+def run_methods(
+    config: TableOptions,
+    experiment: str,
+    cells: Sequence[cli.Row],
+    prepare: Callable[[cli.Row], tuple[Task, cli.Row]],
+    report: Callable[[list[cli.Row], dict[str, str]], cli.Summary],
+) -> list[cli.Row]:
+    """Runs every method on every cell; what an earlier run has done is read from its files.
+
+    Args:
+        config: options.
+        experiment: name of the experiment.
+        cells: what identifies each set of scans.
+        prepare: makes the task of a cell, and what its rows carry besides the results.
+        report: summarises the rows, and names the methods that were not run, with the reasons.
+
+    Returns:
+        All rows.
+
+    Raises:
+        ValueError: the package of a chosen method cannot be imported.
+    """
+    packages = {name: package for name in config.methods if (package := METHODS[name].package) is not None}
+    reasons = {name: cli.why_not_importable(package) for name, package in packages.items()}
+    unusable = {name: reason for name, reason in reasons.items() if reason is not None}
+    if unusable and set(config.methods) != set(METHODS):
+        name, reason = next(iter(unusable.items()))
+        raise ValueError(f"--methods {name}: {reason}")
+    not_run = NOT_RUN | unusable
+    # The scans are made once for all methods, and not at all where all rows exist.
+    prepared = lru_cache(maxsize=1)(lambda *cell: prepare(dict(cell)))
+
+    def work(_: cli.TableRun, method: str, **cell: Any) -> cli.Row:
+        task, extra = prepared(*cell.items())
+        return run_method(method, task) | extra
+
+    cases = [{"method": method, **cell} for cell in cells for method in config.methods if method not in not_run]
+    rows = cli.run_table(config, experiment, cases, work, lambda rows: report(rows, not_run))
+    print(*(f"{name}: not run ({reason})" for name, reason in not_run.items()), sep="\n")
+    return rows

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
-from dpmjax import cli, io, load_model, viz
+from dpmjax import cli, io, load_map, load_model, save_map, viz
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import align_rigid, path_lengths
+from dpmjax.saved_maps import Precision
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
-from dpmjax.slam import SlamMethods, make_methods
+from dpmjax.slam import SlamMethods, localize_each, make_methods
 from experiments import _slam_evaluation as evaluation
-from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive
+from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive, first_keyframes, map_path
 from experiments._slam_peers import PEERS, why_missing
-from experiments._slam_uses import MULTIWAY, REFINED, evaluate_localization, evaluate_refinement
 
 TOWN = "town"
 # Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
@@ -36,11 +37,9 @@ COLORS = {
     "KISS-ICP": "#e08a1e",
     "KISS-SLAM": "#b5432e",
     "small_gicp": "#7a5aa6",
-    MULTIWAY: "#8c8c8c",
     ODOMETRY: "#6fa3d8",
     NETWORK: "#e0a030",
     OURS: "#1f4e8c",
-    REFINED: "#2e8b57",
 }
 SIZES = {
     "map_bytes_points": "points of all scans",
@@ -51,23 +50,6 @@ SIZES = {
     "map_bytes_int8": "ours, int8",
 }
 LOCALIZATION = "localization, "
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Rows that are made of each drive.
-
-    Attributes:
-        weights: name of a shipped model, or a file.
-        seed: of the refinement and of the scans that are looked for.
-        is_refined: whether refinements of our run are rows.
-        num_localized: number of scans that are looked for in the map of the first half; 0 for no such row.
-    """
-
-    weights: str
-    seed: int
-    is_refined: bool
-    num_localized: int
 
 
 def open_drives(
@@ -91,8 +73,7 @@ def open_drives(
         if entry == TOWN and not Path(entry).exists():
             routes = enumerate((towns or {}).items())
             simulated = [cli.keep_scans(town_drive(seed, number, length_m)) for number, (seed, length_m) in routes]
-            rows = slice(None, None, options.jump)
-            drives += [drive.take(rows).take(slice(options.n_scans)) for drive in simulated]
+            drives += [drive.take(options.selection) for drive in simulated]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [cli.open_drive(Path(entry), options, name) for name in names]
@@ -109,62 +90,93 @@ def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
     return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
 
 
-def missing_peers(comparison: Comparison) -> dict[str, str]:
-    """Returns the peers that cannot run, and why."""
-    reasons = {name: why_missing(name) for name in PEERS}
-    if comparison.is_refined:
-        reasons[MULTIWAY] = cli.why_not_importable("open3d")
-    return {name: reason for name, reason in reasons.items() if reason is not None}
-
-
 def compare(
-    config: cli.RunOptions, experiment: str, comparison: Comparison, sequences: Sequence[LidarSequence]
+    config: cli.DriveOptions, experiment: str, sequences: Sequence[LidarSequence], num_localized: int
 ) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
-    methods = make_methods(load_model(comparison.weights), weights=comparison.weights)
-    missing, by_name = missing_peers(comparison), {sequence.name: sequence for sequence in sequences}
+    methods = make_methods(load_model(config.weights), weights=config.weights)
+    missing = {name: reason for name in PEERS if (reason := why_missing(name)) is not None}
+    by_name = {sequence.name: sequence for sequence in sequences}
 
     def work(run: cli.TableRun, sequence: str, method: str) -> cli.Row:
         drive = evaluation.open_folder(run.folder, by_name[sequence], run.is_stopped)
-        if method != ODOMETRY:
-            return evaluate(comparison, drive, methods, method)
+        if method in PEERS:
+            return evaluation.evaluate_peer(drive, method)
+        if method.startswith(LOCALIZATION):
+            precision = next(name for name in PRECISIONS if method.endswith(name))
+            return evaluate_localization(drive, methods, precision, num_localized, config.seed)
+        if method == NETWORK:
+            return evaluation.evaluate_network(drive, methods)
         case, ours = {"sequence": sequence, "method": OURS}, partial(evaluation.evaluate_ours, drive, methods)
-        return evaluation.odometry_row(drive, cli.do_row(run.folder.path, case, ours, seed=comparison.seed))
+        if method == OURS:
+            return ours()
+        return evaluation.odometry_row(drive, cli.do_row(run.folder.path, case, ours, seed=config.seed))
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         notes = (f"{name} was not run: {why}." for name, why in missing.items())
-        numbers = {"weights": comparison.weights, "peers_left_out": missing}
+        numbers = {"weights": config.weights, "peers_left_out": missing}
         draw_rows = partial(draw, sequences=sequences, rows=rows)
         return cli.Summary(numbers, "\n\n".join([tables(rows), *notes]), draw_rows)
 
     # Trajectories of all drives come first: an early end leaves a whole table.
-    stages = ((*PEERS, OURS, NETWORK, ODOMETRY), (REFINED, MULTIWAY) if comparison.is_refined else ())
-    cases = [
-        {"sequence": name, "method": method}
-        for stage in stages
-        for name in by_name
-        for method in stage
-        if method not in missing
-    ]
+    methods_run = [method for method in (*PEERS, OURS, NETWORK, ODOMETRY) if method not in missing]
+    cases = [{"sequence": name, "method": method} for name in by_name for method in methods_run]
     cases += [
         {"sequence": sequence.name, "method": f"{LOCALIZATION}{precision}"}
         for sequence in sequences
         for precision in PRECISIONS
-        if comparison.num_localized and sequence.T_world_lidar is not None
+        if num_localized and sequence.T_world_lidar is not None
     ]
     return cli.run_table(config, experiment, cases, work, report)
 
 
-def evaluate(comparison: Comparison, drive: Drive, methods: SlamMethods, method: str) -> cli.Row:
-    """Returns the row of a drive and a method."""
-    if method in PEERS:
-        return evaluation.evaluate_peer(drive, method)
-    if method in (REFINED, MULTIWAY):
-        return evaluate_refinement(drive, methods, method, comparison.seed)
-    if method.startswith(LOCALIZATION):
-        precision = next(name for name in PRECISIONS if method.endswith(name))
-        return evaluate_localization(drive, methods, precision, comparison.num_localized, comparison.seed)
-    return (evaluation.evaluate_ours if method == OURS else evaluation.evaluate_network)(drive, methods)
+def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precision, num: int, seed: int) -> cli.Row:
+    """Looks for random scans of the drive in the map of its first half, saved and loaded at a precision.
+
+    The map is that of the SLAM run. No scan is one of its keyframes. A scan is in the map where a keyframe of the whole
+    first half is near; elsewhere the right answer is that it is not.
+    """
+    assert drive.reference is not None
+    if not map_path(drive.folder.path, "float32").exists():  # no scan had points enough
+        return {"num_scans": 0}
+    whole = load_map(map_path(drive.folder.path, "float32"))
+    num_early = sum(keyframe.scan < len(drive.sequence) / 2 for keyframe in whole.keyframes)
+    half = first_keyframes(whole, max(num_early, 1))
+    path = save_map(drive.folder / f"first_half_{precision}.npz", half, precision)
+    slam_map, taken = load_map(path), {keyframe.scan for keyframe in half.keyframes}
+    others = [scan for scan in range(len(drive.sequence)) if scan not in taken]
+    chosen = np.sort(np.random.default_rng(seed).choice(others, min(num, len(others)), replace=False))
+    part = drive.sequence.take(chosen)
+    known = drive.reference[[keyframe.scan for keyframe in slam_map.keyframes]]
+    found, seconds, clock = [], [], time.perf_counter()
+    for one in localize_each(methods, slam_map, _points_of(part, drive, precision)):
+        found.append(one)
+        seconds.append(time.perf_counter() - clock)
+        clock = time.perf_counter()
+    errors = cli.localization_errors(found, slam_map, known, drive.reference[chosen])
+    keyframes = drive.reference[sorted(taken), :3, 3]
+    apart = np.linalg.norm(drive.reference[chosen][:, None, :3, 3] - keyframes[None], axis=2).min(axis=1)
+    is_inside, is_found, is_right = apart <= drive.scale.reach_m, errors.is_found, errors.is_right
+    return {
+        "num_scans": len(found),
+        "num_keyframes": len(slam_map),
+        "map_bytes": path.stat().st_size,
+        "num_inside": int(is_inside.sum()),
+        "num_right": int((is_inside & is_right).sum()),
+        "num_wrong": int((is_inside & is_found & ~is_right).sum()),
+        "num_outside": int((~is_inside).sum()),
+        "num_outside_right": int((~is_inside & is_right).sum()),
+        "num_outside_wrong": int((~is_inside & is_found & ~is_right).sum()),
+        "median_error_m": float(np.median(errors.translation_m[is_right])) if is_right.any() else None,
+        "scan_s": float(np.median(seconds)),
+    }
+
+
+def _points_of(part: LidarSequence, drive: Drive, precision: str) -> Iterator[np.ndarray]:
+    for number in tqdm(range(len(part)), desc=f"{part.name}, {precision}", unit=" scans", dynamic_ncols=True):
+        if drive.is_stopped():
+            raise cli.RowStopped
+        yield part.read_points(number)
 
 
 def tables(rows: Sequence[cli.Row]) -> str:

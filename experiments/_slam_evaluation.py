@@ -18,17 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import save_map
-from dpmjax.cli import (
-    RowStopped,
-    RunFolder,
-    SlamRun,
-    map_drive,
-    trajectory_errors,
-    write_loops,
-    write_scans,
-    write_trajectory,
-)  # fmt: skip
+from dpmjax import cli, save_map
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
@@ -69,7 +59,7 @@ class Drive(NamedTuple):
     """
 
     sequence: LidarSequence
-    folder: RunFolder
+    folder: cli.RunFolder
     is_indoors: bool
     is_stopped: Callable[[], bool]
 
@@ -88,7 +78,7 @@ class Drive(NamedTuple):
         return np.load(self.folder / f"{file_name(method)}.npy")
 
 
-def open_folder(folder: RunFolder, sequence: LidarSequence, is_stopped: Callable[[], bool]) -> Drive:
+def open_folder(folder: cli.RunFolder, sequence: LidarSequence, is_stopped: Callable[[], bool]) -> Drive:
     """Makes the folder of a drive."""
     part = folder.part("drives", sequence.name.replace("/", "-"))
     return Drive(sequence, part, is_indoors(sequence.read_points(0)), is_stopped)
@@ -102,8 +92,8 @@ def file_name(method: str) -> str:
 def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     """Runs the whole system, and writes its files."""
     result, row = map_row(drive, drive.folder, OURS, methods)
-    write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
-    write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
+    cli.write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
+    cli.write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
     save_trajectory(drive, ODOMETRY, result.T_odometry_scan)
     return {**row, **map_sizes(drive.folder.path, result)}
 
@@ -119,11 +109,13 @@ def with_network(methods: SlamMethods) -> SlamMethods:
     return methods._replace(config=replace(methods.config, odometry=odometry))
 
 
-def map_row(drive: Drive, folder: RunFolder, method: str, methods: SlamMethods) -> tuple[SlamResult, dict[str, Any]]:
+def map_row(
+    drive: Drive, folder: cli.RunFolder, method: str, methods: SlamMethods
+) -> tuple[SlamResult, dict[str, Any]]:
     """Maps a drive, or goes on from the state in the folder, and measures trajectory, loops and seconds."""
-    run, result = map_drive(folder, drive.sequence, methods, drive.is_stopped)
+    run, result = cli.map_drive(folder, drive.sequence, methods, drive.is_stopped)
     if len(run.reports) < len(drive.sequence):
-        raise RowStopped
+        raise cli.RowStopped
     ends = result.keyframes
     found = [
         FoundLoop((ends[loop.source],) * 2, (ends[loop.target],) * 2, loop.T_target_source)
@@ -140,7 +132,7 @@ def map_row(drive: Drive, folder: RunFolder, method: str, methods: SlamMethods) 
     }
 
 
-def _per_scan(run: SlamRun, seconds: float) -> float | None:
+def _per_scan(run: cli.SlamRun, seconds: float) -> float | None:
     """Returns the seconds a scan; None for a run that was resumed at its end."""
     return seconds / run.num_done if run.num_done else None
 
@@ -166,7 +158,7 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
     at = set(size_marks(num_scans))
     for number in tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True):
         if drive.is_stopped():
-            raise RowStopped
+            raise cli.RowStopped
         points = drive.sequence.read_points(number).astype(np.float64)
         clock = time.perf_counter()
         if len(points):
@@ -199,7 +191,7 @@ def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: S
     return {
         "num_scans": len(T_world_scan),
         "path_m": float(path_lengths(known)[-1]),
-        **trajectory_errors(T_world_scan, drive.reference),
+        **cli.trajectory_errors(T_world_scan, drive.reference),
         "num_loops": len(loops),
         **(loop_numbers(drive, loops) if drive.reference is not None else {}),
     }
@@ -207,7 +199,7 @@ def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: S
 
 def save_trajectory(drive: Drive, method: str, T_world_scan: np.ndarray) -> None:
     """Writes the trajectory of a method."""
-    write_trajectory(drive.folder.path, T_world_scan, drive.sequence.times, file_name(method))
+    cli.write_trajectory(drive.folder.path, T_world_scan, drive.sequence.times, file_name(method))
 
 
 def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import contextlib
 import importlib.metadata
 import os
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,29 +41,28 @@ class FoundLoop(NamedTuple):
     T_older_newer: np.ndarray
 
 
-class Peer(Protocol):
+class Peer:
     """A program that takes scans in their order.
+
+    `step` takes a scan, (n, 3) float64, not empty. `map_bytes` returns the bytes of the map of the whole way so far,
+    with floats of 4 bytes.
 
     Attributes:
         map_name: kind of the map, for the column of its bytes.
     """
 
     map_name: str
-
-    def step(self, points: np.ndarray) -> None:
-        """Takes a scan, (n, 3) float64, not empty."""
+    _poses: list[np.ndarray]
 
     def grow_map(self, points: np.ndarray) -> None:
         """Adds the last scan to a map of the whole way, where the program drops far points; not timed."""
 
-    def map_bytes(self) -> int:
-        """Returns the bytes of the map of the whole way so far, with floats of 4 bytes."""
-
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         """Returns (n, 4, 4) poses of all scans, and the loops."""
+        return np.array(self._poses), []
 
 
-class KissIcp:
+class KissIcp(Peer):
     """KISS-ICP (Vizzo et al. 2023), with a voxel map of the whole way: the program itself drops far points."""
 
     map_name = "voxels"
@@ -78,7 +77,7 @@ class KissIcp:
         mapping = config.mapping
         self._odometry = KissICP(config)
         self._whole = VoxelHashMap(mapping.voxel_size, _UNLIMITED_M, mapping.max_points_per_voxel)
-        self._poses: list[np.ndarray] = []
+        self._poses = []
 
     def step(self, points: np.ndarray) -> None:
         self._odometry.register_frame(points, np.zeros(0))
@@ -90,15 +89,12 @@ class KissIcp:
         thinned, T = self._odometry.voxelize(frame)[1], self._poses[-1]
         self._whole.add_points(thinned @ T[:3, :3].T + T[:3, 3])
 
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        return np.array(self._poses), []
-
     def map_bytes(self) -> int:
         """Returns the bytes of its points; see `Peer`."""
         return POINT_BYTES * len(self._whole.point_cloud())
 
 
-class KissSlam:
+class KissSlam(Peer):
     """KISS-SLAM (Guadagnino et al. 2025): the same odometry, local maps of 100 m, loops between them, a pose graph."""
 
     map_name = "local_maps"
@@ -115,9 +111,6 @@ class KissSlam:
     def step(self, points: np.ndarray) -> None:
         with _silence():
             self._slam.process_scan(points, np.zeros(0))
-
-    def grow_map(self, points: np.ndarray) -> None:
-        """Does nothing: the program keeps its local maps."""
 
     def map_bytes(self) -> int:
         """Returns the bytes of the points of all local maps, without their normals; see `Peer`."""
@@ -141,7 +134,7 @@ class KissSlam:
         return np.array(poses), loops
 
 
-class SmallGicp:
+class SmallGicp(Peer):
     """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
 
     map_name = "gaussians"
@@ -154,7 +147,7 @@ class SmallGicp:
         self._map, self._whole = (small_gicp.GaussianVoxelMap(voxel_m) for _ in range(2))
         self._whole.set_lru(horizon=_UNLIMITED_SCANS)
         self._scan: Any = None
-        self._poses: list[np.ndarray] = []
+        self._poses = []
 
     def step(self, points: np.ndarray) -> None:
         scan, _ = self._library.preprocess_points(points, self._point_m, num_threads=self._threads)
@@ -175,9 +168,6 @@ class SmallGicp:
     def map_bytes(self) -> int:
         """Returns the bytes of the mean and the covariance of each voxel; see `Peer`."""
         return GAUSSIAN_BYTES * int(self._whole.size())
-
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        return np.array(self._poses), []
 
 
 PEERS: dict[str, tuple[str, Callable[..., Any]]] = {

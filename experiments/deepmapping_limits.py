@@ -25,7 +25,6 @@ from tyro.conf import arg
 
 from dpmjax import cli, simulation, viz
 from experiments import _deepmapping_methods as shared
-from experiments import _deepmapping_tables as tables
 from experiments._deepmapping_methods import Task
 
 EXPERIMENT = "deepmapping_limits"
@@ -39,7 +38,7 @@ NUM_SCANS, NUM_ROOMS = 256, 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(tables.TableOptions):
+class Config(shared.TableOptions):
     """Options of the grid."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods", "strides", "noises_px", "orders", "worlds"})
@@ -77,7 +76,7 @@ def main(config: Config) -> list[dict[str, Any]]:
         "order": config.orders,
     }
     cells = [dict(zip(axes, cell, strict=True)) for cell in itertools.product(*axes.values())]
-    return tables.run_methods(config, EXPERIMENT, cells, partial(_prepare, config), partial(report, config))
+    return shared.run_methods(config, EXPERIMENT, cells, partial(_prepare, config), partial(report, config))
 
 
 def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
@@ -128,7 +127,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             for name, numbers in row["candidates"].items():
                 ates[_column(row, name)].append(numbers["ate_px"])
         medians = (f"{np.median(ates[column]):.3g}" if column in ates else "" for column in columns)
-        kept = tables.best_kept(mine)
+        kept = shared.best_kept(mine)
         lines.append([*map(str, cell), *medians, f"{kept['num_best_kept']} of {kept['num_choices']}"])
     return cli.markdown(("world", "order", "every", "noise, px", *columns, "best kept"), lines)
 
@@ -160,7 +159,7 @@ def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) 
             viz.save_figure(figure, folder / f"{world}_{order}.png")
 
     numbers = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
-    numbers |= tables.success_of_trusted(rows) | tables.best_kept(rows)
+    numbers |= shared.success_of_trusted(rows) | shared.best_kept(rows)
     return cli.Summary(numbers, "\n\n".join(["\n".join(lines), table(rows)]), draw)
 
 

@@ -14,15 +14,14 @@ missing pixels. Walks on which no motion at all has an ATE below 450 mm are left
 Each trajectory is written to rows/ as soon as all methods have done it. The file metrics.json has the share of walks
 with an ATE below 450 mm, and of right walks. The paper's threshold is 450 mm; no motion at all meets it on most of its
 walks. Right is an ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, and points
-within 100 mm. Images of bare walls leave the motion along them open. For hard walks the table also has the share of
-right walks among those that the surfaces hold to a tenth of the spread (`_rgbd_methods.surface_spread`). The file
-errors.png has the box plots, map_K.png some trajectories from above.
+within 100 mm. The file errors.png has the box plots, map_K.png some trajectories from above.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -33,9 +32,13 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, simulation, viz
 from dpmjax import deepmapping as dm
-from experiments._rgbd_methods import METHODS, errors_of, run_method, spread_of, surface_spread
+from dpmjax import registration_rgbd as rgbd
+
+Poses = NDArray[np.float64]
 
 EXPERIMENT = "deepmapping_rgbd"
+METHODS = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct", "icp", "multiway")
+_ICP_POINTS = 800
 _SUCCESS_MM = 450.0
 # What is right: ATE as a share of the spread, turns, distance of points.
 _RIGHT_SHARE, _RIGHT_DEG, _RIGHT_MM = 0.1, 2.0, 100.0
@@ -59,7 +62,7 @@ class Config(cli.RunOptions):
     limit: Annotated[int, arg(metavar="N")] = 105
     """Trajectories."""
     methods: tuple[str, ...] = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct")
-    """What to compare; also placed-no-prior, icp, deepmapping-icp and multiway (Open3D, extra `baselines`)."""
+    """What to compare; also icp and multiway (Open3D, extra `baselines`)."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: seconds a trajectory; paper: its networks and sampling, for a GPU."""
     window_step: Annotated[int, arg(metavar="N")] = _FOLDER_VIEWS // 2
@@ -97,7 +100,8 @@ def read_trajectory(config: Config, index: int) -> io.DepthSequence:
     views, seed = 8 if index % 2 == 0 else 16, 1000 * config.seed + index
     if config.data is None:
         if config.walks == "hard":
-            return hard_walk(seed, simulation.HARD_WALK)
+            apartment, walk = _FIRST_HELD_OUT + seed, simulation.HARD_WALK
+            return simulation.simulate_depth_sequence(apartment, _HARD_VIEWS, seed=seed, config=walk)
         return simulation.simulate_depth_sequence(seed % _NUM_APARTMENTS, views, seed=seed)
     if io.is_active_vision(config.data):
         return io.read_active_vision(config.data, views, seed=seed)
@@ -109,15 +113,74 @@ def read_trajectory(config: Config, index: int) -> io.DepthSequence:
     return replace(window, name=f"{sequence.name}, images {begin} to {begin + len(window) - 1}")
 
 
-def hard_walk(seed: int, walk: simulation.DepthWalkConfig) -> io.DepthSequence:
-    """Returns a hard walk; the same seed with other noise gives the same way."""
-    return simulation.simulate_depth_sequence(_FIRST_HELD_OUT + seed, _HARD_VIEWS, seed=seed, config=walk)
+def run_method(
+    name: str, sequence: io.DepthSequence, settings: dm.DeepMappingConfig, found: Mapping[str, Poses], *, seed: int
+) -> Poses:
+    """Returns (n, 4, 4) T_world_camera by one method.
+
+    Args:
+        name: one of `METHODS`. "zero": all cameras at one place. "placed": the search for first poses. "deepmapping":
+            from "placed", of the two the one of the larger projective consistency. "deepmapping-cold": L-Net from zero.
+            "direct": its losses without L-Net, from L-Net's first forward pass, as in the paper. "icp": each image onto
+            the one before. "multiway": Open3D's multiway registration.
+        sequence: depth images.
+        settings: settings of DeepMapping.
+        found: results of other methods for this sequence: a start that is there is not computed again.
+        seed: seed of everything random.
+
+    Returns:
+        The poses.
+    """
+    import jax
+
+    from experiments._baselines import multiway_images
+
+    scans, key = rgbd.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
+
+    def fit_cold(config: dm.DeepMappingConfig) -> Poses:
+        return dm.fit_deepmapping(scans, config, key=key).T_world_scan
+
+    methods = {
+        "zero": lambda: np.tile(np.eye(4), (len(sequence), 1, 1)),
+        "placed": lambda: rgbd.initialize_depth(scans, rgbd.depth_search(settings.motion), key=key),
+        "deepmapping": lambda: dm.register_depth(scans, settings, key=key, start=found.get("placed")).T_world_scan,
+        "deepmapping-cold": lambda: fit_cold(settings),
+        "direct": lambda: fit_cold(dm.as_direct(settings)),
+        "icp": lambda: chain_icp(sequence, seed=seed),
+        "multiway": lambda: multiway_images(sequence.points, sequence.mask),
+    }
+    return methods[name]()
 
 
-def walk_surface_spread(seed: int) -> float:
-    """Returns the spread of a hard walk that the surfaces leave, mm."""
-    noise_m = simulation.HARD_WALK.depth_noise_m
-    return surface_spread(hard_walk(seed, replace(simulation.HARD_WALK, depth_noise_m=0.0, dropout_share=0.0)), noise_m)
+def chain_icp(sequence: io.DepthSequence, *, seed: int) -> Poses:
+    """Returns poses by point-to-plane ICP of each image onto the one before, from the same pose."""
+    from dpmjax.registration2d import icp
+
+    rng = np.random.default_rng(seed)
+    # One size for all clouds, so that ICP compiles once.
+    clouds = [
+        points[mask][rng.choice(int(mask.sum()), _ICP_POINTS)]
+        for points, mask in zip(sequence.points, sequence.mask, strict=True)
+    ]
+    T = [np.eye(4)]
+    for before, after in itertools.pairwise(clouds):
+        T.append(T[-1] @ np.asarray(icp(after, before, metric="plane").T_target_source, np.float64))
+    return np.stack(T)
+
+
+def spread_of(sequence: io.DepthSequence) -> float:
+    """Returns the root mean square distance of the cameras from their mean, mm: the ATE of not moving at all."""
+    assert sequence.T_world_camera is not None
+    positions = sequence.T_world_camera[:, :3, 3]
+    return 1e3 * float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
+
+
+def errors_of(T: Poses, sequence: io.DepthSequence) -> dict[str, float]:
+    """Returns ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
+    errors = cli.depth_errors(sequence, T)
+    return {name.replace("_m", "_mm"): 1e3 * value for name, value in errors.items() if name.endswith("_m")} | {
+        name: value for name, value in errors.items() if name.endswith("_deg")
+    }
 
 
 def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm.DeepMappingConfig) -> cli.Row:
@@ -135,10 +198,8 @@ def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm
         The remaining entries of the row.
     """
     sequence = read_trajectory(config, trajectory)
-    found: dict[str, NDArray[np.float64]] = {}
+    found: dict[str, Poses] = {}
     row: cli.Row = {"name": sequence.name, "views": len(sequence), "spread_mm": spread_of(sequence)}
-    if config.data is None and config.walks == "hard":
-        row["surface_spread_mm"] = walk_surface_spread(1000 * config.seed + trajectory)
     for name in config.methods:
         begun = time.perf_counter()
         found[name] = run_method(name, sequence, settings, found, seed=config.seed)
@@ -153,11 +214,8 @@ def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm
 
 def summarise(rows: Sequence[cli.Row], methods: Sequence[str]) -> dict[str, Any]:
     """Returns success rates and medians by method."""
-    table: dict[str, dict[str, float | None]] = {}
+    table: dict[str, dict[str, float]] = {}
     spread_mm = np.array([row["spread_mm"] for row in rows])
-    is_held = None
-    if "surface_spread_mm" in rows[0]:
-        is_held = np.array([row["surface_spread_mm"] for row in rows]) < _RIGHT_SHARE * spread_mm
     for name in methods:
         values = {key: np.array([row[name][key] for row in rows]) for key in rows[0][name]}
         is_right = (values["ate_mm"] < _RIGHT_SHARE * spread_mm) & (values["point_distance_mm"] < _RIGHT_MM)
@@ -165,10 +223,7 @@ def summarise(rows: Sequence[cli.Row], methods: Sequence[str]) -> dict[str, Any]
         medians = {f"median_{key}": float(np.median(values[key])) for key in ("ate_mm", "point_distance_mm", "run_s")}
         success = float((values["ate_mm"] < _SUCCESS_MM).mean())
         table[name] = {"success": success, "right": float(is_right.mean()), **medians}
-        if is_held is not None:
-            table[name]["right_of_held"] = float(is_right[is_held].mean()) if is_held.any() else None
-    held = {} if is_held is None else {"num_held_by_surfaces": int(is_held.sum())}
-    return {"num_trajectories": len(rows), **held, "methods": table}
+    return {"num_trajectories": len(rows), "methods": table}
 
 
 def report(rows: list[cli.Row], methods: Sequence[str]) -> cli.Summary:
@@ -176,9 +231,7 @@ def report(rows: list[cli.Row], methods: Sequence[str]) -> cli.Summary:
     numbers = summarise(rows, methods)
     right = f"below {_RIGHT_SHARE:.0%} of the spread, turns {_RIGHT_DEG:g} degrees, points {_RIGHT_MM:g} mm"
     text = f"{len(rows)} trajectories; success: ATE below 450 mm (the paper's); right: ATE {right}"
-    if "num_held_by_surfaces" in numbers:
-        text += f"\nthe surfaces hold {numbers['num_held_by_surfaces']} of them to a tenth of the spread"
-    columns = list(dict.fromkeys(column for row in numbers["methods"].values() for column in row))
+    columns = list(numbers["methods"][methods[0]])
     lines = [[name, *(row[column] for column in columns)] for name, row in numbers["methods"].items()]
     panels = {
         title: {name: [row[name][key] for row in rows] for name in methods}

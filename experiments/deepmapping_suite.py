@@ -21,7 +21,6 @@ from tyro.conf import arg
 
 from dpmjax import cli, metrics, simulation, viz
 from experiments import _deepmapping_methods as shared
-from experiments import _deepmapping_tables as tables
 from experiments._deepmapping_methods import Task
 
 EXPERIMENT = "deepmapping_suite"
@@ -29,7 +28,7 @@ NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(tables.TableOptions):
+class Config(shared.TableOptions):
     """Options of the suite."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods"})
@@ -55,7 +54,7 @@ def list_trajectories() -> list[dict[str, int]]:
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs the missing cases, and writes the table."""
-    return tables.run_methods(
+    return shared.run_methods(
         config, EXPERIMENT, list_trajectories()[: config.limit], partial(_prepare, config), report
     )
 
@@ -80,7 +79,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {
         **_medians(rows),
         **{name: float(np.median([row[key] for row in rows])) for name, key in medians.items() if key in rows[0]},
-        **tables.success_of_trusted(rows),
+        **shared.success_of_trusted(rows),
         "candidates": {
             name: {
                 **_medians([row["candidates"][name] for row in rows if name in row["candidates"]]),

@@ -16,22 +16,33 @@ out of the fits. `python -m experiments.dpm_confidence` checks the confidence on
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, load_model, metrics, save_model, simulation, viz
+from dpmjax import cli, encode, load_model, register, save_model, simulation, viz
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
+from dpmjax.metrics import area_under_curve, brier_score, registration_recall
+from dpmjax.simulation import HDL32E, OS1_64, VLP16, SceneMixture, draw_scene, simulate_scene
 from dpmjax.weights import read_card
-from experiments import _dpm_calibration_pairs as pairs_of
-from experiments._dpm_calibration_pairs import KINDS, ambiguous_case, ambiguous_drive, measure_pairs
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
+AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
+LIDARS = (VLP16, HDL32E, OS1_64)
+BEAMS = {len(lidar.elevations_deg): lidar for lidar in LIDARS}
+KINDS = ("of_clouds", "of_scans", "of_weak_scans")
+# Elements of a scan in the map of SLAM, and in `register(..., refine=True)` with a cloud.
+NUM_ELEMENTS = 1024
+PAIR_STREAM = 4141
+# Scans of each town, and of another town beside, that pairs are made of.
+NUM_SCANS, NUM_OTHER_SCANS = 36, 12
+TOWN_STREAM = 4134
 OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
 TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (60.0, np.inf))
 # The two ends of a corridor may look alike: no evidence tells a pair without overlap from a right one.
@@ -72,7 +83,7 @@ def main(config: Config) -> list[cli.Row]:
             # The other town is that of the next row.
             seeds = (case["overlap_town"], case["overlap_town"] + 1)
             drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
-            return pairs_of.measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
+            return measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
         drive, bands_m = open_place(**case)
         return measure_pairs(model, drive, bands_m, NUM_PAIRS, seed=config.seed, on_pair=run.check_stop)
 
@@ -82,7 +93,7 @@ def main(config: Config) -> list[cli.Row]:
 
 def list_cases(config: Config) -> list[cli.Row]:
     """Returns the places of the confidence, then the towns of the overlap."""
-    kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
+    kinds = [kind for kind, _ in SceneMixture().kinds]
     towns = [{"town": FIRST_TOWN + number, "kind": kinds[number % len(kinds)]} for number in range(config.towns)]
     places = [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(config.ambiguous)]
     return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(config.overlap_towns)]
@@ -112,7 +123,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
         for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png"))
     }
     if overlap_rows:
-        fitted, overlap_numbers, found = pairs_of.fit_overlap(overlap_rows)
+        fitted, overlap_numbers, found = fit_overlap(overlap_rows)
         numbers |= overlap_numbers
         calibrated = replace(calibrated, overlap=fitted)
         note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
@@ -148,15 +159,136 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, dict[s
             continue
         place, features, is_right = (np.array(column) for column in zip(*pairs, strict=True))
         models[kind] = dpm.fit_logistic(names, features, is_right)
-        confidence = pairs_of.held_out_probability(names, features, is_right, place)
+        confidence = held_out_probability(names, features, is_right, place)
         held_out[kind] = {"confidence": confidence, "is_right": is_right}
         numbers |= {
             f"num_pairs_{kind}": len(pairs),
             f"share_right_{kind}": float(is_right.mean()),
-            f"brier_{kind}": metrics.brier_score(confidence, is_right),
+            f"brier_{kind}": brier_score(confidence, is_right),
             f"brier_of_a_constant_{kind}": float(is_right.var()),
         }
     return dpm.Calibration(**models), numbers, held_out
+
+
+def ambiguous_case(number: int, first_seed: int) -> dict[str, Any]:
+    """Returns the case of one of the ambiguous places: kinds of place take turns, then lidars do."""
+    beams = list(BEAMS)[number // len(AMBIGUOUS) % len(BEAMS)]
+    return {"place": first_seed + number, "kind": AMBIGUOUS[number % len(AMBIGUOUS)], "beams": beams}
+
+
+def ambiguous_drive(place: int, kind: str, beams: int, length_m: float) -> LidarSequence:
+    """Simulates an ambiguous place in its true size."""
+    mixture = SceneMixture(
+        kinds=((kind, 1.0),), sensors=((BEAMS[beams], 1.0),), indoor_scale=(1.0, 1.0), length_m=length_m
+    )
+    return simulate_scene(draw_scene(place, mixture))
+
+
+def measure_pairs(
+    model: dpm.Model,
+    drive: LidarSequence,
+    bands_m: tuple[tuple[float, float], ...],
+    num_pairs: int,
+    *,
+    seed: int,
+    on_pair: Callable[[], object],
+) -> dict[str, Any]:
+    """Registers random pairs as scans, and as clouds of surface elements.
+
+    Args:
+        model: encoder and decoder.
+        drive: scans with true poses.
+        bands_m: smallest and largest distance of the pairs.
+        num_pairs: number of pairs of each distance, fewer where the drive has fewer.
+        seed: of the draws.
+        on_pair: called after each pair.
+
+    Returns:
+        Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
+        true distance, metres.
+    """
+    names = (*KINDS, "is_right_of_clouds", "is_right", "distance_m")
+    found: dict[str, list[Any]] = {name: [] for name in names}
+    distances = dpm.scan_distances(drive)
+    num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
+    for number, (low, high) in enumerate(bands_m):
+        drawn = dpm.draw_rows_apart(distances, low, high, num_pairs, np.random.default_rng([PAIR_STREAM, number, seed]))
+        for pair in dpm.read_scan_pairs(drive, drawn, seed=seed):
+            result = dpm.register_in_stages(model, pair)
+            clouds = [encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
+            of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
+            motions = np.stack([of_clouds, result.verified])
+            is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
+            for name, features in result.evidence._asdict().items():
+                found[name].append(None if features is None else features.tolist())
+            found["is_right_of_clouds"].append(bool(is_right[0]))
+            found["is_right"].append(bool(is_right[1]))
+            found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))
+            on_pair()
+    return found
+
+
+def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:
+    """Returns evidence and distance of the pairs of a town.
+
+    Half of the pairs are less than 20 m apart, a quarter 20 to 40 m, an eighth farther; an eighth has one scan of
+    another town.
+
+    Args:
+        model: encoder and decoder.
+        drives: drives through the town, and through a second one.
+        num_pairs: number of pairs, about.
+        seed: seed of the run.
+    """
+    rng = np.random.default_rng([TOWN_STREAM, seed])
+    rows = [_spread(len(drive), num) for drive, num in zip(drives, (NUM_SCANS, NUM_OTHER_SCANS), strict=True)]
+    own, other = (dpm.encode_turned(model, drive, some, rng=rng) for drive, some in zip(drives, rows, strict=True))
+    distances = dpm.scan_distances(drives[0])[np.ix_(rows[0], rows[0])]
+    kinds = (
+        (distances < dpm.OVERLAP_M) & (distances > 0),
+        (distances >= dpm.OVERLAP_M) & (distances < dpm.NO_OVERLAP_M),
+        distances >= dpm.NO_OVERLAP_M,
+    )
+    drawn: list[tuple[Any, Any, float]] = []
+    for kind, share in zip(kinds, (2, 4, 8), strict=True):
+        for a, b in dpm.draw_rows(np.argwhere(kind), num_pairs // share, rng):
+            drawn.append((own[a], own[b], float(distances[a, b])))
+    for a, b in dpm.draw_rows(np.argwhere(np.ones((len(own), len(other)))), num_pairs // 8, rng):
+        drawn.append((own[a], other[b], float("inf")))
+    sources, targets, metres = zip(*drawn, strict=True)
+    evidence = np.asarray(dpm.evidence_pairs(model, list(sources), list(targets)))
+    return {"evidence": evidence.tolist(), "is_overlap": [distance < dpm.OVERLAP_M for distance in metres]}
+
+
+def fit_overlap(rows: Sequence[dict[str, Any]]) -> tuple[dpm.LogisticModel, dict[str, Any], dict[str, np.ndarray]]:
+    """Returns the model of overlap, its numbers, and the probability of the pairs of each town when it is left out."""
+    towns = np.concatenate([np.full(len(row["is_overlap"]), row["overlap_town"]) for row in rows])
+    features = np.concatenate([np.asarray(row["evidence"], float) for row in rows])
+    is_overlap = np.concatenate([np.asarray(row["is_overlap"], bool) for row in rows])
+    found = held_out_probability(dpm.OVERLAP_FEATURES, features, is_overlap, towns)
+    numbers = {
+        "num_overlap_pairs": len(towns),
+        "auc_overlap": area_under_curve(found, is_overlap),
+        "brier_overlap": brier_score(found, is_overlap),
+        "brier_of_a_constant_overlap": float(is_overlap.var()),
+    }
+    fitted = dpm.fit_logistic(dpm.OVERLAP_FEATURES, features, is_overlap)
+    return fitted, numbers, {"probability": found, "is_overlap": is_overlap}
+
+
+def held_out_probability(
+    names: tuple[str, ...], features: np.ndarray, labels: np.ndarray, towns: np.ndarray
+) -> np.ndarray:
+    """Returns the probability of each example by a fit on all towns but its own."""
+    found = np.empty(len(towns))
+    for town in np.unique(towns):
+        part = towns == town
+        found[part] = dpm.logistic_probability(dpm.fit_logistic(names, features[~part], labels[~part]), features[part])
+    return found
+
+
+def _spread(num: int, num_kept: int) -> np.ndarray:
+    return np.unique(np.linspace(0, num - 1, num_kept).astype(int))
 
 
 if __name__ == "__main__":

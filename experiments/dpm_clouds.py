@@ -32,13 +32,11 @@ ELEMENTS = (256, 512, 768, 1024)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class Config(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="scenes|PATH ...")] = ("scenes",)
     """Folders of scans with poses, or simulated scenes."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     pairs: Annotated[int, arg(metavar="N")] = 20
     """Pairs for each distance."""
 
@@ -116,14 +114,7 @@ def first_elements(cloud: DescriptorCloud, num: int | None) -> DescriptorCloud:
     """Returns the cloud with its first elements; None leaves the descriptors without elements."""
     if num is None:
         return cloud.described
-    assert cloud.normals is not None
-    assert cloud.planarity is not None
-    return cloud.replace(
-        positions=cloud.positions[:num],
-        mask=cloud.mask[:num],
-        normals=cloud.normals[:num],
-        planarity=cloud.planarity[:num],
-    )
+    return cloud.replace(**{name: getattr(cloud, name)[:num] for name in ("positions", "mask", "normals", "planarity")})
 
 
 def table(rows: Sequence[cli.Row], stages: Sequence[str]) -> str:

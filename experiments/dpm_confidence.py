@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, load_model, metrics
 from dpmjax import deeppointmap as dpm
-from experiments._dpm_calibration_pairs import ambiguous_case, ambiguous_drive, measure_pairs
+from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, measure_pairs
 
 EXPERIMENT = "dpm_confidence"
 # Apart from the seeds of the calibration.

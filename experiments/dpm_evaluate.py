@@ -16,42 +16,55 @@ more methods see the same pairs: the search and the verification of `register` w
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
 file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated. The
-option --refine adds two rows: the keyframes of our run, refined by DeepMapping, and by multiway registration (Open3D,
-extra `baselines`), from the same poses. The file table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps,
-localisations and seconds a scan. The seconds are of all scans, and of the first and the last tenth, which show whether
-they grow. trajectories.png and map_sizes.png show the trajectories and the bytes of maps; drives/ holds the
-trajectories of every method and the files of our run. `_slam_evaluation.py` says how loops are counted.
+file table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps, localisations and seconds a scan. The seconds
+are of all scans, and of the first and the last tenth, which show whether they grow. trajectories.png and map_sizes.png
+show the trajectories and the bytes of maps; drives/ holds the trajectories of every method and the files of our run.
+`_slam_evaluation.py` says how loops are counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, load_model
+from dpmjax import cli, load_model, registration_recall
+from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
+from dpmjax.metrics import mcnemar_p_value, wilson_interval
 
 EXPERIMENT = "dpm_evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
+# KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
+VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
+Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
+NETWORK, VERIFIED = "network alone", "network, search and verification"
+SEARCH, KISS = "search and verification, no network", "KISS-Matcher"
+# The row and its entry that say which pairs a method has registered right.
+_ANSWERS = {
+    NETWORK: ("DeepPointMap", "is_right_descriptors"),
+    VERIFIED: ("DeepPointMap", "is_right"),
+    SEARCH: ("search", "is_right"),
+    KISS: ("KISS-Matcher", "is_right"),
+}
+MONITORED = ("kitti_00_drive",)
+"""Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(cli.DriveOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"refine"})
-
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     slam: FlagCreatePairsOff[bool] = False
     """Compare SLAM on whole drives instead of registrations of pairs."""
     pairs: Annotated[int, arg(metavar="N")] = 30
@@ -62,8 +75,6 @@ class Config(cli.DriveOptions):
     """Length of the towns' routes; two numbers with --slam: from that of the first town to that of the last."""
     no_kiss: FlagCreatePairsOff[bool] = False
     """Leave KISS-Matcher out."""
-    refine: FlagCreatePairsOff[bool] = False
-    """With --slam: polish the keyframes of our run by DeepMapping, and by Open3D's multiway registration."""
     localize: Annotated[int, arg(metavar="N")] = 50
     """With --slam: number of scans that are looked for in the map of the first half; 0 leaves it out."""
 
@@ -75,8 +86,8 @@ class Config(cli.DriveOptions):
             raise ValueError("give at least one folder of scans, or town")
         if not 1 <= len(self.town_length_m) <= (2 if self.slam else 1):
             raise ValueError("--town-length-m: expected one length, or two with --slam")
-        if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction or self.refine):
-            raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction, --refine")
+        if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction):
+            raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction")
 
 
 def main(config: Config) -> list[cli.Row]:
@@ -88,19 +99,14 @@ def evaluate_slam(config: Config) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
     from experiments import _slam_comparison as comparison
 
-    compared = comparison.Comparison(
-        weights=config.weights, seed=config.seed, is_refined=config.refine, num_localized=config.localize
-    )
     seeds = range(cli.FIRST_TOWN, cli.FIRST_TOWN + config.num_towns)
     lengths_m = np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist()
     drives = comparison.open_drives(config.paths, config, dict(zip(seeds, lengths_m, strict=True)))
-    return comparison.compare(config, EXPERIMENT, compared, drives)
+    return comparison.compare(config, EXPERIMENT, drives, config.localize)
 
 
 def evaluate_pairs(config: Config) -> list[cli.Row]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
-    from experiments._dpm_evaluation import evaluate_matcher, kiss_matcher, search_alone
-
     model = load_model(config.weights)
     matchers = {"search": partial(search_alone, config=model.config.verification), "KISS-Matcher": kiss_matcher}
     drives = cli.open_evaluation_drives(config.paths, cli.evaluation_towns(config.num_towns, config.town_length_m[0]))
@@ -128,8 +134,6 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
 
 def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row], no_kiss: str | None) -> cli.Summary:
     """Returns the numbers, the tables and the pictures of the pairs."""
-    from experiments._dpm_evaluation import pooled_rows, pooled_table, table
-
     recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
     pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])
     numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **cli.calibration_numbers(rows)}
@@ -137,6 +141,125 @@ def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row],
     text = "\n\n".join(filter(None, [table(rows), pooled_table(pooled), *notes]))
     draw = partial(cli.draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
     return cli.Summary({**numbers, "pooled": pooled}, text, draw)
+
+
+def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Returns `T_target_source` of KISS-Matcher (Lim et al. 2025)."""
+    import kiss_matcher
+
+    ranges = np.linalg.norm(np.concatenate([source, target]), axis=1)
+    voxel_m = INDOOR_VOXEL_M if np.median(ranges) < INDOORS_M else VOXEL_M
+    matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel_m))
+    found = matcher.estimate(list(source.astype(np.float32)), list(target.astype(np.float32)))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = found.rotation, np.ravel(found.translation)
+    return T
+
+
+def search_alone(source: np.ndarray, target: np.ndarray, config: dpm.VerificationConfig) -> np.ndarray:
+    """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
+    measured = dpm.measure_scan(source, config), dpm.measure_scan(target, config)
+    chosen = dpm.choose_motion(*measured, np.eye(4)[None], config)
+    return dpm.refine_motion(*measured, chosen, config).T_target_source
+
+
+def evaluate_matcher(
+    matcher: Matcher, drive: LidarSequence, band: str, num_pairs: int, *, seed: int, on_pair: Callable[[], object]
+) -> cli.Row:
+    """Returns errors and seconds of another matcher on the same pairs."""
+    motions, seconds, true = [], [], []
+    for pair in dpm.read_scan_pairs(drive, dpm.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
+        started = time.perf_counter()
+        motions.append(matcher(pair.source, pair.target))
+        seconds.append(time.perf_counter() - started)
+        true.append(pair.T_target_source)
+        on_pair()
+    errors = registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
+    row = cli.error_columns(errors, "_refined")
+    row["is_right"] = row.pop("is_right_refined")
+    return row | ({"pair_s": float(np.median(seconds))} if seconds else {})
+
+
+def table(rows: Sequence[cli.Row]) -> str:
+    """Returns the rows as a Markdown table: one line a sequence and distance."""
+    columns = (
+        "sequence", "distance", "pairs", f"recall: {NETWORK}", VERIFIED, "the same, refined", f"{SEARCH}, refined",
+        KISS, "median error: network alone", "refined", "s / pair", f"{KISS}, s", "overlap AUC",
+    )  # fmt: skip
+    by_case = {(row["method"], row["sequence"], row["band"]): row for row in rows}
+    lines = []
+    for (method, sequence, band), row in by_case.items():
+        if method != "DeepPointMap" or band not in cli.BAND_NAMES or not row["num_pairs"]:
+            continue
+        kiss, search = (by_case.get((other, sequence, band), {}) for other in ("KISS-Matcher", "search"))
+        auc = by_case.get(("overlap", sequence, "all"), {}).get("auc") if band == "near" else None
+        recalls = (row[f"recall_{stage}"] for stage in ("descriptors", "verified", "refined"))
+        others = (other.get("recall_refined") for other in (search, kiss))
+        errors = (cli.length_text(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
+        seconds = (row["pair_s"], kiss.get("pair_s"), cli.cell_text(auc, 3))
+        lines.append([sequence, cli.BAND_NAMES[band], row["num_pairs"], *recalls, *others, *errors, *seconds])
+    return cli.markdown(columns, lines)
+
+
+def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> list[dict[str, Any]]:
+    """Pools the rows of pairs over drives, with and without those that were watched during the training.
+
+    Args:
+        rows: rows of `dpm_evaluate`.
+        drives: names of the drives to pool.
+
+    Returns:
+        One row for each set of drives, band and method that has registered all pairs of the set. `p_values` holds, by
+        the name of another method, the p-value of the difference.
+    """
+    sets = {"all drives": list(drives)}
+    unseen = [name for name in drives if name not in MONITORED]
+    if len(unseen) < len(drives):
+        sets[f"all drives but {', '.join(sorted(set(drives) - set(unseen)))}"] = unseen
+    pooled: list[dict[str, Any]] = []
+    for (title, names), band in itertools.product(sets.items(), cli.BAND_NAMES):
+        answers = {method: _answers(rows, method, names, band) for method in _ANSWERS}
+        known = {method: of_all for method, of_all in answers.items() if of_all is not None and len(of_all)}
+        for method, is_right in known.items():
+            share, low, high = wilson_interval(int(is_right.sum()), len(is_right))
+            others = {name: mcnemar_p_value(is_right, other) for name, other in known.items() if name != method}
+            numbers = {"num_pairs": len(is_right), "num_right": int(is_right.sum())}
+            interval = {"recall": share, "recall_low": low, "recall_high": high}
+            case = {"drives": title, "sequences": names, "band": band, "method": method}
+            pooled.append({**case, **numbers, **interval, "p_values": others})
+    return pooled
+
+
+def _answers(rows: Sequence[Mapping[str, Any]], method: str, drives: Sequence[str], band: str) -> np.ndarray | None:
+    """Returns which pairs of all drives are right; None where the method has not registered those of every drive."""
+    name, entry = _ANSWERS[method]
+    by_drive = {row["sequence"]: row for row in rows if row["method"] == name and row["band"] == band}
+    if any(entry not in by_drive.get(drive, {}) for drive in drives):
+        return None
+    return np.concatenate([np.zeros(0, bool), *(np.asarray(by_drive[drive][entry], bool) for drive in drives)])
+
+
+def pooled_table(pooled: Sequence[Mapping[str, Any]]) -> str:
+    """Returns the pooled rows as Markdown; without any, an empty string."""
+    if not pooled:
+        return ""
+    lines = []
+    for row in pooled:
+        p_values = "; ".join(f"{name} {_p_value(p)}" for name, p in row["p_values"].items())
+        recall = f"{row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f})"
+        numbers = (row["num_pairs"], row["method"], row["num_right"], recall)
+        lines.append([row["drives"], cli.BAND_NAMES[row["band"]], *numbers, p_values or "-"])
+    columns = ("pooled over", "distance", "pairs", "method", "right", "recall (95 % interval)")
+    text = cli.markdown((*columns, "p against the other methods"), lines)
+    notes = "Intervals: Wilson. p: McNemar's exact test, two-sided, on the same pairs."
+    notes += " All motions but those of the network alone and of KISS-Matcher are refined."
+    if watched := sorted({name for row in pooled for name in row["sequences"]} & set(MONITORED)):
+        notes += f" The recall on {', '.join(watched)} was watched during the training: it is no unseen drive."
+    return f"{text}\n\n{notes}"
+
+
+def _p_value(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 if __name__ == "__main__":

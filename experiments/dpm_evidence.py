@@ -44,11 +44,9 @@ LENGTH_M = 200.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class Config(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """The network that proposes the hypotheses."""
     pairs: Annotated[int, arg(metavar="N")] = 20
     """Pairs of each distance of each scene."""
     scenes: Annotated[int, arg(metavar="N")] = len(SCENES)

@@ -31,13 +31,11 @@ EXPERIMENT = "dpm_keyframes"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class Config(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")]
     """Folders of scans with poses."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     keyframes: Annotated[tuple[int, ...], arg(metavar="N ...")] = (1, 4, 8, 16)
     """Numbers of keyframes that are merged, one column each."""
 

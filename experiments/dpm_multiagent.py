@@ -16,17 +16,18 @@ of each drive, and table.md a row a drive. A file of poses (TUM, KITTI) stands f
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, load_model, viz
+from dpmjax import cli, load_model, metrics, viz, write_g2o
+from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from dpmjax.slam import SlamMethods, join_agents, make_methods
-from experiments._slam_agents import agent_panels, agents_numbers, cut_sequence, summary, table, write_agents
+from dpmjax.slam import AgentsResult, SlamMethods, as_pose_graph, join_agents, make_methods, take_component
 
 EXPERIMENT = "dpm_multiagent"
 
@@ -45,8 +46,6 @@ class Config(cli.DriveOptions):
     """Number of parts that one drive is cut into."""
     overlap: Annotated[float, arg(metavar="SHARE")] = 0.05
     """By this share of its length a part is longer at each end."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -66,22 +65,21 @@ def main(config: Config) -> Any:
     if not config.cut:
         folder = cli.open_run_folder(config, EXPERIMENT)
         with cli.recording(folder), cli.StopFlag() as stop:
-            metrics = map_agents(folder, config, methods, runs[0], lambda: stop.is_requested)
-            metrics |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
-            cli.write_metrics(folder, metrics, seed=config.seed)
-            print(f"{summary(metrics)}\nresults in {folder.path}")
-        return metrics
+            numbers = map_agents(folder, config, methods, runs[0], lambda: stop.is_requested)
+            numbers |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
+            cli.write_metrics(folder, numbers, seed=config.seed)
+            print(f"{summary(numbers)}\nresults in {folder.path}")
+        return numbers
     by_name = {sequences[0].name: sequences for sequences in runs}
 
     def work(run: cli.TableRun, sequence: str) -> cli.Row:
         part = run.folder.part("drives", sequence)
-        numbers = map_agents(part, config, methods, by_name[sequence], run.is_stopped)
+        row = map_agents(part, config, methods, by_name[sequence], run.is_stopped)
         run.check_stop()
-        return numbers
+        return row
 
-    numbers = {"weights": config.weights}
-    cases = [{"sequence": name} for name in by_name]
-    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(numbers, table(rows)))
+    cases, weights = [{"sequence": name} for name in by_name], {"weights": config.weights}
+    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(weights, table(rows)))
 
 
 def map_agents(
@@ -100,12 +98,12 @@ def map_agents(
     mapped = [sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)]
     with cli.progress_bar("loops between agents", " keyframes") as on_keyframe:
         result = join_agents(methods, agents, on_keyframe=on_keyframe)
-    metrics = {"weights": config.weights, "overlap": config.overlap, **agents_numbers(result, mapped)}
-    for agent, size in zip(metrics["agents"], write_agents(folder, result, mapped), strict=True):
+    numbers = {"weights": config.weights, "overlap": config.overlap, **agents_numbers(result, mapped)}
+    for agent, size in zip(numbers["agents"], write_agents(folder, result, mapped), strict=True):
         agent |= size
-    cli.write_metrics(folder, metrics, seed=config.seed)  # numbers first: a picture that fails must not cost them
+    cli.write_metrics(folder, numbers, seed=config.seed)  # numbers first: a picture that fails must not cost them
     viz.save_figure(viz.agents_figure(f"{len(mapped)} agents", agent_panels(result, mapped)), folder / "agents.png")
-    return metrics
+    return numbers
 
 
 def agent_methods(config: Config) -> SlamMethods:
@@ -121,6 +119,210 @@ def open_runs(config: Config) -> list[list[LidarSequence]]:
     if len({drive.name for drive in drives}) < len(drives):
         raise ValueError(f"two drives have the same name ({', '.join(drive.name for drive in drives)})")
     return [cut_sequence(drive, config.agents, config.overlap) for drive in drives]
+
+
+def cut_sequence(sequence: LidarSequence, num_agents: int, overlap: float) -> list[LidarSequence]:
+    """Cuts a sequence into parts of one length, each longer by a share of it at both ends (DeepPointMap section 5.3).
+
+    Raises:
+        ValueError: fewer scans than agents.
+    """
+    num = len(sequence)
+    if num < num_agents:
+        raise ValueError(f"{sequence.name}: {num} scans are too few for --agents {num_agents}")
+    length, parts = num / num_agents, []
+    for agent in range(num_agents):
+        start = max(round(agent * length - overlap * length), 0)
+        end = min(round((agent + 1) * length + overlap * length), num)
+        parts.append(sequence.take(slice(start, end)))
+    return parts
+
+
+def write_agents(
+    folder: cli.RunFolder, result: AgentsResult, sequences: Sequence[LidarSequence]
+) -> list[dict[str, int]]:
+    """Writes trajectories, graph, loops and maps; returns the bytes that each agent sends at each precision."""
+    sizes = []
+    for number, (T_world_scan, agent, sequence) in enumerate(
+        zip(result.T_world_scan, result.agents, sequences, strict=True), start=1
+    ):
+        cli.write_trajectory(folder.path, T_world_scan, sequence.times, f"agent_{number}")
+        path = folder.part("agents", f"agent_{number}") / "map.npz"
+        sizes.append(cli.write_map_file(path, agent.map) if len(agent.map) else {})
+    for component in range(max(result.component) + 1):
+        slam_map = take_component(result.joined, component)
+        if len(slam_map):
+            cli.write_map_file(folder / f"map_{component + 1}.npz", slam_map)
+    if len(result.joined.slam_map):
+        write_g2o(folder / "graph.g2o", as_pose_graph(result.joined.slam_map))
+    columns = ("kind", "agent", "scan", "other_agent", "other_scan", *cli.LOOP_CELLS)
+    cli.write_table(folder / "loops.csv", columns, loop_rows(result))
+    return sizes
+
+
+def loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
+    """Returns candidates within agents, then those between them, by agents counted from 1 and their scans."""
+    joined: list[dict[str, int]] = []
+    within: list[dict[str, Any]] = []
+    for number, agent in enumerate(result.agents, start=1):
+        ends = [{"agent": number, "scan": int(scan)} for scan in agent.keyframes]
+        within += cli.loop_rows(agent.loops, ends)
+        joined += ends
+    kinds = {"within": within, "between": cli.loop_rows(result.joined.loops, joined)}
+    return [{"kind": kind, **row} for kind, rows in kinds.items() for row in rows]
+
+
+def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> dict[str, Any]:
+    """Returns what `metrics.json` says: errors of each component in its one frame, of each agent, and bytes."""
+    references = [sequence.T_world_lidar for sequence in sequences]
+    agents = [
+        {
+            "agent": number,
+            "sequence": sequence.name,
+            "component": result.component[number - 1] + 1,
+            "num_scans": len(T_world_scan),
+            "num_keyframes": len(agent.keyframes),
+            "num_loops": len(cli.accepted_ends(agent.loops)),
+            **cli.trajectory_errors(T_world_scan, reference),
+            **cli.trajectory_errors(agent.T_world_scan, reference, "_alone"),
+            **traffic._asdict(),
+        }
+        for number, (T_world_scan, agent, traffic, sequence, reference) in enumerate(
+            zip(result.T_world_scan, result.agents, result.traffic, sequences, references, strict=True), start=1
+        )
+    ]
+    components = [
+        {
+            "component": component + 1,
+            "agents": [number + 1 for number in members],
+            "ate_m": joint_ate_m(result, references, members),
+        }
+        for component, members in enumerate(members_of(result))
+    ]
+    return {
+        "num_agents": len(agents),
+        "num_components": len(components),
+        "num_loops_between": len(cli.accepted_ends(result.joined.loops)),
+        "num_wrong_loops_between": num_wrong(result, references),
+        "meetings": [{"agents": pair, "num_loops": num} for pair, num in cli.count_meetings(result.joined)],
+        "ate_m": components[0]["ate_m"] if len(components) == 1 else None,
+        "components": components,
+        "agents": agents,
+    }
+
+
+def num_wrong(result: AgentsResult, references: Sequence[np.ndarray | None]) -> int | None:
+    """Returns how many loops between agents are wrong beyond 2 m or 5 degrees; None without a reference for each."""
+    known = [reference for reference in references if reference is not None]
+    if len(known) < len(references):
+        return None
+    T = np.concatenate([reference[agent.keyframes] for reference, agent in zip(known, result.agents, strict=True)])
+    source, target = cli.accepted_ends(result.joined.loops).T
+    accepted = [loop.T_target_source for loop in result.joined.loops if loop.status == "accepted"]
+    found = np.reshape(accepted, (-1, 4, 4))
+    return int((~metrics.registration_recall(found, rigid.inverse(T[target]) @ T[source]).is_right).sum())
+
+
+def members_of(result: AgentsResult) -> list[list[int]]:
+    """Returns the agents of each component."""
+    return [
+        [number for number, each in enumerate(result.component) if each == component]
+        for component in range(max(result.component) + 1)
+    ]
+
+
+def joint_ate_m(result: AgentsResult, references: Sequence[np.ndarray | None], members: Sequence[int]) -> float | None:
+    """Returns the ATE of agents in their one frame; None without a reference for each, or from different drives."""
+    pairs = _positions(result, references, members)
+    return None if pairs is None or len(pairs[0]) < 2 else metrics.absolute_trajectory_error(*pairs)
+
+
+def _positions(
+    result: AgentsResult, references: Sequence[np.ndarray | None], members: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns (n, 3) positions of agents and of their references, metres; None without a reference for each."""
+    known = [reference[:, :3, 3] for number in members if (reference := references[number]) is not None]
+    if len(known) < len(members):
+        return None
+    return np.concatenate([result.T_world_scan[number][:, :3, 3] for number in members]), np.concatenate(known)
+
+
+def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> list[viz.AgentPanel]:
+    """Gathers the data of the picture: clouds, tracks and loops of each component."""
+    panels = []
+    map_of_row, T_keyframe = result.joined.map_of_keyframe, result.joined.slam_map.T_world_keyframe
+    for members in members_of(result):
+        pairs = _positions(result, [sequence.T_world_lidar for sequence in sequences], members)
+        T_shown_reference = None if pairs is None else metrics.align_rigid(*reversed(pairs))
+        tracks = []
+        for number in members:
+            scans, sequence, T = result.agents[number].keyframes, sequences[number], result.T_world_scan[number]
+            cloud = cli.gather_map(T[scans], lambda row, read=sequence.read_points, scans=scans: read(int(scans[row])))
+            track = cli.map_track(f"agent {number + 1}, {len(T)} scans", number, T, cloud)
+            if T_shown_reference is not None and sequence.T_world_lidar is not None:
+                R, t = T_shown_reference[:3, :3], T_shown_reference[:3, 3]
+                track = track._replace(reference=sequence.T_world_lidar[:, :3, 3] @ R.T + t)
+            tracks.append(track)
+        # Rows lie in the frame of the map, trajectories begin at their own origin.
+        T_shown_map = _shown_frame(result, members)
+        ends = cli.accepted_ends(result.joined.loops)
+        ends = ends[np.isin(map_of_row[ends[:, 0]], members)]
+        loops = T_keyframe[ends][..., :3, 3] @ T_shown_map[:3, :3].T + T_shown_map[:3, 3]
+        drives = ", ".join(dict.fromkeys(sequences[number].name for number in members))
+        title = drives + (", in one frame" if len(members) > 1 else ", in a frame of its own")
+        panels.append(viz.AgentPanel(title, tracks, loops))
+    return panels
+
+
+def _shown_frame(result: AgentsResult, members: Sequence[int]) -> np.ndarray:
+    for number in members:
+        rows = np.flatnonzero(result.joined.map_of_keyframe == number)
+        if len(rows):
+            first = result.agents[number].reports[0]
+            T_map_scan = result.joined.slam_map.T_world_keyframe[rows[first.keyframe]] @ first.T_keyframe_scan
+            return np.asarray(result.T_world_scan[number][0] @ rigid.inverse(T_map_scan))
+    return np.eye(4)
+
+
+def summary(numbers: dict[str, Any]) -> str:
+    """Returns the lines on the console."""
+    lines = []
+    for agent in numbers["agents"]:
+        sent, scans = agent.get("map_bytes_int8", agent["keyframe_bytes"]) / 1e6, agent["scan_bytes"] / 1e6
+        line = f"agent {agent['agent']}: {agent['num_scans']} scans, {agent['num_keyframes']} keyframes, "
+        line += f"{sent:.1f} MB sent instead of {scans:.1f} MB of points"
+        if "ate_m" in agent:
+            line += f"; ATE {agent['ate_m']:.3f} m, alone {agent['ate_alone_m']:.3f} m"
+        lines.append(line)
+    for component in numbers["components"]:
+        members = ", ".join(map(str, component["agents"]))
+        text = "one frame" if len(component["agents"]) > 1 else "met nobody, a frame of its own"
+        ate = component["ate_m"]
+        lines.append(f"agents {members}: {text}" + ("" if ate is None else f", ATE together {ate:.3f} m"))
+    return "\n".join([*lines, f"{numbers['num_loops_between']} loops between agents"])
+
+
+def table(rows: Sequence[cli.Row]) -> str:
+    """Returns a table as Markdown, one line for each drive that was cut."""
+    columns = ("drive", "scans", "ATE of each agent (alone), m", "loops between (wrong)", "in one frame: ATE, m")
+    return cli.markdown((*columns, "sent by each, MB", "points of all scans, MB"), map(_drive_cells, rows))
+
+
+def _drive_cells(row: cli.Row) -> list[str]:
+    agents = row["agents"]
+    errors = "; ".join(f"{a['ate_m']:.3f} ({a['ate_alone_m']:.3f})" if "ate_m" in a else "-" for a in agents)
+    met = [f"{' and '.join(map(str, one['agents']))}: {one['num_loops']}" for one in row["meetings"]]
+    wrong = "" if row["num_wrong_loops_between"] is None else f" ({row['num_wrong_loops_between']})"
+    together = (f"{', '.join(map(str, one['agents']))}: {cli.cell_text(one['ate_m'], 3)}" for one in row["components"])
+    return [
+        row["sequence"],
+        ", ".join(str(agent["num_scans"]) for agent in agents),
+        errors,
+        (", ".join(met) or "none") + wrong,
+        "; ".join(together),
+        ", ".join(f"{agent.get('map_bytes_int8', agent['keyframe_bytes']) / 1e6:.2f}" for agent in agents),
+        ", ".join(f"{agent['scan_bytes'] / 1e6:.0f}" for agent in agents),
+    ]
 
 
 if __name__ == "__main__":

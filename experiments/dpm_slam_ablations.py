@@ -17,20 +17,8 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import Model, cli, load_model, save_map
+from dpmjax import Model, cli, load_model, save_map, slam
 from dpmjax.scans import surface_at
-from dpmjax.slam import (
-    Alignment,
-    Geometry,
-    LocalMap,
-    Match,
-    Matcher,
-    SlamConfig,
-    SlamMethods,
-    Submap,
-    ThinnedScan,
-    make_methods,
-)
 from experiments._slam_comparison import open_drives
 from experiments._slam_evaluation import PRECISIONS, Drive, file_name, map_path, map_row, open_folder, with_network
 
@@ -52,8 +40,6 @@ class Config(cli.DriveOptions):
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")]
     """Folders of scans with poses, or files of poses."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
 
 
 def main(config: Config) -> list[cli.Row]:
@@ -77,12 +63,12 @@ def evaluate(drive: Drive, model: Model, setting: str) -> cli.Row:
     return {**row, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
 
 
-def ablated(model: Model, setting: str) -> SlamMethods:
+def ablated(model: Model, setting: str) -> slam.SlamMethods:
     """Returns the methods of a setting."""
     if setting.endswith(NO_OFFSETS):
         decoder = replace(model.config.decoder, predicts_offsets=False)
         model = replace(model, config=replace(model.config, decoder=decoder))
-    methods, setting = make_methods(model), setting.removesuffix(NO_OFFSETS)
+    methods, setting = slam.make_methods(model), setting.removesuffix(NO_OFFSETS)
     if setting == NETWORK:
         return with_network(methods)
     if setting == DECODER:
@@ -112,18 +98,18 @@ def table(rows: Sequence[cli.Row]) -> str:
     return cli.markdown((*columns, "map int8, float32, MB"), lines)
 
 
-def with_fewer_elements(model: Model, num_elements: int) -> SlamMethods:
+def with_fewer_elements(model: Model, num_elements: int) -> slam.SlamMethods:
     """Returns methods whose scans and keyframes have at most `num_elements` surface elements.
 
     Fewer elements of the same surface are farther apart, by the root of the ratio: radii of odometry grow with it.
     """
     factor = max(math.sqrt(model.config.pyramid.stages[0].num_points / num_elements), 1.0)
-    whole = make_methods(model, _with_wider_radii(SlamConfig(), factor))
+    whole = slam.make_methods(model, _with_wider_radii(slam.SlamConfig(), factor))
     matcher = _FewerOfKeyframes(whole.matcher, num_elements)
     return whole._replace(matcher=matcher, geometry=_FewerOfScans(whole.geometry, num_elements))
 
 
-def _with_wider_radii(config: SlamConfig, factor: float) -> SlamConfig:
+def _with_wider_radii(config: slam.SlamConfig, factor: float) -> slam.SlamConfig:
     def wider(alignment: Any) -> Any:
         levels = (replace(level, radius_m=factor * level.radius_m) for level in alignment.levels)
         return replace(alignment, levels=tuple(levels))
@@ -134,7 +120,7 @@ def _with_wider_radii(config: SlamConfig, factor: float) -> SlamConfig:
     return replace(config, odometry=odometry)
 
 
-def without_elements(methods: SlamMethods) -> SlamMethods:
+def without_elements(methods: slam.SlamMethods) -> slam.SlamMethods:
     """Returns methods without surface elements: each pose and each loop stays as the decoder proposes it."""
     loops = methods.config.loops
     information = np.diag(np.repeat([loops.sigma_m**-2.0, loops.sigma_rad**-2.0], 3))
@@ -155,11 +141,11 @@ class _Wrapped:
 class _FewerOfKeyframes(_Wrapped):
     """A matcher whose keyframes keep the first elements, in the order of farthest points, and their features."""
 
-    def __init__(self, matcher: Matcher, num_elements: int) -> None:
+    def __init__(self, matcher: slam.Matcher, num_elements: int) -> None:
         super().__init__(matcher)
         self._num = num_elements
 
-    def encode(self, scan: ThinnedScan) -> Any:
+    def encode(self, scan: slam.ThinnedScan) -> Any:
         whole = self._wrapped.encode(scan)
         unit_m, *arrays = whole.elements
         elements = type(whole.elements)(unit_m, *(array[: self._num] for array in arrays))
@@ -170,11 +156,11 @@ class _FewerOfKeyframes(_Wrapped):
 class _FewerOfScans(_Wrapped):
     """A geometry whose scans have their first elements only."""
 
-    def __init__(self, geometry: Geometry, num_elements: int) -> None:
+    def __init__(self, geometry: slam.Geometry, num_elements: int) -> None:
         super().__init__(geometry)
         self._num = num_elements
 
-    def thin(self, points: np.ndarray) -> ThinnedScan | None:
+    def thin(self, points: np.ndarray) -> slam.ThinnedScan | None:
         whole = self._wrapped.thin(points)
         if whole is None:
             return None
@@ -186,23 +172,23 @@ class _FewerOfScans(_Wrapped):
 class _Unmoved(_Wrapped):
     """A geometry that returns the first of the given poses and accepts it."""
 
-    def __init__(self, geometry: Geometry, information: np.ndarray) -> None:
+    def __init__(self, geometry: slam.Geometry, information: np.ndarray) -> None:
         super().__init__(geometry)
         self._information = information
 
-    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
-        return Alignment(T_map_scan, 1.0, 0.0, 1.0, self._information)
+    def align(self, local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
+        return slam.Alignment(T_map_scan, 1.0, 0.0, 1.0, self._information)
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+    def search(self, local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
         return self.align(local_map, scan, T_map_scan[0])
 
 
 class _DecoderAlone(_Wrapped):
     """A matcher that registers the central scans of submaps by their descriptors, and verifies nothing."""
 
-    def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
+    def register(self, pairs: Sequence[tuple[slam.Submap, slam.Submap]]) -> list[slam.Match]:
         proposals = [self._wrapped.propose(source.scans[0], target.scans[0], 1) for source, target in pairs]
-        return [Match(proposal.T_target_source[0], proposal.probability, np.nan) for proposal in proposals]
+        return [slam.Match(proposal.T_target_source[0], proposal.probability, np.nan) for proposal in proposals]
 
 
 if __name__ == "__main__":

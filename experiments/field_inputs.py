@@ -9,13 +9,13 @@ rows.
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -114,7 +114,7 @@ def main(config: Config) -> list[dict[str, Any]]:
     """Runs the missing rows and writes the table."""
     cases = [case for case in CASES if not config.only or Path(case.data).name in config.only]
     named = [{"data": case.data, "command": case.command} for case in cases]
-    return run_table(config, EXPERIMENT, named, partial(_run, config=config), report)
+    return run_table(config, EXPERIMENT, named, functools.partial(_run, config=config), report)
 
 
 def report(rows: list[dict[str, Any]]) -> Summary:
@@ -155,10 +155,8 @@ def _turned_deg(T: NDArray[np.float64]) -> float:
 
 def _value(metrics: dict[str, Any], key: str) -> Any:
     """Returns a number by its path, with dots between the names; None where it is missing."""
-    found: Any = metrics
-    for name in key.split("."):
-        found = found.get(name) if isinstance(found, dict) else None
-    return found
+    names = key.split(".")
+    return functools.reduce(lambda found, name: found.get(name) if isinstance(found, dict) else None, names, metrics)
 
 
 def table_of(rows: list[dict[str, Any]]) -> str:

@@ -5,14 +5,12 @@
 
 Writes toy.png (figure 14), endings.png (the ends of all seeds) and metrics.json. The metrics are the share of seeds
 that reach the global minimum, in the network form and in the direct form, from the same starts. The direct form is
-solved by plain descent and by three solvers of jaxopt. The metrics cover several initialisations and learning rates,
-and the seconds beside a plain PyTorch loop where torch is installed.
+solved by plain descent and by three solvers of jaxopt. The metrics cover several initialisations and learning rates.
 """
 
 from __future__ import annotations
 
 import itertools
-import time
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, get_args
 
@@ -71,8 +69,6 @@ def main(config: Config) -> dict[str, Any]:
             "steps": config.steps,
             "share_at_global_minimum": {name: share_at_minimum(x) for name, x in ends.items()},
             "variants": variants,
-            "seconds": measure_seconds(paper, config),
-            "peak_rss_gb": cli.peak_rss_gb(),
         }
         cli.write_metrics(folder, metrics, seed=config.seed)
         x = np.linspace(-VIEW, VIEW, 2401)
@@ -108,7 +104,7 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.f
     import jax
     import jax.numpy as jnp
 
-    from experiments.baselines.direct import minimize_toy
+    from experiments._baselines import minimize_toy
 
     runs = descend_both(toy, config)
     network, direct = map(path, runs)
@@ -154,41 +150,6 @@ def share_at_minimum(x: NDArray[np.floating]) -> float:
     return float(is_at_minimum(x).mean())
 
 
-def measure_seconds(toy: dm.ToyConfig, config: Config) -> dict[str, Any]:
-    """Returns seconds of the network form: all seeds in one vmap, one seed, one seed in a PyTorch loop."""
-    seconds: dict[str, Any] = {}
-    for name, seeds in (("all_seeds", config.seeds), ("one_seed", 1)):
-        run = descend(toy, replace(config, seeds=seeds))
-        seconds |= {f"{name}_compile_s": run.compile_s, f"{name}_run_s": run.run_s}
-    if (reason := cli.why_not_importable("torch")) is not None:
-        print(f"the loop in PyTorch is not timed: {reason}")
-    else:
-        seconds["torch_one_seed_run_s"] = torch_seconds(toy, config.seed)
-    return seconds
-
-
-def torch_seconds(toy: dm.ToyConfig, seed: int) -> float:
-    """Returns the seconds of the same descent of one seed as a plain loop in PyTorch."""
-    import torch
-
-    torch.manual_seed(seed)
-    widths = (1, *toy.net.features, 1)
-    layers: list[Any] = []
-    for before, after in itertools.pairwise(widths):
-        layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
-    net = torch.nn.Sequential(*layers[:-1])
-    z = torch.randn(1, requires_grad=True)
-    optimizer = torch.optim.SGD([*net.parameters(), z], lr=toy.learning_rate)
-    begun = time.perf_counter()
-    for _ in range(toy.num_steps):
-        x = net(z)
-        loss = (0.5 * x**2 + 5.0 * torch.sin(10.0 * x) + 20.0 * torch.sin(x)).sum()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    return time.perf_counter() - begun
-
-
 def report(metrics: dict[str, Any]) -> str:
     """Returns the shares as lines."""
     minimum = f"x = {metrics['x_global']:.3f}, L = {metrics['loss_global']:.3f}"
@@ -200,7 +161,7 @@ def report(metrics: dict[str, Any]) -> str:
         f"network {100 * row['network']:5.1f} %, direct {100 * row['direct']:5.1f} %"
         for row in metrics["variants"]
     ]
-    return "\n".join([*lines, ", ".join(f"{name} {value:.3g}" for name, value in metrics["seconds"].items())])
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

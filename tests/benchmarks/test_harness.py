@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.rows import Row, format_table, measure
+from benchmarks import Row, format_table, measure
 
 REPOSITORY = Path(__file__).parents[2]
 

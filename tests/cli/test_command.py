@@ -35,7 +35,6 @@ from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_
 @dataclass(frozen=True, kw_only=True)
 class Config(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"steps"})
-    old_names: ClassVar[dict[str, str]] = {"--iterations": "--steps"}
 
     data: tyro.conf.Positional[Path | None] = None
     """Scans."""
@@ -141,10 +140,6 @@ def test_a_folder_that_is_taken_is_refused_before_the_input_is_read(toy, tmp_pat
     code, output, errors = finish(toy("missing.pcd", "-o", "."))
     assert (code, output) == (2, "")
     assert errors == "dpmjax: error: . is not empty and holds no earlier run: name another folder with -o\n"
-
-
-def test_old_names_of_options_still_work(toy):
-    assert finish(toy("-o", "out", "--iterations", "2"))[:2] == (0, "0\n1\n")
 
 
 @pytest.mark.parametrize("error", [RuntimeError("no backend"), AssertionError()])

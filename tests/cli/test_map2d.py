@@ -98,7 +98,7 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
 
 @pytest.mark.slow
 def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) -> None:
-    options = (scans_npz, "--steps", 60, "--no-polish", "--init", "zero")  # the old name of --no-refine
+    options = (scans_npz, "--steps", 60, "--no-refine", "--init", "zero")
     broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
     assert broken.returncode == 130, broken.stderr
     stopped = metrics_of(tmp_path / "broken")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.cli.map2d_numbers import corrected_numbers, planar_errors, report, spans_of
+from dpmjax.cli.map2d_results import corrected_numbers, planar_errors, report, spans_of
 from dpmjax.geometry import se2
 from dpmjax.simulation import simulate_sequence
 

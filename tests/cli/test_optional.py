@@ -10,7 +10,7 @@ import pytest
 
 from dpmjax.cli import program, slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
-from dpmjax.cli.machine import EXTRAS, require_importable, why_not_importable
+from dpmjax.cli.info import EXTRAS, require_importable, why_not_importable
 from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
 from tests.optional import import_or_skip
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from dpmjax.cli.drives import DriveOptions, find_sources, open_drive
-from dpmjax.cli.route_drives import STEP_M, keep_scans, route_drive
+from dpmjax.cli.drives import STEP_M, DriveOptions, find_sources, keep_scans, open_drive, route_drive
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, write_kitti, write_tum
 from dpmjax.simulation.town import driving

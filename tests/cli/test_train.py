@@ -17,8 +17,7 @@ from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
 from dpmjax.cli.train import NAME, Config, main, training_settings
-from dpmjax.cli.train_data import KINDS, EvaluationSets
-from dpmjax.cli.train_run import Records, run_training
+from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,

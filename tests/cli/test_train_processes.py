@@ -38,7 +38,7 @@ coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
 from dpmjax.deeppointmap import TrainingHooks, draw_evaluation_pairs
-from dpmjax.cli.train_data import KINDS, EvaluationSets
+from dpmjax.cli.train_run import KINDS, EvaluationSets
 from dpmjax.cli.train_run import Records, run_training
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.command import Interrupted, StopFlag

@@ -10,7 +10,7 @@ import pytest
 from dpmjax.deepmapping.engine import fit
 from dpmjax.deepmapping.toy import ToyConfig, global_minimum, network_value, toy_loss, toy_problem
 from dpmjax.nets.localization import ScalarNet, ScalarNetConfig
-from experiments.baselines.direct import minimize_toy
+from experiments._baselines import minimize_toy
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 SHORT = ToyConfig(num_steps=20)

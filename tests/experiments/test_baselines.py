@@ -12,8 +12,7 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments.baselines.direct import Swarms, swarm_chain
-from experiments.baselines.multiway import multiway, multiway_clouds, multiway_images
+from experiments._baselines import Swarms, multiway, multiway_images, swarm_chain
 from tests.optional import import_or_skip
 
 QUICK = Swarms(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
@@ -76,19 +75,3 @@ def test_multiway_finds_small_motions_of_depth_images() -> None:
     points = np.stack([view.points[0] - T[:3, 3].astype(np.float32) for T in T_world_camera])
     found = multiway_images(points, np.stack([view.mask[0]] * 3))
     np.testing.assert_allclose(found, T_world_camera, atol=1e-3)
-
-
-@pytest.mark.usefixtures("with_open3d")
-def test_multiway_polishes_clouds_in_the_frame_of_the_first() -> None:
-    rng = np.random.default_rng(0)
-    T_true = np.tile(np.eye(4), (6, 1, 1))
-    T_true[:, 0, 3] = 5.0 + 0.5 * np.arange(6)
-    walls = rng.uniform(-1, 1, (6, 3000, 3))
-    walls[:, np.arange(3000), np.arange(3000) % 3] = np.where(np.arange(3000) < 1500, -1, 1)
-    clouds = [points * [6.0, 4.0, 1.5] + [6.0, 0, 0] - T[:3, 3] for points, T in zip(walls, T_true, strict=True)]
-    start = T_true.copy()
-    start[1:, :3, 3] += rng.normal(0, 0.05, (5, 3))
-    found = multiway_clouds(clouds, start)
-    np.testing.assert_allclose(found[0], T_true[0], atol=1e-9)
-    before, after = (np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1).max() for T in (start, found))
-    assert after < before / 4

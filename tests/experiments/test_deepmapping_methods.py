@@ -15,19 +15,19 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_sequence
 from experiments import (
     _deepmapping_methods,
-    _deepmapping_tables,
     deepmapping_limits,
     deepmapping_logs,
     deepmapping_suite,
 )
-from experiments._corridor_logs import write_corridor_log
 from experiments._deepmapping_methods import (
     DEEPMAPPING,
     METHODS,
     Task,
+    best_kept,
     make_task,
+    run_method,
 )
-from experiments._deepmapping_tables import best_kept, run_method
+from experiments.deepmapping_logs import write_corridor_log
 from tests.optional import import_or_skip
 
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
@@ -140,7 +140,7 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
 
     monkeypatch.setattr(deepmapping_limits.simulation, "simulate_sequence", simulate)
     monkeypatch.setattr(_deepmapping_methods, "make_task", lambda sequence, **_: Task(sequence, planar=None))
-    monkeypatch.setattr(_deepmapping_tables, "run_method", lambda name, task: a_row(name, len(task.sequence)))
+    monkeypatch.setattr(_deepmapping_methods, "run_method", lambda name, task: a_row(name, len(task.sequence)))
     absent = METHODS["multiway"]._replace(package="no_such_package")
     monkeypatch.setitem(METHODS, "multiway", absent)
     first = run("--limit", "1", "--methods", "icp-plane", "icp-point")
@@ -284,7 +284,8 @@ def test_a_whole_recording_is_measured_by_its_relations_and_its_corrected_log(tm
     assert row["relations_m"] < min(0.05, row["relations_initial_m"])
     assert row["num_corrected"] == 48
     assert row["ate_corrected_m"] < min(0.1, row["ate_corrected_initial_m"])
-    assert len((tmp_path / "out" / "robot.clf_odometry" / "trajectory_tum.txt").read_text().splitlines()) >= 48
+    trajectory = tmp_path / "out" / "drives" / "robot.clf_odometry" / "trajectory_tum.txt"
+    assert len(trajectory.read_text().splitlines()) >= 48
 
 
 def test_shares_of_trust_count_maps_that_are_right_at_every_scan() -> None:
@@ -313,13 +314,13 @@ def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -
     for name, odometry in (("good", walk.odometry_poses), ("lost", walk.reference_poses)):
         (tmp_path / f"{name}.log").write_text("\n".join(flaser_lines(walk, walk.reference_poses, odometry)) + "\n")
     options = [str(tmp_path), "-o", str(tmp_path / "out"), "--inits", "odometry", "--steps", "2"]
-    for _ in range(2):
-        main, config = deepmapping_logs.main, deepmapping_logs.Config
-        assert run_command(main, config, name="logs", description=None, args=options) == 0
+    main, config = deepmapping_logs.main, deepmapping_logs.Config
+    for more in ([], ["--resume"]):
+        assert run_command(main, config, name="logs", description=None, args=[*options, *more]) == 0
         printed = capsys.readouterr().out.splitlines()
         assert [line.split(" | ")[:3] for line in printed if "good" in line] == [["| good.log", "12 (5)", "odometry"]]
     (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["rows"]
     assert row["candidates"][row["kept"]]["ate_m"] == row["ate_m"]
-    options[:1] = [str(tmp_path), str(tmp_path)]
+    options = [str(tmp_path), *options[:1]]
     assert run_command(main, config, name="logs", description=None, args=options) == 2
     assert "4 logs have 2 different names" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from dpmjax.deeppointmap import (
     MatchEvidence,
 )
 from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
-from experiments import _dpm_calibration_pairs, dpm_calibrate, dpm_confidence, dpm_evaluate
+from experiments import dpm_calibrate, dpm_confidence, dpm_evaluate
 from tests.deeppointmap import toy
 
 
@@ -82,8 +82,8 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         return toy.drive(seed)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(_dpm_calibration_pairs, "simulate_scene", lambda scene: toy.drive(scene.seed))
-    monkeypatch.setattr(_dpm_calibration_pairs, "encode", lambda model, points, num_elements: points)
+    monkeypatch.setattr(dpm_calibrate, "simulate_scene", lambda scene: toy.drive(scene.seed))
+    monkeypatch.setattr(dpm_calibrate, "encode", lambda model, points, num_elements: points)
     rng = np.random.default_rng(0)
 
     def found(model, pair):
@@ -111,7 +111,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
             self.T_target_source = motions[-1].descriptors
 
     monkeypatch.setattr(deeppointmap, "register_in_stages", staged)
-    monkeypatch.setattr(_dpm_calibration_pairs, "register", lambda model, *clouds, refine: Found())
+    monkeypatch.setattr(dpm_calibrate, "register", lambda model, *clouds, refine: Found())
     monkeypatch.setattr(dpm_calibrate, "NUM_PAIRS", 20)
     monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
     sizes = ["--towns", 3, "--ambiguous", 2, "--overlap-towns", 2]
@@ -158,6 +158,6 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
 
 def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:
     drives = [toy.drive(1), toy.drive(2)]
-    row = _dpm_calibration_pairs.measure_town(dpmjax.load_model(weights), drives, 32, 0)
+    row = dpm_calibrate.measure_town(dpmjax.load_model(weights), drives, 32, 0)
     assert sum(row["is_overlap"]) == 16
     assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))

@@ -18,7 +18,7 @@ from dpmjax.io import read_poses, write_tum
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.saved_maps import load_state
 from dpmjax.slam import SlamConfig, SlamMethods
-from experiments import _slam_agents, dpm_multiagent
+from experiments import dpm_multiagent
 from tests.deeppointmap import toy
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps
 
@@ -129,14 +129,14 @@ def test_a_finished_run_is_not_done_again(tmp_path, monkeypatch) -> None:
 def test_parts_overlap_and_hold_all_scans() -> None:
     drive = toy.drive(num_scans=25)
     for num_agents, overlap in ((1, 0.05), (3, 0.0), (3, 0.05), (4, 0.5)):
-        parts = _slam_agents.cut_sequence(drive, num_agents, overlap)
+        parts = dpm_multiagent.cut_sequence(drive, num_agents, overlap)
         numbers = [[int(source) for source in part.sources] for part in parts]
         assert sorted({number for part in numbers for number in part}) == list(range(25))
         assert all(part == list(range(part[0], part[-1] + 1)) for part in numbers)
         num_shared = sum(map(len, numbers)) - 25
         assert abs(num_shared - 2 * (num_agents - 1) * overlap * 25 / num_agents) <= 2 * num_agents
     with pytest.raises(ValueError, match="25 scans are too few"):
-        _slam_agents.cut_sequence(drive, 26, 0.05)
+        dpm_multiagent.cut_sequence(drive, 26, 0.05)
 
 
 @pytest.mark.parametrize(

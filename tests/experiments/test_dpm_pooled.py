@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments._dpm_evaluation import KISS, MONITORED, NETWORK, SEARCH, VERIFIED, pooled_rows, pooled_table, table
+from experiments.dpm_evaluate import KISS, MONITORED, NETWORK, SEARCH, VERIFIED, pooled_rows, pooled_table, table
 
 NUM_PAIRS, NUM_NETWORK, NUM_SEARCH = 30, 20, 25
 

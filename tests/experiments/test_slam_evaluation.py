@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -14,15 +12,12 @@ import dpmjax
 from dpmjax.cli import RowStopped
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
-from dpmjax.cli.route_drives import STEP_M as STEP_OF_KEPT_SCANS_M
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.saved_maps import load_state
-from dpmjax.slam import RefinedKeyframes
-from experiments import _slam_comparison, _slam_evaluation, _slam_peers, _slam_uses, dpm_evaluate
+from experiments import _slam_comparison, _slam_evaluation, _slam_peers, dpm_evaluate
 from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, Drive, FoundLoop
-from experiments._slam_uses import MULTIWAY, REFINED
 from tests.deeppointmap import toy
 from tests.slam.truth import laps, pose
 
@@ -124,32 +119,10 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     for name in ("table.md", "trajectories.png", "map_sizes.png"):
         assert (out / name).stat().st_size > 0
     assert f"| toy 1 | {NUM_SCANS}, 10 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
-    monkeypatch.setattr(_slam_evaluation, "map_drive", None)
+    monkeypatch.setattr("dpmjax.cli.map_drive", None)
     monkeypatch.setattr(SteadyPeer, "step", None)
     assert run("--resume", "-o", out) == EXIT_OK
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
-
-
-def test_refinements_are_rows_that_a_resumed_run_may_add(with_toys, tmp_path, monkeypatch, capsys) -> None:
-    out, drive = tmp_path / "out", toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
-    assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 0, "-o", out) == EXIT_OK
-
-    def moved(slam_map, read_points, **_):
-        for row, keyframe in enumerate(slam_map.keyframes):
-            np.testing.assert_allclose(read_points(row), drive.read_scan(keyframe.scan), atol=STEP_OF_KEPT_SCANS_M)
-        T = np.array(slam_map.T_world_keyframe)
-        T[:, 1, 3] += 3.0 * np.arange(len(T))
-        return RefinedKeyframes(replace(slam_map, T_world_keyframe=T), 1, 1)
-
-    monkeypatch.setattr(_slam_uses, "refine_keyframes", moved)
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    assert run("--slam", "--resume", "--refine", "-o", out) == EXIT_OK
-    assert f"{MULTIWAY} was not run: open3d is not installed" in capsys.readouterr().out
-    rows = {row["method"]: row for row in load_json(out / "metrics.json")["rows"]}
-    assert list(rows) == ["steady", OURS, NETWORK, ODOMETRY, REFINED]
-    refined = rows[REFINED]
-    assert (refined["refine_windows"], refined["num_scans"]) == (1, NUM_SCANS)
-    assert refined["ate_m"] > rows[OURS]["ate_m"] + 0.5
 
 
 def test_sizes_of_maps_are_those_of_the_files(with_toys, tmp_path) -> None:

@@ -19,7 +19,7 @@ import tyro
 from tqdm import tqdm
 
 from dpmjax.cli import program
-from dpmjax.cli.machine import select_device
+from dpmjax.cli.info import select_device
 from dpmjax.cli.run_folder import OutputOptions, RunFailedError, check_run_folder, find_run, load_config
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError
@@ -172,8 +172,6 @@ def run_command(
 
 
 def _parse(config_type: type[ConfigT], name: str, description: str | None, arguments: list[str]) -> ConfigT:
-    old_names = getattr(config_type, "old_names", {})
-    arguments = [old_names.get(argument, argument) for argument in arguments]
     prog = f"dpmjax {name}" if name in program.COMMANDS else f"python -m experiments.{name}"
     parse = partial(tyro.cli, config_type, prog=prog, description=description)
     config = parse(args=arguments)

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least
-from dpmjax.cli.machine import peak_rss_gb
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.result_files import write_poses
+from dpmjax.cli.run_folder import RunFolder, RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import Registered
@@ -41,7 +41,7 @@ _LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(ScanOptions, RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
@@ -49,18 +49,10 @@ class Config(RunOptions):
     simulated apartment."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
-    motion: Literal["auto", "planar", "full"] = "auto"
-    """planar: the camera stays level and at one height; full: any motion; auto: full but for simulated images."""
-    start: Annotated[int, arg(metavar="N")] = 0
-    """First image to use."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use N images; without it, all."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth image."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, n_scans=2, jump=1, start=0)
+        check_least(self, n_scans=2, jump=1)
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -76,16 +68,12 @@ def main(config: Config) -> dict[str, Any]:
     with recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} images", "search of first poses ...", sep="\n", flush=True)
         recorder = FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
-        is_planar = sequence.is_planar if config.motion == "auto" else config.motion == "planar"
-        settings = deepmapping.preset(config.preset, "depth", motion="planar" if is_planar else "full")
+        settings = deepmapping.preset(config.preset, "depth", motion="planar" if sequence.is_planar else "full")
         key = jax.random.key(config.seed)
         found = deepmapping.register_depth(images, settings, key=key, engine=recorder)
         metrics = {
             **depth_numbers(sequence, found),
-            "fit_s": recorder.run_s,
-            "compile_s": recorder.compile_s,
-            "steps": recorder.steps,
-            "peak_rss_gb": peak_rss_gb(),
+            **recorder.numbers,
             "is_interrupted": stop.is_requested,
         }
         write_depth_results(folder, sequence, found.T_world_scan)
@@ -97,15 +85,14 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def read_images(config: Config) -> DepthSequence:
-    """Returns the images of DATA or of a simulated walk, sub-range and stride applied."""
+    """Returns the chosen images of DATA or of a simulated walk."""
     from dpmjax import io, simulation
 
-    stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
     if config.data is None:
-        sequence = simulation.simulate_depth_sequence(0, stop or _NUM_SIMULATED, seed=config.seed)
+        sequence = simulation.simulate_depth_sequence(0, config.selection.stop or _NUM_SIMULATED, seed=config.seed)
     else:
         sequence = io.read_pose_folder(config.data)
-    chosen = sequence.take(slice(config.start, stop, config.jump))
+    chosen = sequence.take(config.selection)
     if len(chosen) < 2:
         raise ValueError(f"{sequence.name}: {len(chosen)} of {len(sequence)} images are chosen; choose two or more")
     return chosen
@@ -162,12 +149,10 @@ def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, f
 
 
 def write_depth_results(folder: RunFolder, sequence: DepthSequence, T_world_camera: Floats) -> None:
-    """Writes trajectory.npy, trajectory_tum.txt, trajectory_kitti.txt and map.ply."""
+    """Writes the trajectory and map.ply."""
     from dpmjax import io
 
-    io.write_poses_npy(folder / "trajectory.npy", T_world_camera)
-    io.write_tum(folder / "trajectory_tum.txt", T_world_camera)
-    io.write_kitti(folder / "trajectory_kitti.txt", T_world_camera)
+    write_poses(folder.path, T_world_camera)
     points = np.einsum("nij,nhwj->nhwi", T_world_camera[:, :3, :3], sequence.points)
     points += T_world_camera[:, None, None, :3, 3]
     io.write_ply(folder / "map.ply", points[sequence.mask].astype(np.float32))

@@ -1,29 +1,39 @@
-"""Input of the commands: drives of 3-D scans, from files or simulated, read in advance by a thread."""
+"""Input of the commands: drives of 3-D scans, from files, simulated, or simulated along a trajectory of the user."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
 from dpmjax.cli.command import check_least
-from dpmjax.cli.run_folder import RunOptions
-from dpmjax.sequences import LidarSequence, Note
+from dpmjax.cli.run_folder import RESULTS, ModelOptions, RunOptions, ScanOptions
+from dpmjax.sequences import InputError, LidarSequence, Note
 
 LOGGER = logging.getLogger("dpmjax.drives")
 TOWN = "town"
 TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
+# A car of 10 m/s and a lidar of 10 turns a second, as in KITTI: one scan each metre, with up to 3 degrees of turn.
+ROUTE_SPEED_M_S, ROUTE_RATE_HZ, ROUTE_TURN_DEG_S = 10.0, 10.0, 30.0
+STEP_M = 2.0**-8
+"""Unit of the integer coordinates of kept scans: 16 bits reach 128 m."""
+# Time of a turn of a lidar whose scans have no times of points.
+TURN_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveOptions(RunOptions):
+class DriveOptions(ScanOptions, ModelOptions, RunOptions):
     """Options of every command that reads the scans of whole drives."""
 
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
@@ -32,10 +42,6 @@ class DriveOptions(RunOptions):
     """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use the first N scans, after --jump."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -63,20 +69,22 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
     Raises:
         InputError: no such folder, drive or poses, a file that is missing or truncated, or a damaged first scan.
     """
-    from dpmjax.cli.route_drives import is_route, route_drive
-
     if data is None:
         drive = demo_drive(options.seed)
-    elif is_route(data):
-        drive = route_drive(data, options.seed)
     else:
-        drive = io.open_lidar_sequence(data, sequence=sequence, bin_columns=options.columns, topic=options.topic)
+        drive = open_path(data, options.seed, sequence=sequence, bin_columns=options.columns, topic=options.topic)
     if options.kitti_angle_correction:
         drive = with_raised_beams(drive)
-    part = drive.take(np.arange(len(drive))[:: options.jump][: options.n_scans])
+    part = drive.take(options.selection)
     io.require_whole_files(part, bin_columns=options.columns)
     note = io.unit_note(part.read_points(0), part.sources[0])
     return part if note is None else replace(part, notes=(*part.notes, note))
+
+
+def open_path(path: Path, seed: int, **options: Any) -> LidarSequence:
+    """Opens a folder of scans or a bag, or simulates a town of a seed along a file of poses."""
+    is_route = path.suffix.lower() in (".txt", ".tum") and path.is_file()
+    return route_drive(path, seed) if is_route else io.open_lidar_sequence(path, **options)
 
 
 def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
@@ -115,6 +123,64 @@ def demo_drive(seed: int) -> LidarSequence:
     return simulation.simulate_scene(simulation.Scene(seed, town, driving, sensor))
 
 
+def route_drive(path: Path, seed: int) -> LidarSequence:
+    """Simulates a town along a trajectory, and a drive through it; scans are simulated when they are first read.
+
+    Streets follow the trajectory, and the ground its slopes; all passes of a place have one height. The car drives in
+    its lane at constant speed and tilts with the ground; rotations and times of the file are ignored.
+
+    Args:
+        path: poses of a lidar or of a camera as TUM or KITTI, metres.
+        seed: of the town.
+
+    Returns:
+        The drive with exact poses and times.
+
+    Raises:
+        InputError: no such poses, or a trajectory shorter than 20 m.
+    """
+    T_world_lidar = io.read_lidar_trajectory(path)
+    T_world_lidar[:, :3, 3] -= T_world_lidar[0, :3, 3]  # float32 holds no centimetres at the coordinates of a country
+    driving = simulation.DriveConfig(ROUTE_SPEED_M_S, ROUTE_RATE_HZ, max_turn_deg_s=ROUTE_TURN_DEG_S)
+    try:
+        drive = simulation.simulate_lidar_sequence(seed, driving=driving, trajectory=T_world_lidar)
+    except ValueError as error:
+        raise InputError(path, str(error), "give the poses of a drive, in metres") from error
+    sources = tuple(f"{path}, simulated scan {number}" for number in range(len(drive)))
+    kept = keep_scans(replace(drive, name=path.stem, sources=sources))
+    return replace(kept, notes=(*kept.notes, Note(f"{path}: a town of seed {seed} is simulated along these poses")))
+
+
+def keep_scans(drive: LidarSequence, folder: Path = RESULTS / "simulated") -> LidarSequence:
+    """Caches the scans of a simulated drive on disk at their first reading, rounded to 4 mm.
+
+    Args:
+        drive: the drive; points within 128 m.
+        folder: a folder in it, named after the drive and its content, gets one file a scan.
+
+    Returns:
+        The same drive, with rounded points.
+    """
+    home = folder.resolve() / f"{drive.name}-{_digest(drive)}"
+    return replace(drive, read_scan=partial(_read_kept, home, drive.read_scan))
+
+
+def _read_kept(folder: Path, read_scan: Callable[[int], NDArray[np.float32]], index: int) -> NDArray[np.float32]:
+    path = folder / f"{index:06}.npy"
+    if not path.exists():
+        buffer = BytesIO()
+        np.save(buffer, np.rint(read_scan(index) / STEP_M).astype(np.int16))
+        io.write_atomically(path, buffer.getvalue())
+    return np.load(path).astype(np.float32) * np.float32(STEP_M)
+
+
+def _digest(drive: LidarSequence) -> str:
+    """Hashes the poses, the times and two scans, which differ between towns, lidars and versions of the simulator."""
+    arrays = (drive.T_world_lidar, drive.times, drive.read_points(0), drive.read_points(len(drive) - 1))
+    parts = (b"" if array is None else np.ascontiguousarray(array).tobytes() for array in arrays)
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:8]
+
+
 @dataclass(frozen=True)
 class Source:
     """Origin of a drive to train on or to evaluate with; a worker process opens it.
@@ -137,15 +203,11 @@ class Source:
 
     def open(self) -> LidarSequence:
         """Opens or simulates the drive; scans without a pose of an existing reference are left out."""
-        from dpmjax.cli.route_drives import is_route, route_drive
-
         if self.path is None:
             mixture = self.town_mixture or simulation.SceneMixture()
             length_m, kind = self.town_length_m, self.town_kind
             return simulation.simulate_drive(self.town_seed, length_m=length_m, kind=kind, mixture=mixture)
-        if is_route(self.path):
-            return route_drive(self.path, self.town_seed)
-        drive = io.open_lidar_sequence(self.path, sequence=self.name)
+        drive = open_path(self.path, self.town_seed, sequence=self.name)
         return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
 
 
@@ -181,9 +243,6 @@ def find_sources(
             LOGGER.warning("%s is left out: %s", found[source].name, reason)
         sources += [source for source in found if source not in reasons]
     return sources
-
-
-TURN_S = 0.1
 
 
 class ScanReader:

@@ -28,7 +28,7 @@ from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import Source, find_sources
 from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, markdown, run_table
-from dpmjax.cli.run_folder import RunFolder, RunOptions
+from dpmjax.cli.run_folder import ModelOptions, RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 
 NAME = "evaluate"
@@ -47,13 +47,11 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(ModelOptions, RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, or simulated towns."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     pairs: Annotated[int, arg(metavar="N")] = 15
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N")] = 1
@@ -144,13 +142,12 @@ def registration_row(
     }
     for stage in STAGES:
         row |= error_columns(getattr(found, stage), f"_{stage}")
-    is_right = row.pop("is_right_refined")
-    return {
-        **row,
-        "is_right": is_right.tolist(),
-        "motions": found.T_target_source.reshape(-1, 16).tolist(),
-        **_seconds(found),
-    }
+    row["is_right"] = row.pop("is_right_refined").tolist()
+    row["motions"] = found.T_target_source.reshape(-1, 16).tolist()
+    if len(found.confidence):
+        row |= {f"{stage}_s": float(np.median(seconds)) for stage, seconds in found.seconds._asdict().items()}
+        row["pair_s"] = float(np.median(found.seconds.total))
+    return row
 
 
 def overlap_row(
@@ -159,15 +156,10 @@ def overlap_row(
     """Returns AUC and Brier score of the overlap probability; AUC None where the drive lacks pairs."""
     found = deeppointmap.evaluate_overlap(model, drive, num_pairs, seed=seed, on_scan=on_scan)
     row: Row = {"auc": None, "has_revisits": found.has_revisits, "num_pairs": len(found.is_overlap)}
-    if not len(found.is_overlap):
-        return row
-    return {
-        **row,
-        "auc": found.area_under_curve,
-        "brier": found.brier_score,
-        "probability": found.probability.tolist(),
-        "is_overlap": found.is_overlap.tolist(),
-    }
+    if len(found.is_overlap):
+        row |= {"auc": found.area_under_curve, "brier": found.brier_score}
+        row |= {"probability": found.probability.tolist(), "is_overlap": found.is_overlap.tolist()}
+    return row
 
 
 def error_columns(errors: metrics.RegistrationRecall, suffix: str) -> Row:
@@ -257,10 +249,3 @@ def length_text(metres: float | None) -> str:
     """Returns a median error for a table; a dash where no registration was right."""
     # NaN becomes null in the file of a row.
     return "-" if metres is None or np.isnan(metres) else f"{metres:.3f} m"
-
-
-def _seconds(found: deeppointmap.ScanEvaluation) -> Row:
-    if not len(found.confidence):
-        return {}
-    stages = {f"{stage}_s": float(np.median(of_stage)) for stage, of_stage in found.seconds._asdict().items()}
-    return {**stages, "pair_s": float(np.median(found.seconds.total))}

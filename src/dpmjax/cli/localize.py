@@ -49,8 +49,6 @@ class Config(DriveOptions):
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive of a folder that holds several."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """The weights that made the map: a shipped name or a .safetensors file."""
     map_poses: Annotated[Path | None, arg(metavar="FILE")] = None
     """Reference poses of all scans of the drive that made the map, in the world of the scans' reference."""
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,25 +31,12 @@ from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration2d, simulation
+from dpmjax.cli import map2d_results as results
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
-from dpmjax.cli.machine import peak_rss_gb
-from dpmjax.cli.map2d_files import draw_map, draw_occupancy, registered_scans, scan_set_of, write_trajectories
-from dpmjax.cli.map2d_numbers import (
-    ate_of,
-    before_and_after,
-    corrected_numbers,
-    planar_errors,
-    relation_numbers,
-    report,
-)
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.run_folder import (
-    RunOptions,
-    open_run_folder,
-    recording,
-    write_metrics,
-)
+from dpmjax.cli.result_files import write_poses
+from dpmjax.cli.run_folder import RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fit
@@ -65,11 +52,10 @@ _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class Config(ScanOptions, RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
-    old_names: ClassVar[Mapping[str, str]] = {"--polish": "--refine", "--no-polish": "--no-refine"}
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Without it: the built-in world."""
@@ -83,21 +69,15 @@ class Config(RunOptions):
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
-    """Also align all scans together, point to line, from the start and from the fit (--polish is the same)."""
+    """Also align all scans together, point to line, from the start and from the fit."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Stop after N steps; without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S")] = None
     """Stop the fit after S seconds of run time, compile time not counted."""
-    start: Annotated[int, arg(metavar="N")] = 0
-    """First scan to use."""
     relations: Annotated[Path | None, arg(metavar="FILE")] = None
     """Hand-checked relations of a log, to measure the result by."""
     corrected: Annotated[Path | None, arg(metavar="LOG")] = None
     """A log of the same drive with corrected poses, to measure the result by at scans of the same time."""
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use N scans; without it, all."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
     """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
     crowd: an office in which people walk about."""
@@ -106,7 +86,7 @@ class Config(RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=1, n_scans=1, jump=1, start=0, range_noise_px=0)
+        check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
         if self.seconds is not None and not self.seconds > 0.0:
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
         if not self.ordered and self.init != "global":
@@ -129,23 +109,20 @@ def main(config: Config) -> dict[str, Any]:
         metrics = {
             **map_numbers(sequence, result, config, measure),
             **notes,
-            "fit_s": recorder.run_s,
-            "compile_s": recorder.compile_s,
-            "steps": recorder.steps,
-            "peak_rss_gb": peak_rss_gb(),
+            **recorder.numbers,
             "is_interrupted": stop.is_requested,
         }
         # Numbers first, so that they are written even if a picture fails.
-        write_trajectories(folder, sequence, result.poses)
+        write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
         write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
-        registered = registered_scans(sequence, result)
-        limits = draw_map(folder, registered, result, metrics)
+        registered = results.registered_scans(sequence, result)
+        limits = results.draw_map(folder, registered, result, metrics)
         if recorder.has_map:
-            draw_occupancy(folder, registered, result, limits)
+            results.draw_occupancy(folder, registered, result, limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
         write_metrics(folder, metrics, seed=config.seed)
-        summary = report(sequence.unit, metrics)
+        summary = results.report(sequence.unit, metrics)
         LOGGER.info(summary)
         print(summary, f"results in {folder.path}", sep="\n")
     return metrics
@@ -167,10 +144,10 @@ def register_sequence(
         if len(rows) < len(sequence):
             print(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
-        return partial(recorder, measure=ate_of(fitted, typical_range(fitted.points, fitted.mask)))
+        return partial(recorder, measure=results.ate_of(fitted, typical_range(fitted.points, fitted.mask)))
 
     return registration2d.register_scans(
-        scan_set_of(sequence),
+        results.scan_set_of(sequence),
         registration_settings(config, sequence),
         key=jax.random.key(config.seed),
         start=start,
@@ -186,7 +163,7 @@ def map_numbers(
     measure: Callable[[Floats, str], dict[str, float]],
 ) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
-    registered = registered_scans(sequence, result)
+    registered = results.registered_scans(sequence, result)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
 
     def title(name: str) -> str:
@@ -195,13 +172,13 @@ def map_numbers(
     return {
         "num_scans": len(sequence),
         "num_registered": len(registered),
-        **before_and_after(registered, start, kept),
+        **results.before_and_after(registered, start, kept),
         **measure(result.recording.between(start), "_initial"),
         **measure(result.poses, ""),
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
-            title(name): planar_errors(registered, candidate.poses) | candidate.score._asdict()
+            title(name): results.planar_errors(registered, candidate.poses) | candidate.score._asdict()
             for name, candidate in result.candidates.items()
         },
         "assessment": result.assessment._asdict(),
@@ -230,8 +207,8 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
         raise ValueError(f"{sequence.name}: its scans have no times, which relations and a corrected log need")
 
     def measure(poses: Floats, suffix: str) -> dict[str, float]:
-        by_relations = {} if relations is None else relation_numbers(times, poses, relations, suffix)
-        return by_relations | ({} if corrected is None else corrected_numbers(times, poses, corrected, suffix))
+        by_relations = {} if relations is None else results.relation_numbers(times, poses, relations, suffix)
+        return by_relations | ({} if corrected is None else results.corrected_numbers(times, poses, corrected, suffix))
 
     # Files of another drive are refused before any long work.
     measure(np.zeros((len(sequence), 3)), "")
@@ -239,14 +216,14 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
 
 
 def read_scans(config: Config) -> ScanSequence:
-    """Returns the scans of DATA or of the built-in world, sub-range and stride applied."""
-    stop = None if config.n_scans is None else config.start + config.n_scans * config.jump
+    """Returns the chosen scans of DATA or of the built-in world."""
+    chosen = config.selection
     if config.data is not None:
-        return io.read_sequence(config.data, selection=slice(config.start, stop, config.jump), topic=config.topic)
+        return io.read_sequence(config.data, selection=chosen, topic=config.topic)
     sequence = simulation.simulate_sequence(
-        config.world, stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
+        config.world, chosen.stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )
-    return sequence.take(slice(config.start, stop, config.jump))
+    return sequence.take(chosen)
 
 
 def starting_poses(config: Config, sequence: ScanSequence) -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dpmjax.cli.map2d import NAME, Config, fit_settings, read_scans
-from dpmjax.cli.map2d_files import scan_set_of
+from dpmjax.cli.map2d_results import scan_set_of
 from dpmjax.cli.run_folder import CHECKPOINTS, find_run, load_config
 
 if TYPE_CHECKING:

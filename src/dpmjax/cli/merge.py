@@ -15,7 +15,6 @@ map_2.npz and so on.
 
 from __future__ import annotations
 
-import collections
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,23 +25,21 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import saved_maps, slam, viz, weights
+from dpmjax.cli import slam_files as files
 from dpmjax.cli.command import progress_bar
 from dpmjax.cli.result_files import write_table
-from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.cli.slam_files import LOOP_CELLS, accepted_ends, gather_map, keyframe_points, loop_cells, open_map
+from dpmjax.cli.run_folder import ModelOptions, OutputOptions, RunFolder, open_run_folder, recording, write_metrics
 from dpmjax.cli.slam_numbers import counted
 
 NAME = "merge"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OutputOptions):
+class Config(ModelOptions, OutputOptions):
     """Options of the run."""
 
     maps: Annotated[Positional[tuple[Path, ...]], arg(metavar="MAP MAP ...", help_behavior_hint="required")] = ()
     """Two or more maps, files of dpmjax.save_map."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """The weights that made the maps: a shipped name or a .safetensors file."""
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -51,7 +48,7 @@ def main(config: Config) -> dict[str, Any]:
     if len(config.maps) < 2:
         raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
     methods = slam.make_methods(weights.load_model(config.weights), weights=config.weights)
-    maps = [open_map(path, methods) for path in config.maps]
+    maps = [files.open_map(path, methods) for path in config.maps]
     folder = open_run_folder(config, NAME)
     with recording(folder):
         with progress_bar("loops between maps", " keyframes") as on_keyframe:
@@ -74,13 +71,13 @@ def write_maps(folder: RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam
     for part, slam_map in enumerate(merged.maps, start=1):
         saved_maps.save_map(folder / map_name(part, len(merged.maps)), slam_map)
     write_g2o(folder / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
-    ends = [(number, keyframe.scan) for number, each in enumerate(maps, start=1) for keyframe in each.keyframes]
-    names = ("map", "scan", "other_map", "other_scan")
-    rows = (
-        dict(zip(names, (*ends[loop.source], *ends[loop.target]), strict=True)) | loop_cells(loop)
-        for loop in merged.loops
-    )
-    write_table(folder / "loops.csv", (*names, *LOOP_CELLS), rows)
+    ends = [
+        {"map": number, "scan": keyframe.scan}
+        for number, each in enumerate(maps, start=1)
+        for keyframe in each.keyframes
+    ]
+    columns = ("map", "scan", "other_map", "other_scan", *files.LOOP_CELLS)
+    write_table(folder / "loops.csv", columns, files.loop_rows(merged.loops, ends))
 
 
 def map_name(part: int, num_parts: int) -> str:
@@ -95,9 +92,6 @@ def short_name(path: Path) -> str:
 
 def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> dict[str, Any]:
     """Returns the content of `metrics.json`: connected maps, and the numbers of loops and keyframes."""
-    accepted = [loop for loop in merged.loops if loop.status == "accepted"]
-    map_of_row = (merged.joined.map_of_keyframe + 1).tolist()
-    met = collections.Counter(tuple(sorted((map_of_row[loop.source], map_of_row[loop.target]))) for loop in accepted)
     parts = [
         {
             "file": map_name(part, len(merged.maps)),
@@ -109,7 +103,7 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
     return {
         "num_maps": len(maps),
         "num_parts": len(parts),
-        "num_loops": len(accepted),
+        "num_loops": len(files.accepted_ends(merged.loops)),
         "num_candidates": len(merged.loops),
         "num_keyframes": len(merged.joined.slam_map),
         "parts": parts,
@@ -117,14 +111,14 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
             {"map": number, "file": short_name(path), "num_keyframes": len(each)}
             for number, (path, each) in enumerate(zip(paths, maps, strict=True), start=1)
         ],
-        "loops_between": [{"maps": list(pair), "num_loops": num} for pair, num in sorted(met.items())],
+        "loops_between": [{"maps": pair, "num_loops": number} for pair, number in files.count_meetings(merged.joined)],
     }
 
 
 def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.AgentPanel:
     """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
     members = [number for number, component in enumerate(merged.component) if component == part]
-    ends = accepted_ends(merged.loops)
+    ends = files.accepted_ends(merged.loops)
     ends = ends[np.isin(merged.joined.map_of_keyframe[ends[:, 0]], members)]
     is_joined = len(members) > 1
     text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
@@ -137,10 +131,8 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
-    cloud = gather_map(T_world_keyframe, lambda row: keyframe_points(slam_map, int(rows[row])))
-    label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
-    color = viz.COLORS[number % len(viz.COLORS)]
-    return viz.AgentTrack(label, color, T_world_keyframe[:, :3, 3], None, cloud.points, cloud.heights_m)
+    cloud = files.gather_map(T_world_keyframe, lambda row: files.keyframe_points(slam_map, int(rows[row])))
+    return files.map_track(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 
 def merge_text(metrics: dict[str, Any]) -> str:

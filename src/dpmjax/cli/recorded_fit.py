@@ -38,13 +38,7 @@ class FitRecorder:
         has_map: True where M-Net has been trained.
     """
 
-    def __init__(
-        self,
-        folder: RunFolder,
-        length: str,
-        *,
-        stop: Callable[[float], bool],
-    ) -> None:
+    def __init__(self, folder: RunFolder, length: str, *, stop: Callable[[float], bool]) -> None:
         """Makes an engine for one fit.
 
         Args:
@@ -71,10 +65,8 @@ class FitRecorder:
         checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
         if folder.is_resumed:
             state = checkpoints.restore_latest(state, fallback=state)
-        step = int(state.step)
-        self.run_s = earlier_s = _earlier_seconds(folder, step)
         columns = (*_COLUMNS, f"ate_{self._length}")
-        keep_until = step if folder.is_resumed else None
+        keep_until = int(state.step) if folder.is_resumed else None
         bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
         saved_at = time.perf_counter()
 
@@ -87,11 +79,18 @@ class FitRecorder:
                 saved_at = time.perf_counter()
 
         with bar, HistoryFile(folder / HISTORY, columns, keep_until=keep_until) as history:
+            earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
+            self.run_s = earlier_s
             done = resume(problem, state, data, on_report=record, stop=lambda: self._stop(self.run_s))
         checkpoints.save(int(done.state.step), done.state)
         self.steps, self.compile_s = int(done.state.step), done.compile_s
         self.has_map = self.steps > 0 and problem.phases[int(done.state.phase)].occupancy_weight > 0.0
         return done
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Returns seconds and steps under the names of `metrics.json`."""
+        return {"fit_s": self.run_s, "compile_s": self.compile_s, "steps": self.steps}
 
     def _write(self, progress: Progress, ate: float, history: HistoryFile, bar: tqdm) -> None:
         """Adds one call of the step to the table and to the progress bar."""
@@ -101,13 +100,6 @@ class FitRecorder:
         history.append(**row, loss=report.loss, **losses)
         ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
         show_progress(bar, f"{phase}, loss {report.loss:.4f}{ate_text}", progress.share, self.run_s)
-
-
-def _earlier_seconds(folder: RunFolder, step: int) -> float:
-    """Returns the run time of the steps that an earlier run has done."""
-    if not folder.is_resumed or not (folder / HISTORY).exists():
-        return 0.0
-    return max((float(row["run_s"]) for row in read_history(folder / HISTORY) if int(row["step"]) <= step), default=0.0)
 
 
 def show_progress(bar: tqdm, text: str, done: float, run_s: float) -> None:

@@ -22,7 +22,7 @@ from tyro.conf import Positional, arg
 from dpmjax import deeppointmap, io, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import report_notes
-from dpmjax.cli.run_folder import OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax.cli.run_folder import ModelOptions, OutputOptions, RunFolder, open_run_folder, recording, write_metrics
 
 NAME = "register"
 # Least calibrated probability of a certain motion.
@@ -31,15 +31,13 @@ SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OutputOptions):
+class Config(ModelOptions, OutputOptions):
     """Options of the run."""
 
     source: Annotated[Positional[Path], arg(metavar="A")]
     """Scan whose points are moved."""
     target: Annotated[Positional[Path], arg(metavar="B")]
     """Scan in whose frame they end."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     columns: Annotated[int | None, arg(metavar="N")] = None
     """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     refine: bool = True
@@ -64,6 +62,8 @@ def main(config: Config) -> dict[str, Any]:
         clock = time.perf_counter()
         found = deeppointmap.register(model, source, target, refine=config.refine)
         T = np.asarray(found.T_target_source, np.float64)
+        names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
+        shares = {name: float(getattr(found.verification, name)) for name in names}
         metrics = {
             "source": config.source.name,
             "target": config.target.name,
@@ -72,7 +72,7 @@ def main(config: Config) -> dict[str, Any]:
             **motion_numbers(T),
             "confidence": float(found.confidence),
             "num_inliers": int(found.num_inliers),
-            **match_shares(found.verification),
+            **shares,
             "is_calibrated": model.config.calibration is not None,
             "register_s": time.perf_counter() - clock,
         }
@@ -97,12 +97,6 @@ def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
         "translation_m": float(np.linalg.norm(T_target_source[:3, 3])),
         "rotation_deg": float(np.degrees(angle)),
     }
-
-
-def match_shares(verification: Any) -> dict[str, float]:
-    """Returns the shares of points that the confidence is based on; empty without a verification."""
-    names = () if verification is None else ("visible_share", "matched_share", "contradicted_share")
-    return {name: float(getattr(verification, name)) for name in names}
 
 
 def write_motion(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 import json
 import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from dpmjax.io.files import write_atomically
+import numpy as np
+
+from dpmjax import io
 
 UNKNOWN = "unknown"
 
 
 def write_json(path: Path, value: Any) -> None:
     """Writes dataclasses, paths and NumPy values as JSON, atomically."""
-    write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
+    io.write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
 
 
 def load_json(path: Path) -> dict[str, Any]:
@@ -89,11 +91,25 @@ def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str |
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes a CSV file atomically."""
-    text = io.StringIO()
+    text = StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_atomically(path, text.getvalue())
+    io.write_atomically(path, text.getvalue())
+
+
+def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum: Any) -> None:
+    """Writes poses in the plane or in space as NAME.npy, NAME_tum.txt and NAME_kitti.txt.
+
+    Args:
+        folder: folder of the files.
+        poses: poses of all scans.
+        name: beginning of the names of the files.
+        **tum: options of `io.write_tum`, such as the times.
+    """
+    io.write_poses_npy(folder / f"{name}.npy", poses)
+    io.write_tum(folder / f"{name}_tum.txt", poses, **tum)
+    io.write_kitti(folder / f"{name}_kitti.txt", poses)
 
 
 class HistoryFile:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from dpmjax.cli.command import StopFlag
-from dpmjax.cli.machine import git_hash, versions
+from dpmjax.cli.info import git_hash, versions
 from dpmjax.cli.result_files import UNKNOWN, load_json, write_json
 from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, recording, write_metrics
 from dpmjax.io.files import write_atomically
@@ -78,24 +79,21 @@ def run_table(
     """
     folder = open_run_folder(config, name)
     with recording(folder), StopFlag() as stop:
-        table = TableRun(folder, lambda: stop.is_requested)
-        rows = do_rows(folder.path, list(cases), partial(work, table), seed=config.seed, is_stopped=table.is_stopped)
+        table, rows = TableRun(folder, lambda: stop.is_requested), list[Row]()
+        with suppress(RowStopped):
+            for case in tqdm(list(cases), unit=" rows"):
+                table.check_stop()
+                rows.append(do_row(folder.path, case, partial(work, table, **case), seed=config.seed))
         summary = report(rows) if rows else Summary({}, "no row is finished")
-        write_summary(folder, config, summary, rows, is_interrupted=stop.is_requested)
+        # Numbers come before pictures, so that they are written even if a picture fails.
+        metrics = {**summary.numbers, "is_interrupted": stop.is_requested}
+        note = write_metrics(folder, metrics, seed=config.seed, rows=rows if summary.rows is None else summary.rows)
+        write_atomically(folder / "table.md", summary.text + (f"\n\n{note}.\n" if note else "\n"))
+        print(summary.text)
+        if summary.write_more is not None:
+            summary.write_more(folder)
     print(f"results in {folder.path}")
     return rows
-
-
-def write_summary(
-    folder: RunFolder, config: RunOptions, summary: Summary, rows: Sequence[Row], *, is_interrupted: bool
-) -> None:
-    """Writes metrics.json, table.md and the pictures, and prints the table; numbers come before pictures."""
-    metrics = {**summary.numbers, "is_interrupted": is_interrupted}
-    note = write_metrics(folder, metrics, seed=config.seed, rows=rows if summary.rows is None else summary.rows)
-    write_atomically(folder / "table.md", summary.text + (f"\n\n{note}.\n" if note else "\n"))
-    print(summary.text)
-    if summary.write_more is not None:
-        summary.write_more(folder)
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -134,37 +132,6 @@ def do_row(folder: Path, case: Row, work: Callable[[], Row], *, seed: int) -> Ro
     row["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
     write_json(path, row)
     return row
-
-
-def do_rows(
-    folder: Path,
-    cases: Sequence[Row],
-    work: Callable[..., Row],
-    *,
-    seed: int,
-    is_stopped: Callable[[], bool],
-) -> list[Row]:
-    """Computes one row for each case by `do_row`, with a progress bar.
-
-    Args:
-        folder: folder of the run.
-        cases: entries that identify the rows.
-        work: makes the remaining entries of a row; it is called with the entries of the case as keywords.
-        seed: seed of the run.
-        is_stopped: returns True to end before the next row.
-
-    Returns:
-        The rows so far, without one that ended by `RowStopped`.
-    """
-    rows: list[Row] = []
-    for case in tqdm(cases, unit=" rows"):
-        if is_stopped():
-            break
-        try:
-            rows.append(do_row(folder, case, partial(work, **case), seed=seed))
-        except RowStopped:
-            break
-    return rows
 
 
 def row_path(folder: Path, case: Mapping[str, Any]) -> Path:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax.cli.machine import environment
+from dpmjax.cli.info import environment
 from dpmjax.cli.result_files import as_json, commits_note, load_json, write_json
 from dpmjax.sequences import InputError
 
@@ -36,13 +36,7 @@ ConfigT = TypeVar("ConfigT")
 
 @dataclass(frozen=True, kw_only=True)
 class OutputOptions:
-    """Options of every command that writes results.
-
-    Attributes:
-        old_names: earlier spellings of options on the command line, with today's.
-    """
-
-    old_names: ClassVar[Mapping[str, str]] = {}
+    """Options of every command that writes results."""
 
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
     """Folder for the results, instead of results/<command>/<time>."""
@@ -50,6 +44,29 @@ class OutputOptions:
     """Replace an earlier run in OUT."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
     """Where to compute; without it, JAX chooses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """Options of every command that reads scans or images in a row."""
+
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Use the first N scans, after --jump; without it, all."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
+
+    @property
+    def selection(self) -> slice:
+        """Returns the rows of the scans to use."""
+        return slice(None, None if self.n_scans is None else self.n_scans * self.jump, self.jump)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Options of every command that uses trained weights."""
+
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file; a saved map needs the weights that made it."""
 
 
 @dataclass(frozen=True, kw_only=True)

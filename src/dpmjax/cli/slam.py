@@ -26,12 +26,12 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import slam, weights
+from dpmjax import io, slam, viz, weights
 from dpmjax.cli import slam_files as files
 from dpmjax.cli import slam_numbers as numbers
 from dpmjax.cli.command import StopFlag, progress_bar
 from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, report_notes
-from dpmjax.cli.machine import peak_rss_gb, require_importable
+from dpmjax.cli.info import require_importable
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
 from dpmjax.sequences import InputError, LidarSequence
 
@@ -49,8 +49,6 @@ class Config(DriveOptions):
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
     preset: Literal["default", "paper"] = "default"
@@ -97,7 +95,7 @@ def main(config: Config) -> dict[str, Any]:
         metrics = write_results(folder, config, drive, run, result)
         if config.refine and run.failure is None and not stop.is_requested:
             metrics |= refine_trajectory(folder, config, drive, result, lambda: stop.is_requested)
-        metrics |= {"is_interrupted": stop.is_requested or run.failure is not None, "peak_rss_gb": peak_rss_gb()}
+        metrics["is_interrupted"] = stop.is_requested or run.failure is not None
         metrics |= {**notes, "status": numbers.run_status(metrics), "wall_s": time.perf_counter() - started}
         write_metrics(folder, metrics, seed=config.seed)
         tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
@@ -156,7 +154,7 @@ def write_results(
         metrics |= files.write_map_file(folder / "map.npz", slam_map)
     write_metrics(folder, metrics, seed=config.seed)  # numbers first, even if a picture fails
     cloud = files.gather_map(slam_map.T_world_keyframe, lambda row: drive.read_keyframe(slam_map, row))
-    files.write_map(folder / "map.ply", cloud)
+    io.write_ply(folder / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
     files.draw_pictures(folder.path, sequence, result, cloud, drive.num_keyframes_before)
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
 

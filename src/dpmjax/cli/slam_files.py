@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
-from dpmjax.cli.result_files import write_table
+from dpmjax.cli.result_files import write_poses, write_table
 from dpmjax.cli.slam_numbers import counted, distances_to_reference
 from dpmjax.sequences import LidarSequence
 
@@ -39,10 +40,8 @@ class Cloud(NamedTuple):
 def write_trajectory(
     folder: Path, T_world_scan: np.ndarray, times: np.ndarray | None, name: str = "trajectory"
 ) -> None:
-    """Writes a trajectory as TUM, KITTI and npy."""
-    io.write_poses_npy(folder / f"{name}.npy", T_world_scan)
-    io.write_tum(folder / f"{name}_tum.txt", T_world_scan, times=times, frame="T_world_lidar")
-    io.write_kitti(folder / f"{name}_kitti.txt", T_world_scan)
+    """Writes a trajectory of the lidar as TUM, KITTI and npy."""
+    write_poses(folder, T_world_scan, name, times=times, frame="T_world_lidar")
 
 
 def write_graph(folder: Path, result: slam.SlamResult) -> None:
@@ -59,18 +58,44 @@ def write_graph(folder: Path, result: slam.SlamResult) -> None:
 
 def write_loops(path: Path, loops: Sequence[slam.Loop], keyframes: Sequence[int] | np.ndarray) -> None:
     """Writes every candidate of a loop with its outcome."""
-    ends = (
-        {"scan": int(keyframes[loop.source]), "other_scan": int(keyframes[loop.target]), **loop_cells(loop)}
+    rows = loop_rows(loops, [{"scan": int(scan)} for scan in keyframes])
+    write_table(path, ("scan", "other_scan", *LOOP_CELLS), rows)
+
+
+def loop_rows(loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> list[dict[str, Any]]:
+    """Returns a row for each candidate of a loop: its two keyframes, its source, outcome, and the numbers of that.
+
+    Args:
+        loops: the candidates.
+        ends: cells of each keyframe, in the order of the rows of the map; names of the target begin with `other_`.
+
+    Returns:
+        The rows.
+    """
+    return [
+        {
+            **ends[loop.source],
+            **{f"other_{name}": cell for name, cell in ends[loop.target].items()},
+            "found_by": loop.found_by,
+            "status": loop.status,
+            "overlap": _number(loop.overlap),
+            "probability": _number(loop.probability),
+            "rmse_m": _number(loop.rmse),
+        }
         for loop in loops
-    )
-    write_table(path, ("scan", "other_scan", *LOOP_CELLS), ends)
+    ]
 
 
-def loop_cells(loop: slam.Loop) -> dict[str, str]:
-    """Returns the cells of a loop candidate in a table: source, outcome and the numbers of the decision."""
-    numbers = {"overlap": loop.overlap, "probability": loop.probability, "rmse_m": loop.rmse}
-    cells = {name: _number(number) for name, number in numbers.items()}
-    return {"found_by": loop.found_by, "status": loop.status, **cells}
+def count_meetings(joined: slam.JoinedMaps) -> list[tuple[list[int], int]]:
+    """Returns the pairs of maps that have met, counted from 1, each with the number of its accepted loops."""
+    pairs = np.sort(joined.map_of_keyframe[accepted_ends(joined.loops)] + 1, axis=1)
+    return [(list(pair), number) for pair, number in sorted(Counter(map(tuple, pairs.tolist())).items())]
+
+
+def map_track(label: str, number: int, T_world_scan: np.ndarray, cloud: Cloud) -> viz.AgentTrack:
+    """Returns the trajectory and the points of one of several maps in its colour."""
+    color = viz.COLORS[number % len(viz.COLORS)]
+    return viz.AgentTrack(label, color, T_world_scan[:, :3, 3], None, cloud.points, cloud.heights_m)
 
 
 def write_scans(
@@ -143,11 +168,6 @@ def write_map_file(path: Path, slam_map: slam.KeyframeMap) -> dict[str, int]:
     """Writes the map for later runs and for localisation; returns its size at each precision."""
     saved_maps.save_map(path, slam_map)
     return {"map_bytes": path.stat().st_size, "map_bytes_int8": len(saved_maps.map_bytes(slam_map, "int8"))}
-
-
-def write_map(path: Path, cloud: Cloud) -> None:
-    """Writes the thinned map, coloured by height."""
-    io.write_ply(path, cloud.points, colors=viz.height_colors(cloud.heights_m))
 
 
 def draw_pictures(

@@ -30,7 +30,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from dpmjax import deeppointmap, simulation, viz, weights
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import Source, find_sources
-from dpmjax.cli.machine import peak_rss_gb, select_device
+from dpmjax.cli.info import select_device
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import HISTORY, METRICS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
 
@@ -117,8 +117,7 @@ def main(config: Config) -> None:
     join_processes(config.coordinator, config.num_processes, config.process_id)
     if config.coordinator is not None:  # not before the processes have found each other
         select_device(config.device)
-    from dpmjax.cli.train_data import draw_sets, prepare_sources
-    from dpmjax.cli.train_run import Records, run_training
+    from dpmjax.cli.train_run import Records, draw_sets, prepare_sources, run_training
 
     with together():
         first = None if config.weights is None else weights.load_model(config.weights)
@@ -148,7 +147,6 @@ def main(config: Config) -> None:
             "num_scans": len(store.table),
             "bad_scans": bad,
             "wall_s": time.perf_counter() - started,
-            "peak_rss_gb": peak_rss_gb(),
             "is_interrupted": stop.is_requested,
             "seed": config.seed,
         }
@@ -188,7 +186,7 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
 
 def measure(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation, dict[str, Any]]:
     """Returns recall and errors of the trained and of the untrained network, and times."""
-    from dpmjax.cli.train_data import KIND_NAMES
+    from dpmjax.cli.train_run import KIND_NAMES
 
     pairs = records.sets.held_out
     models = {"": trained.model, "_untrained": records.untrained}

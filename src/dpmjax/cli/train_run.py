@@ -1,40 +1,112 @@
-"""A DeepPointMap training: its evaluations, and the table, the progress bar and the checkpoints that it writes."""
+"""A DeepPointMap training: its drives and evaluations, and the table, the bar and the checkpoints that it writes."""
 
 from __future__ import annotations
 
 import math
+import os
 import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
+from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.cli.drives import TOWN, Source
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
-from dpmjax.cli.train_data import KIND_NAMES, EvaluationSets
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    Model,
-    ScanStore,
-    StepRecord,
-    Trained,
-    TrainingConfig,
-    TrainingHooks,
-    TrainingProgress,
-    TrainingState,
-    begin_training,
-    evaluate_registration,
-    train,
-)
+from dpmjax.io import open_lidar_sequence
+from dpmjax.simulation import HDL32E, HDL64E, OS1_64, simulate_drive
 
+# Far from the seeds of training towns, which count up from the seed of the run.
+HELD_OUT_SEED, SELECTION_SEED = 1_000_000, 2_000_000
+SELECTION_PAIRS, VALIDATION_PAIRS = 320, 60
+SELECTION_SCENES = (("suburb", HDL64E), ("canyon", OS1_64), ("country", HDL32E), ("campus", OS1_64))
+SELECTION_LENGTH_M = 250.0
+KINDS = (dpm.PairKind(2.0, 10.0), dpm.PairKind(10.0, 20.0), dpm.PairKind(2.0, 10.0, 4), dpm.PairKind(10.0, 20.0, 4))
+"""Pairs that models are selected and reported by: scans and maps of four scans, near and far."""
+
+KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
 SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
 RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
 COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
+
+
+class EvaluationSets(NamedTuple):
+    """Pairs of a run.
+
+    Attributes:
+        selection: pairs of towns of their own, by which the best model is chosen.
+        real: pairs of each folder of real scans, which are measured but not used for selection.
+        held_out: pairs of another town, measured once at the end.
+    """
+
+    selection: tuple[dpm.EvaluationPairs, ...]
+    real: tuple[dpm.EvaluationPairs, ...]
+    held_out: dpm.EvaluationPairs
+
+
+def draw_sets(
+    settings: dpm.TrainingConfig, held_out_pairs: int, validate: Sequence[Path], *, length_m: float
+) -> EvaluationSets:
+    """Returns the pairs of a run; `validate` names folders of real scans, `length_m` is that of towns."""
+    draw = partial(dpm.draw_evaluation_pairs, config=settings.model)
+    num = max(1, SELECTION_PAIRS // (len(KINDS) * len(SELECTION_SCENES)))
+    towns = [
+        simulate_drive(SELECTION_SEED + number, length_m=min(length_m, SELECTION_LENGTH_M), kind=kind, sensor=sensor)
+        for number, (kind, sensor) in enumerate(SELECTION_SCENES)
+    ]
+    held_out = simulate_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
+    work = [partial(draw, town, num, kinds=KINDS, max_scans=64) for town in towns]
+    work += [partial(draw, open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate]
+    work += [partial(draw, held_out, held_out_pairs, kinds=KINDS)]
+    sets = [one() for one in tqdm(work, desc="prepare evaluation", unit=" drives", dynamic_ncols=True)]
+    return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
+
+
+def prepare_sources(
+    sources: Sequence[Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
+) -> list[dpm.PreparedDrive]:
+    """Returns all drives, each prepared in a process of its own and kept in `folder` for later runs."""
+    with tqdm(total=len(sources), desc="prepare scans", unit=" drives", dynamic_ncols=True) as bar:
+        if len(sources) == 1:
+            with tqdm(desc=str(sources[0].path or TOWN), unit=" scans", leave=False) as scans:
+                prepared = dpm.prepare_drive(
+                    sources[0].open(), settings, folder=folder, seed=seed, on_scan=lambda: scans.update(1)
+                )
+            bar.update(1)
+            return [prepared]
+        # A fresh interpreter: a fork of a process that runs JAX may hang.
+        num_workers = min(len(sources), os.cpu_count() or 1)
+        pool = ProcessPoolExecutor(num_workers, get_context("spawn"), initializer=_use_processor)
+        try:
+            tasks = {pool.submit(_prepare, source, settings, folder, seed): source for source in sources}
+            done: dict[Source, dpm.PreparedDrive] = {}
+            for task in as_completed(tasks):
+                done[tasks[task]] = task.result()
+                bar.update(1)
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return [done[source] for source in sources]
+
+
+def _use_processor() -> None:
+    # The device belongs to the process that trains.
+    jax.config.update("jax_platforms", "cpu")
+
+
+def _prepare(source: Source, settings: dpm.TrainingConfig, folder: Path, seed: int) -> dpm.PreparedDrive:
+    return dpm.prepare_drive(source.open(), settings, folder=folder, seed=seed)
 
 
 class Records:
@@ -51,16 +123,16 @@ class Records:
     def __init__(
         self,
         folder: RunFolder,
-        settings: TrainingConfig,
+        settings: dpm.TrainingConfig,
         sets: EvaluationSets,
         *,
         seed: int,
-        weights: Model | None = None,
+        weights: dpm.Model | None = None,
     ) -> None:
         self.folder, self.sets, self._settings = folder, sets, settings
         self._checkpoints, self._best = Checkpoints(folder / CHECKPOINTS), Checkpoints(folder / BEST)
-        self.start = begin_training(settings, seed=seed, start=weights)
-        self.untrained = Model(self.start.state.params, settings.model)
+        self.start = dpm.begin_training(settings, seed=seed, start=weights)
+        self.untrained = dpm.Model(self.start.state.params, settings.model)
         if folder.is_resumed:
             self.start = self._restored(self.start)
         first = int(self.start.state.step)
@@ -70,13 +142,13 @@ class Records:
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
         self.run_s = self.earlier_s
-        self._seen: set[CurriculumStage] = set()
+        self._seen: set[dpm.CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
-    def evaluate(self, model: Model) -> float:
+    def evaluate(self, model: dpm.Model) -> float:
         """Returns the mean recall on the selection pairs, and measures that on real pairs."""
-        found = [evaluate_registration(model, pairs) for pairs in self.sets.selection]
-        real = [evaluate_registration(model, pairs) for pairs in self.sets.real]
+        found = [dpm.evaluate_registration(model, pairs) for pairs in self.sets.selection]
+        real = [dpm.evaluate_registration(model, pairs) for pairs in self.sets.real]
         of_kinds = np.mean([[recall.recall for recall in evaluation.recalls] for evaluation in found], axis=0)
         of_real = np.mean(
             [[recall.recall for recall in evaluation.recalls] for evaluation in real] or [[math.nan] * 2], 0
@@ -84,7 +156,7 @@ class Records:
         self._recalls = dict(zip(RECALLS, (*of_kinds.tolist(), *of_real.tolist()), strict=True))
         return float(np.mean(of_kinds))
 
-    def on_report(self, record: StepRecord, progress: TrainingProgress) -> None:
+    def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint every few minutes."""
         values = _values(record)
         if math.isfinite(record.score):
@@ -100,13 +172,13 @@ class Records:
             self.save(progress)
             self._last_saved = time.perf_counter()
 
-    def save(self, progress: TrainingProgress) -> None:
+    def save(self, progress: dpm.TrainingProgress) -> None:
         """Writes a checkpoint, and the best parameters where they have changed since the last one."""
         if int(progress.best_step):
             self._best.save(int(progress.best_step), progress.best_params)
         self._checkpoints.save(int(progress.state.step), replace(progress, best_params={}))
 
-    def _restored(self, start: TrainingProgress) -> TrainingProgress:
+    def _restored(self, start: dpm.TrainingProgress) -> dpm.TrainingProgress:
         found = self._checkpoints.restore_latest(replace(start, best_params={}), fallback=None)
         if found is None:
             return start
@@ -116,7 +188,7 @@ class Records:
                 return replace(found, best_params=params)
         return replace(start, state=found.state, best_params=found.state.params)
 
-    def _tell_compilation(self, state: TrainingState) -> None:
+    def _tell_compilation(self, state: dpm.TrainingState) -> None:
         stage = self._settings.stage_at(int(state.step))
         if int(state.step) < int(state.end) and stage not in self._seen:
             self._seen.add(stage)
@@ -132,39 +204,39 @@ class Records:
 
 def run_training(
     records: Records | None,
-    store: ScanStore,
-    settings: TrainingConfig,
-    hooks: TrainingHooks,
+    store: dpm.ScanStore,
+    settings: dpm.TrainingConfig,
+    hooks: dpm.TrainingHooks,
     *,
     seed: int,
     plateau_s: float | None = None,
-) -> Trained:
+) -> dpm.Trained:
     """Returns the result of training, after saving its last state; one process has records.
 
     After `plateau_s` seconds of steps, compilation and evaluation, those of earlier calls included, the decay of the
     learning rate begins.
     """
     if records is None:
-        return train(store, settings, seed=seed, hooks=hooks)
+        return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
         hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
         if plateau_s is not None:
             hooks = replace(hooks, finish=lambda: records.run_s >= plateau_s)
-        trained = train(store, settings, seed=seed, start=records.start, hooks=hooks)
+        trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         return trained
 
 
-def _stage_name(stage: CurriculumStage) -> str:
+def _stage_name(stage: dpm.CurriculumStage) -> str:
     return f"K={stage.max_group}"
 
 
-def _values(record: StepRecord) -> dict[str, Any]:
+def _values(record: dpm.StepRecord) -> dict[str, Any]:
     values = {**record.report._asdict(), **record.report.terms._asdict(), "score": record.score}
     return {name: float(values[name]) for name in MEASURES if math.isfinite(values[name])}
 
 
-def _summary(record: StepRecord, recall: float) -> str:
+def _summary(record: dpm.StepRecord, recall: float) -> str:
     values = {**_values(record), **({"recall": recall} if math.isfinite(recall) else {})}
     parts = [f"{name} {values[name]:.3f}" for name in SHOWN if name in values]
     return ", ".join([_stage_name(record.stage), *parts, f"{record.speed.scans_per_s:.1f} scans/s"])

@@ -1,16 +1,22 @@
-"""The numbers of a map of planar scans: errors against references of several kinds, and the lines on the console."""
+"""Results of a map of planar scans: errors against references of several kinds, console lines, pictures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax import metrics
+from dpmjax import deepmapping, metrics, registration2d, viz
+from dpmjax.cli.run_folder import RunFolder
 from dpmjax.sequences import Relations, ScanSequence
+
+if TYPE_CHECKING:
+    from dpmjax.registration2d import RegisteredScans
+    from dpmjax.types import ScanSet
 
 Floats = NDArray[np.float64]
 
@@ -158,3 +164,51 @@ def report(unit: str, numbers: Mapping[str, Any]) -> str:
         steps = numbers["relations_corrected_m"], numbers["relations_corrected_deg"]
         lines.append("mean error from each of these scans to the next: {:.3g} m, {:.3g} degrees".format(*steps))
     return "\n".join(lines)
+
+
+def scan_set_of(sequence: ScanSequence) -> ScanSet:
+    """Returns the scans without their name, unit and poses."""
+    import jax.numpy as jnp
+
+    from dpmjax.types import ScanSet
+
+    return ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask))
+
+
+def registered_scans(sequence: ScanSequence, result: RegisteredScans) -> ScanSequence:
+    """Returns the scans that were registered."""
+    chosen = result.recording.chosen
+    return sequence if len(chosen) == len(sequence) else sequence.take(chosen)
+
+
+def draw_map(
+    folder: RunFolder, registered: ScanSequence, result: RegisteredScans, numbers: Mapping[str, Any]
+) -> viz.Limits:
+    """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
+    scans, unit = scan_set_of(registered), registered.unit
+    panels = []
+    titles = dict(zip(result.candidates, numbers["candidates"], strict=True))
+    for name in dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept)):
+        if name not in result.candidates:
+            continue
+        title, found = titles[name], numbers["candidates"][titles[name]]
+        ate, distance = found.get(f"ate_{unit}"), found.get(f"point_distance_{unit}")
+        title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "")
+        panels.append(viz.Panel(title, scans, result.candidates[name].poses, ate=ate, point_distance=distance))
+    if registered.reference_poses is None:
+        panels = [replace(panel, is_reference=panel.title.endswith(" (kept)")) for panel in panels]
+    else:
+        panels.append(viz.Panel("Reference", scans, registered.reference_poses, is_reference=True))
+    figure = viz.registered_scans_figure(panels, unit)
+    viz.save_figure(figure, folder / "map.png")
+    return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
+
+
+def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: RegisteredScans, limits: viz.Limits) -> None:
+    """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
+    picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
+    kept, reference = result.candidates[result.kept].poses, registered.reference_poses
+    anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
+    T_view_fit = metrics.align_rigid(trajectory, anchor[:, :2])
+    figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
+    viz.save_figure(figure, folder / "occupancy.png")

@@ -1,7 +1,10 @@
-"""Optimisation of poses without L-Net: baselines of the DeepMapping paper, and of the toy.
+"""Baselines of the DeepMapping paper that stand on other packages (extra `baselines`).
 
-L-BFGS by jaxopt on DeepMapping's loss; a chain of scans by particle swarms of evosax (both in the extra `baselines`).
-By Adam the direct form is `fit_deepmapping` with the settings of `as_direct`.
+L-BFGS by jaxopt on DeepMapping's loss without L-Net, and solvers of jaxopt on the toy. A chain of scans by particle
+swarms of evosax. Multiway registration by Open3D, whose pairs are registered by iterated closest points. Neighbours in
+time are sure edges of a pose graph, and all further pairs uncertain ones. A line process removes wrong edges (Choi,
+Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with
+the settings of `as_direct`.
 """
 
 from __future__ import annotations
@@ -18,8 +21,10 @@ from numpy.typing import NDArray
 
 from dpmjax import ScanSet
 from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem, toy_loss
-from dpmjax.geometry import se2, typical_range
+from dpmjax.geometry import rigid, se2, typical_range
 from dpmjax.losses import chamfer_distance
+
+Floats = NDArray[np.float64]
 
 
 def optimize_directly(
@@ -166,3 +171,119 @@ def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, 
 
     state, _ = jax.lax.scan(iterate, state, jax.random.split(key, sizes.num_iterations))
     return state.best_solution, state.best_fitness
+
+
+# Largest distances of matched points in the first round, and in the second round and the graph, in typical ranges of
+# the scans.
+_COARSE, _FINE = 0.09, 0.0225
+# Scans that the start puts nearer than this share of the typical range are matched too.
+_RADIUS = 0.3
+# Doubtful edges below this confidence are removed.
+_PRUNE = 0.25
+
+
+def multiway(scans: ScanSet) -> Floats:
+    """Returns poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        scans: n scans in order of time.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+    """
+    unit = typical_range(scans.points, scans.mask)
+    points = [p[m] for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
+    flat = [np.concatenate([p, np.zeros((len(p), 1))], axis=1) for p in points]
+    clouds = [_cloud(p) for p in flat]
+    poses = _registered(clouds, unit, is_planar=True)
+    planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
+    return se2.relative(planar[0], planar)
+
+
+def multiway_images(
+    points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"]
+) -> Float[NDArray[np.float64], "n 4 4"]:
+    """Returns poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
+
+    Args:
+        points: points of n images in order of time, each in the frame of its camera.
+        mask: True where something was measured.
+
+    Returns:
+        T_world_camera, the first one the identity.
+    """
+    unit = typical_range(points, mask)
+    clouds = [_cloud(p[m]) for p, m in zip(np.asarray(points), np.asarray(mask), strict=True)]
+    for cloud in clouds:
+        cloud.estimate_normals()
+    return _registered(clouds, unit, is_planar=False)
+
+
+def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> Floats:
+    """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes.
+
+    Each cloud is matched from where the one before is.
+    """
+    import open3d
+
+    coarse, fine = _COARSE * unit, _FINE * unit
+    registration = open3d.pipelines.registration
+    estimation = registration.TransformationEstimationPointToPlane()
+    if is_planar:  # planes of flat clouds leave three directions open
+        estimation = registration.TransformationEstimationPointToPoint()
+    graph = registration.PoseGraph()
+    T_world = [np.eye(4)]
+    graph.nodes.append(_node(T_world[0]))
+    for scan in range(1, len(clouds)):
+        graph.edges.append(_edge(clouds, (scan - 1, scan), np.eye(4), (coarse, fine), estimation, is_doubtful=False))
+        # An edge maps its source, the earlier scan, into the later one.
+        T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
+        graph.nodes.append(_node(T_world[-1]))
+    placed = np.stack(T_world)
+    apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
+    for source, target in np.argwhere(np.triu(apart < _RADIUS * unit, k=2)).tolist():
+        guess = rigid.inverse(placed[target]) @ placed[source]
+        graph.edges.append(_edge(clouds, (source, target), guess, (coarse, fine), estimation, is_doubtful=True))
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        registration.global_optimization(
+            graph,
+            registration.GlobalOptimizationLevenbergMarquardt(),
+            registration.GlobalOptimizationConvergenceCriteria(),
+            registration.GlobalOptimizationOption(
+                max_correspondence_distance=fine, edge_prune_threshold=_PRUNE, reference_node=0
+            ),
+        )
+    return np.stack([node.pose for node in graph.nodes])
+
+
+def _cloud(points: NDArray[np.floating]) -> Any:
+    import open3d
+
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+
+
+def _node(T_world_scan: Floats) -> Any:
+    import open3d
+
+    return open3d.pipelines.registration.PoseGraphNode(T_world_scan)
+
+
+def _edge(
+    clouds: list[Any],
+    pair: tuple[int, int],
+    T_guess: Floats,
+    distances: tuple[float, float],
+    estimation: Any,
+    *,
+    is_doubtful: bool,
+) -> Any:
+    """Returns the motion of a pair of source and target, with its information."""
+    import open3d
+
+    registration = open3d.pipelines.registration
+    source, target = (clouds[row] for row in pair)
+    T = T_guess
+    for distance in distances:
+        T = registration.registration_icp(source, target, distance, T, estimation).transformation
+    information = registration.get_information_matrix_from_point_clouds(source, target, distances[-1], T)
+    return registration.PoseGraphEdge(*pair, T, information, uncertain=is_doubtful)
