@@ -20,8 +20,7 @@ from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
 from dpmjax.types import ScanSet
 from tests.tolerances import ROUNDING

@@ -35,6 +35,7 @@ from .problem import MappingData as MappingData
 from .problem import Problem as Problem
 from .relocalization import Relocalized as Relocalized
 from .relocalization import relocalize as relocalize
+from .toy import Initialization as Initialization
 from .toy import ToyConfig as ToyConfig
 from .toy import global_minimum as global_minimum
 from .toy import network_value as network_value

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from dpmjax.geometry.se3 import Motion
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from dpmjax.deepmapping.config import (
     PlaneComparison,
     ProjectiveComparison,
 )
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 
 # M-Net of the fast presets in space.
 _SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))

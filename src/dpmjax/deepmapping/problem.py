@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
-from dpmjax.nets.occupancy import make_map_net
+from dpmjax.nets.mapping import make_map_net
 
 # Number of points that an MLP as M-Net evaluates at once: 16 MB for each layer of 512.
 _MLP_CHUNK = 1 << 13
