@@ -22,10 +22,9 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
-from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
-from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid, SurfaceElements
+from dpmjax.types import DescriptorCloud, PointPyramid, SurfaceElements
 
 
 @flax.struct.dataclass
@@ -165,22 +164,6 @@ def elements_of_pyramid(pyramid: PointPyramid, config: ModelConfig, *, num_eleme
         )
     elements = pyramid_elements(pyramid, num_elements)
     return replace(elements, positions=elements.positions * config.scale_m)
-
-
-def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:
-    """Encodes one scan from its stored pyramid, after a rigid motion.
-
-    Args:
-        model: a model whose `config.pyramid` built the pyramid.
-        stored: the pyramid of the scan.
-        T_new_lidar: the motion, metres.
-
-    Returns:
-        As `encode_pyramid`, in the frame after the motion.
-    """
-    # A rigid motion in metres is one in normalised coordinates with a shorter translation.
-    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
-    return encode_pyramid(model, moved_pyramid(stored, T_new_lidar * unit))
 
 
 @jax.jit

@@ -12,8 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from dpmjax.deeppointmap.training.curriculum import TrainingConfig
-from dpmjax.deeppointmap.training.layouts import stage_layouts
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig, stage_layouts
 from dpmjax.deeppointmap.training.sampling import (
     PlacedScans,
     RegistrationSample,
