@@ -18,7 +18,6 @@ from dpmjax.deeppointmap.verification import (
     MeasuredScan,
     VerificationConfig,
     compare_scans,
-    verify_motion,
     verify_motions,
 )
 from dpmjax.geometry import rigid
@@ -205,22 +204,15 @@ def _candidates(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
 ) -> Iterator[list[_Candidate]]:
     """Yields hypotheses, some at a time, from the second time on in turn with motions from the views of the scans."""
-    hypotheses = _batched([_Candidate(row, T) for row, T in enumerate(T_target_source)])
-    yield hypotheses[0]
-    searched = _batched([_Candidate(None, T) for T in _searched(source, target, config)])
-    for number in range(max(len(searched), len(hypotheses) - 1)):
-        yield from (*searched[number : number + 1], *hypotheses[number + 1 : number + 2])
-
-
-def _searched(source: MeasuredScan, target: MeasuredScan, config: VerificationConfig) -> Float[np.ndarray, "s 4 4"]:
-    if config.views.num_motions == 0:
-        return np.zeros((0, 4, 4))
-    return correlate_views(source.surface, target.surface, config.views)
-
-
-def _batched(candidates: list[_Candidate]) -> list[list[_Candidate]]:
-    starts = range(0, len(candidates), HYPOTHESES_AT_ONCE)
-    return [candidates[start : start + HYPOTHESES_AT_ONCE] for start in starts]
+    hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
+    yield hypotheses[:HYPOTHESES_AT_ONCE]
+    searched: list[_Candidate] = []
+    if config.views.num_motions > 0:
+        searched = [_Candidate(None, T) for T in correlate_views(source.surface, target.surface, config.views)]
+    further = hypotheses[HYPOTHESES_AT_ONCE:]
+    for start in range(0, max(len(searched), len(further)), HYPOTHESES_AT_ONCE):
+        some = slice(start, start + HYPOTHESES_AT_ONCE)
+        yield from filter(None, (searched[some], further[some]))
 
 
 def refine_motion(
@@ -239,7 +231,7 @@ def refine_motion(
     """
     start = motion.T_target_source
     T = align_surfaces(source.surface, target.surface, start, REFINEMENT).T_target_source
-    found = verify_motion(source, target, T, config)
+    found = verify_motions(source, target, T[None], config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
     return VerifiedMotion(motion.row, T, found._replace(**kept))
 
