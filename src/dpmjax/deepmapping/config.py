@@ -34,15 +34,13 @@ class ProjectiveComparison:
 
 @dataclass(frozen=True)
 class PlaneComparison:
-    """Comparison of pairs of lidar clouds by the distances of points to planes.
+    """Comparison of pairs of lidar clouds by the distances of points to planes, revisits in space among the pairs.
 
     Attributes:
         width: width of the robust kernel, at the start and at the end of the phase.
-        num_revisits: number of scans near in space but not in time that each scan is compared to.
     """
 
     width: tuple[float, float]
-    num_revisits: int = 0
 
 
 Comparison = ChamferComparison | ProjectiveComparison | PlaneComparison

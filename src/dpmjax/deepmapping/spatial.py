@@ -35,6 +35,8 @@ from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
 
 SpatialScans = DepthScans | CloudScans
 _ALL = slice(None)
+# Number of scans near in space but not in time that each cloud is compared to by planes.
+_NUM_REVISITS = 1
 
 
 def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
@@ -181,7 +183,7 @@ def _cloud_loss(
     rows, block = scans_of_step(phase, count, step, key=row_key)
     offsets = draw_offsets(phase, scans_in_block(phase, count) - 1, key=offset_key)
     comparison = phase.comparison
-    num_revisits = comparison.num_revisits if isinstance(comparison, PlaneComparison) else 0
+    num_revisits = _NUM_REVISITS if isinstance(comparison, PlaneComparison) else 0
     partners = _draw_partners(scans, rows, num_revisits, key=partner_key)
     seen = jnp.concatenate([rows, jnp.maximum(partners, 0).reshape(-1)])
     T = _poses(config, phase, params, data, seen)

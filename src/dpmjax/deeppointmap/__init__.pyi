@@ -19,7 +19,6 @@ from .matching import merge_clouds as merge_clouds
 from .matching import thin_merged as thin_merged
 from .model import Model as Model
 from .model import correlate as correlate
-from .model import elements_of_pyramid as elements_of_pyramid
 from .model import encode_pyramid as encode_pyramid
 from .model import init_model as init_model
 from .model_config import ModelConfig as ModelConfig

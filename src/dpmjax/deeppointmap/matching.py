@@ -40,6 +40,9 @@ MIN_NUM_FIRST = 64
 MIN_INLIER_SCORE = 0.5
 """Pairs with higher scores are the first inliers."""
 
+MIN_NUM_INLIERS = 30
+"""A choice of fewer inliers is rejected (published configuration)."""
+
 MAX_NUM_PAIRS = 512
 """Largest number of pairs per direction. More pairs do not make a motion more exact, and the cost of the consensus is
 cubic."""
@@ -63,7 +66,6 @@ class MatchConfig:
         temperature: temperature of both softmaxes.
         pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
         num_rounds: number of times that the inliers are chosen again.
-        min_num_inliers: a choice of fewer inliers is rejected.
         consensus: if given, the first inliers are the pairs that support one common motion. This tolerates many wrong
             pairs, as from networks with little training or in repetitive places.
     """
@@ -71,12 +73,11 @@ class MatchConfig:
     temperature: float = 0.1
     pair_ratio: float = 0.5
     num_rounds: int = 3
-    min_num_inliers: int = 30
     consensus: ConsensusConfig | None = None
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "pair_ratio")
-        require_fields(self, "num_rounds", "min_num_inliers", low=1)
+        require_fields(self, "num_rounds", low=1)
         require_fields(self, "pair_ratio", low=0, high=4)
 
 
@@ -267,7 +268,7 @@ def _choose_inliers(pairs: _PointPairs, first: Bool[Array, " p"], config: MatchC
         spread = jnp.std(errors, where=is_inlier)
         limit = (jnp.mean(errors, where=is_inlier) + INLIER_SIGMAS * spread) * ERROR_SLACK
         chosen = pairs.is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
-        return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
+        return jnp.where(jnp.sum(chosen) >= MIN_NUM_INLIERS, chosen, is_inlier)
 
     return lax.fori_loop(0, config.num_rounds, choose, first)
 

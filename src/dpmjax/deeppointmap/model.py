@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -24,7 +23,7 @@ from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
-from dpmjax.types import DescriptorCloud, PointPyramid, SurfaceElements
+from dpmjax.types import DescriptorCloud, PointPyramid
 
 
 @flax.struct.dataclass
@@ -132,38 +131,12 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
     if directions is None:
         directions = ray_directions(level.positions)
     num_elements = model.config.num_descriptors if num_elements is None else num_elements
-    elements = elements_of_pyramid(pyramid, model.config, num_elements=num_elements)
-    return DescriptorCloud(
-        positions=elements.positions,
-        features=features,
-        mask=elements.mask,
-        directions=directions,
-        normals=elements.normals,
-        planarity=elements.planarity,
-    )
-
-
-@functools.partial(jax.jit, static_argnames=("config", "num_elements"))
-def elements_of_pyramid(pyramid: PointPyramid, config: ModelConfig, *, num_elements: int) -> SurfaceElements:
-    """Computes the surface elements of a scan in metres, without the networks: those of `encode_pyramid`.
-
-    Args:
-        pyramid: one scan in normalised coordinates, from `config.pyramid`; masked points may hold anything.
-        config: scale and pyramid.
-        num_elements: at least the number of descriptors, at most the number of points of the first stage.
-
-    Returns:
-        Elements in the frame of the lidar, in the order of farthest points.
-
-    Raises:
-        ValueError: if the number is out of range.
-    """
-    if num_elements < config.num_descriptors:
-        raise ValueError(
-            f"num_elements: expected at least the {config.num_descriptors} descriptors, got {num_elements}"
-        )
+    if num_elements < model.config.num_descriptors:
+        expected = f"expected at least the {model.config.num_descriptors} descriptors"
+        raise ValueError(f"num_elements: {expected}, got {num_elements}")
     elements = pyramid_elements(pyramid, num_elements)
-    return replace(elements, positions=elements.positions * config.scale_m)
+    positions = elements.positions * model.config.scale_m
+    return DescriptorCloud(positions, features, elements.mask, directions, elements.normals, elements.planarity)
 
 
 @jax.jit

@@ -16,12 +16,7 @@ from jaxtyping import Array, Float
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import encode, scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
-from dpmjax.deeppointmap.model import (
-    Model,
-    correlate,
-    descriptor_similarity,
-    predict_offsets,
-)
+from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, weak_direction_of
 from dpmjax.deeppointmap.prepared_scans import (
     NUM_THREADS,

@@ -206,11 +206,10 @@ def _encode_all(model: Model, scans: SampleScans) -> DescriptorCloud:
 
 @jax.jit
 def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorCloud) -> Registration:
-    def register_one(maps: tuple[DescriptorCloud, DescriptorCloud]) -> Registration:
-        hypotheses = trace_match(model, *maps, config=model.config.matching)
-        return jax.tree.map(lambda leaf: leaf[0], hypotheses)
+    def best_motion(maps: tuple[DescriptorCloud, DescriptorCloud]) -> Registration:
+        return jax.tree.map(lambda leaf: leaf[0], trace_match(model, *maps, config=model.config.matching))
 
-    return jax.lax.map(register_one, (sources, targets))
+    return jax.lax.map(best_motion, (sources, targets))
 
 
 def _maps(

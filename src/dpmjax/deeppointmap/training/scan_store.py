@@ -219,7 +219,6 @@ def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
     return digest.hexdigest()[:24]
 
 
-LOGGER = logging.getLogger("dpmjax.training")
 PUBLISHED = SamplingConfig()
 
 
@@ -271,12 +270,12 @@ def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> s
     if num_near == num_too_near:
         found = f"{len(positions)} scans, no two of them {limits[0]} to {limits[1]} m apart"
         return f"{found}; such pairs are needed (are the poses in metres?)"
-    reason = ""
+    reasons = []
     for number in range(len(drive)):
         try:
             drive.read_scan(number)
         except ValueError as error:
-            reason = reason or str(error)
-            continue
-        return None
-    return f"all {len(drive)} scans are bad; the first, {reason}"
+            reasons.append(str(error))
+        else:
+            return None
+    return f"all {len(drive)} scans are bad; the first, {reasons[0]}"
