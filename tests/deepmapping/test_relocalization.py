@@ -14,8 +14,7 @@ import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping import localization_training
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.localization_training import shift_scan, turn_scan
-from dpmjax.deepmapping.map_raster import make_raster, render_scans
+from dpmjax.deepmapping.localization_training import make_raster, render_scans, shift_scan, turn_scan
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses

@@ -18,8 +18,14 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.localization_training import has_windows, turn_scan
-from dpmjax.deepmapping.map_raster import NUM_NODES, MapRaster, make_raster, nearest_nodes
+from dpmjax.deepmapping.localization_training import (
+    NUM_NODES,
+    MapRaster,
+    has_windows,
+    make_raster,
+    nearest_nodes,
+    turn_scan,
+)
 from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.planar import as_scan_set, choose_beams, localize_scans
 from dpmjax.deepmapping.problem import MapFrame

@@ -127,7 +127,9 @@ def choose_motion(
     if is_weak := weak_share(*axes) < config.max_weak_share:
         starts = sliding_motions(*axes, SLIDING_STEP_M)
         num_slid = len(starts)
-        finalists += _aligned(scans, _best_along(scans, axes, starts, config), FINE, config)
+        slid = _moved(scans, starts, COARSE)
+        order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
+        finalists += _aligned(scans, [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE, config)
     motions = [*finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
@@ -160,18 +162,6 @@ def _moved(
     return np.stack([one.T_target_source for one in found])
 
 
-def _best_along(
-    scans: tuple[MeasuredScan, MeasuredScan],
-    axes: tuple[WallAxis, WallAxis],
-    starts: Float[np.ndarray, "s 4 4"],
-    config: VerificationConfig,
-) -> list[_Candidate]:
-    """Returns the motions that the elements that face the axis support most, coarsely aligned."""
-    slid = _moved(scans, starts, COARSE)
-    order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
-    return [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]]
-
-
 def _facing_elements(
     scans: tuple[MeasuredScan, MeasuredScan],
     axes: tuple[WallAxis, WallAxis],
@@ -179,19 +169,13 @@ def _facing_elements(
     config: VerificationConfig,
 ) -> Float[np.ndarray, " s"]:
     """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
-    settings = replace(config, num_samples=NUM_FACING)
-    first, second = (
-        scan._replace(surface=facing_surface(scan.surface, axis.axis)) for scan, axis in zip(scans, axes, strict=True)
-    )
-    sides = (
-        compare_scans(first, scans[1], T_target_source, settings),
-        compare_scans(second, scans[0], rigid.inverse(T_target_source), settings),
-    )
-    counts = [
-        (side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible)
-        @ facing_weights(scan.surface, axis.axis, MAX_FACING)[:NUM_FACING]
-        for side, scan, axis in zip(sides, (first, second), axes, strict=True)
-    ]
+    settings, counts = replace(config, num_samples=NUM_FACING), []
+    motions = T_target_source, rigid.inverse(T_target_source)
+    for scan, other, axis, T_other_scan in zip(scans, scans[::-1], axes, motions, strict=True):
+        surface = facing_surface(scan.surface, axis.axis)
+        side = compare_scans(scan._replace(surface=surface), other, T_other_scan, settings)
+        values = side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible
+        counts.append(values @ facing_weights(surface, axis.axis, MAX_FACING)[:NUM_FACING])
     return np.mean(counts, axis=0)
 
 
