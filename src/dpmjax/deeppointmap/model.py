@@ -134,7 +134,7 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
     if num_elements < model.config.num_descriptors:
         expected = f"expected at least the {model.config.num_descriptors} descriptors"
         raise ValueError(f"num_elements: {expected}, got {num_elements}")
-    elements = pyramid_elements(pyramid, num_elements)
+    elements: Any = pyramid_elements(pyramid, num_elements)
     positions = elements.positions * model.config.scale_m
     return DescriptorCloud(positions, features, elements.mask, directions, elements.normals, elements.planarity)
 
