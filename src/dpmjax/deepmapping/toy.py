@@ -17,7 +17,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from dpmjax.checks import require_one_of
+from dpmjax.checks import require_fields, require_one_of, require_positive_fields
 from dpmjax.deepmapping.problem import Problem
 from dpmjax.types import AnyArray
 
@@ -92,10 +92,8 @@ class ToyConfig:
     num_steps: int = 1000
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0.0:
-            raise ValueError(f"learning_rate: expected a number above 0, got {self.learning_rate}")
-        if self.num_steps < 1:
-            raise ValueError(f"num_steps: expected at least 1, got {self.num_steps}")
+        require_positive_fields(self, "learning_rate")
+        require_fields(self, "num_steps", low=1)
 
 
 @flax.struct.dataclass

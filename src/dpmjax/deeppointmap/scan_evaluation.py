@@ -1,4 +1,9 @@
-"""Evaluation on pairs of raw scans of a drive: registration after each stage, and overlap."""
+"""Evaluation of a model on pairs of raw scans of a drive: registration after each stage of `register`, and overlap.
+
+pairs = read_scan_pairs(drive, draw_scan_pairs(drive, "near", 30))
+evaluation = evaluate_scan_pairs(model, pairs)
+evaluation.refined.recall
+"""
 
 from __future__ import annotations
 
@@ -26,6 +31,14 @@ from dpmjax.types import DescriptorCloud
 
 Seconds = float | Float[np.ndarray, " p"]
 """Of one registration, or of each of several."""
+
+NO_OVERLAP_M = 40.0
+"""Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out."""
+
+REVISIT_PATH_M = 100.0
+"""Scans seen again after so many metres of driving are revisits."""
+
+REVISIT_STREAM = 4133
 
 
 class StageSeconds(NamedTuple):
@@ -161,15 +174,6 @@ def _confidence(model: Model, evidence: MatchEvidence) -> float:
     if calibration is None or evidence.of_scans is None:
         return float(evidence.of_clouds[1])
     return calibrated_probability(calibration, evidence)
-
-
-NO_OVERLAP_M = 40.0
-"""Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out."""
-
-REVISIT_PATH_M = 100.0
-"""Scans seen again after so many metres of driving are revisits."""
-
-REVISIT_STREAM = 4133
 
 
 class OverlapEvaluation(NamedTuple):

@@ -16,7 +16,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from dpmjax.checks import require_count, require_one_of
+from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry.bearing import ray_directions, to_ray_frame, wall_normals
 from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
 from dpmjax.nets.neighbourhood import maximum_of_normalised
@@ -48,9 +48,7 @@ class EncoderConfig:
     compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:
-        require_count("stem_channels", self.stem_channels)
-        require_count("expansion", self.expansion)
-        require_count("output_channels", self.output_channels)
+        require_fields(self, "stem_channels", "expansion", "output_channels", low=1)
         require_one_of("frame", self.frame, get_args(Frame))
         require_compute_dtype(self.compute_dtype)
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
+from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 from dpmjax.geometry.se3 import Motion, motion_matrices
@@ -81,8 +82,7 @@ class DepthSearchConfig:
     turn_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.num_trajectories, self.num_candidates, self.num_varied) < 1:
-            raise ValueError(f"all counts must be at least 1, got {self}")
+        require_fields(self, "num_trajectories", "num_candidates", "num_varied", low=1)
 
 
 def depth_search(motion: Motion) -> DepthSearchConfig:

@@ -20,6 +20,19 @@ from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
+PAIR_PROBABILITY = 0.34
+"""Probability that a group is one pair of scans, in every stage."""
+
+GroupShape = tuple[int, int]
+"""Number of scans in the first and in the second map of a group."""
+
+Layout = tuple[GroupShape, ...]
+"""The groups of one sample, small ones first."""
+
+NUM_LAYOUTS = 4
+GOLDEN = 0.6180339887498949
+"""Its multiples, modulo 1, spread evenly however many there are."""
+
 
 @dataclass(frozen=True)
 class CurriculumStage:
@@ -225,20 +238,6 @@ PRESETS = {
     ),
     "paper": TrainingConfig(),
 }
-
-
-PAIR_PROBABILITY = 0.34
-"""Probability that a group is one pair of scans, in every stage."""
-
-GroupShape = tuple[int, int]
-"""Number of scans in the first and in the second map of a group."""
-
-Layout = tuple[GroupShape, ...]
-"""The groups of one sample, small ones first."""
-
-NUM_LAYOUTS = 4
-GOLDEN = 0.6180339887498949
-"""Its multiples, modulo 1, spread evenly however many there are."""
 
 
 @functools.cache

@@ -28,6 +28,8 @@ from dpmjax.scans.augment import AugmentConfig
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
+TRAINED = ObjectiveConfig()
+
 PAIR_STREAM = 3103
 MAP_RADIUS_M = 10.0
 """A map of an evaluation holds scans so near to its first one."""
@@ -225,9 +227,6 @@ def _maps(
 @jax.jit
 def _merge_all(clouds: DescriptorCloud, rows: Array, T_map_scan: Array) -> DescriptorCloud:
     return jax.vmap(merge_clouds)(jax.tree.map(lambda leaf: leaf[rows], clouds), T_map_scan)
-
-
-TRAINED = ObjectiveConfig()
 
 
 class OffsetQuality(NamedTuple):

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from dpmjax.checks import require_count
+from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.training.data_pipeline import SampleMaker
@@ -118,7 +118,7 @@ class TrainingHooks:
     finish: Callable[[], bool] = bool
 
     def __post_init__(self) -> None:
-        require_count("evaluate_every", self.evaluate_every)
+        require_fields(self, "evaluate_every", low=1)
 
 
 class Trained(NamedTuple):

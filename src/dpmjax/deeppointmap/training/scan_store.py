@@ -29,6 +29,8 @@ from dpmjax.sequences import LidarSequence
 from dpmjax.types import PointCloud
 
 LOGGER = logging.getLogger("dpmjax.training")
+PUBLISHED = SamplingConfig()
+
 VARIANT_STREAM = 3104
 FORMAT = 2
 """Raise it when the same scans and settings shall give other files."""
@@ -217,9 +219,6 @@ def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
         except ValueError as error:
             digest.update(str(error).encode())
     return digest.hexdigest()[:24]
-
-
-PUBLISHED = SamplingConfig()
 
 
 def prepare_drives(
