@@ -17,6 +17,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.scans import SurfaceConfig, scan_surface
 from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.types import AnyArray
 
 # In typical ranges: nearest and farthest point, side of the voxels, and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
@@ -36,10 +37,10 @@ _COMPARED_OFFSETS, _COMPARED_POINTS = (1, 2, 4, 8), 512
 class PlaneCloud(NamedTuple):
     """Points of one scan with their planes, or of several with a leading axis; as in CloudScans."""
 
-    points: Float[Array, "... c 3"]
-    mask: Bool[Array, "... c"]
-    normals: Float[Array, "... c 3"]
-    flatness: Float[Array, "... c"]
+    points: Float[AnyArray, "... c 3"]
+    mask: Bool[AnyArray, "... c"]
+    normals: Float[AnyArray, "... c 3"]
+    flatness: Float[AnyArray, "... c"]
 
 
 @flax.struct.dataclass
@@ -97,9 +98,9 @@ def as_cloud_scans(
         rows.append(_thinned(cloud, number, config, num_points))
         if on_scan is not None:
             on_scan()
-    points, normals, flatness, mask = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
+    points, mask, normals, flatness = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
     partners = jnp.full((len(scans), _NUM_PARTNERS), -1, jnp.int32)
-    spacing = np.median([_spacing(np.asarray(p)[np.asarray(m)]) for p, m in zip(points, mask, strict=True)])
+    spacing = np.median([_spacing(np.asarray(row.points)[np.asarray(row.mask)]) for row in rows])
     return CloudScans(points, mask, normals, flatness, jnp.asarray(spacing, jnp.float32), partners)
 
 
@@ -113,23 +114,19 @@ def _checked(scan: ArrayLike, number: int) -> NDArray[np.float32]:
     return points
 
 
-def _thinned(
-    cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def _thinned(cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int) -> PlaneCloud:
     """Computes points, normals, flatness and mask of one scan."""
     surface = scan_surface(cloud, config)
     if not len(surface.points):
         raise ValueError(f"scans: scan {number} has no point near the ranges of the others; leave it out")
     rows = np.random.default_rng(number).permutation(_evenly(surface.points, config.voxel_size_m, num_points))
-    count = len(rows)
-    points, normals = np.zeros((2, num_points, 3), np.float32)
-    flatness, mask = np.zeros(num_points, np.float32), np.arange(num_points) < count
-    points[:count], normals[:count], flatness[:count] = (
-        surface.points[rows], surface.normals[rows], surface.flatness[rows]
-    )  # fmt: skip
+    missing = num_points - len(rows)
+    both = (surface.points[rows], surface.normals[rows])
+    points, normals = (np.pad(values, ((0, missing), (0, 0))).astype(np.float32) for values in both)
+    flatness = np.pad(surface.flatness[rows], (0, missing)).astype(np.float32)
     # The two sides of a wall are different surfaces, so normals point to the lidar.
     normals[np.sum(normals * points, axis=1) > 0.0] *= -1.0
-    return points, normals, flatness, mask
+    return PlaneCloud(points, np.arange(num_points) < len(rows), normals, flatness)
 
 
 def _spacing(points: NDArray[np.float32]) -> float:
