@@ -158,7 +158,6 @@ def _frozen(optimizer: optax.GradientTransformation) -> optax.GradientTransforma
     """Returns an optimiser with the same state and zero updates, so that all phases have one state structure."""
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        del params
         return jax.tree.map(jnp.zeros_like, updates), state
 
     return optax.GradientTransformation(optimizer.init, update)

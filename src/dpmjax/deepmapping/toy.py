@@ -162,7 +162,6 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
 
 
 def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
-    del data
     net_key, z_key = jax.random.split(key)
     z = jax.random.normal(z_key)
     params = ToyParams(jnp.zeros(()), ScalarNet(config.net).init(net_key, z), z)
@@ -170,23 +169,19 @@ def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
 
 
 def _optimizer(config: ToyConfig, phase: ToyConfig) -> optax.GradientTransformation:
-    del phase
     return optax.sgd(config.learning_rate)
 
 
 def _loss(
     config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None, step: Array, key: jax.Array
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    del step, key
     x = _poses(config, phase, params, data)
     return toy_loss(x), x
 
 
 def _poses(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> Float[Array, ""]:
-    del phase, data
     return params.x if config.form == "direct" else network_value(config, params)
 
 
 def _next_phase(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> ToyParams:
-    del config, phase, data
     return params

@@ -161,7 +161,6 @@ class MapMLP(nn.Module):
         Returns:
             Logits.
         """
-        del level_weights
         x = points
         for features in self.features:
             y = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
