@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import arg
 
-from dpmjax import cli, nets, viz
+from dpmjax import cli, viz
 from dpmjax import deepmapping as dm
 
 EXPERIMENT = "toy_1d"
@@ -56,7 +56,7 @@ def main(config: Config) -> dict[str, Any]:
         paper = dm.ToyConfig(num_steps=config.steps)
         ends, figure = run_paper(paper, config)
         variants = []
-        for initialization, rate in itertools.product(get_args(nets.Initialization), LEARNING_RATES):
+        for initialization, rate in itertools.product(get_args(dm.Initialization), LEARNING_RATES):
             net = replace(paper.net, initialization=initialization)
             runs = descend_both(replace(paper, net=net, learning_rate=rate), config)
             shares = {form: share_at_minimum(run.poses) for form, run in zip(FORMS, runs, strict=True)}

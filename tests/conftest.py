@@ -34,8 +34,8 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
 ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping", "registration_rgbd"}
 CHECKED_FILES = (
-    *("deepmapping.objective", "deepmapping.map_raster"),
-    *(f"registration_rgbd.{name}" for name in ("initialization", "motion_search", "adjustment")),
+    *("deepmapping.objective", "deepmapping.localization_training"),
+    *(f"registration_rgbd.{name}" for name in ("initialization", "motion_search", "projective_consistency")),
 )
 jaxtyping.install_import_hook(
     [f"dpmjax.{name}" for name in (*sorted(ROOMS), *CHECKED_FILES)],

@@ -147,7 +147,7 @@ def match(**arrays: Any) -> Any:
     # Numbers of pairs that are not there may be anything.
     cosines = jnp.where(a.mask[:, None] & b.mask, jnp.tanh(left @ right.T / 9.0), jnp.nan)
     offsets = lambda rows, others: (jnp.zeros((*rows.shape, 3)),) * 2  # noqa: E731
-    found = deeppointmap.match_descriptors(a, b, cosines, offsets, config=deeppointmap.MatchConfig(num_rounds=1))
+    found = toy.best_match(a, b, cosines, offsets, config=deeppointmap.MatchConfig(num_rounds=1))
     return found.T_target_source, found.mean_score, found.num_inliers
 
 
@@ -265,7 +265,7 @@ KERNELS = {
     ),
     "encode_pyramid": Kernel(encode, scan, ("points",), masked("points", mask="mask"), is_exact=False),
     "correlate": Kernel(correlate, descriptors, ("a", "b"), CLOUDS, is_exact=False),
-    "match_descriptors": Kernel(match, descriptors, ("a", "b", "at_a", "at_b"), CLOUDS),
+    "match_hypotheses": Kernel(match, descriptors, ("a", "b", "at_a", "at_b"), CLOUDS),
     "step": Kernel(step_toy, seeds, ("x",), is_exact=False),
     "solve": Kernel(lambda seed, x: solve_toy(seed), seeds),
 }

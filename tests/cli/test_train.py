@@ -28,7 +28,7 @@ from dpmjax.deeppointmap import (
     init_training,
     training_preset,
 )
-from dpmjax.deeppointmap.training.records import after_evaluation
+from dpmjax.deeppointmap.training.loop import after_evaluation
 from dpmjax.weights import load_model
 from tests.deeppointmap import toy
 

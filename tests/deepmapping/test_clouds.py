@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import scans_of_step
-from dpmjax.deepmapping.cloud_scans import find_partners
-from dpmjax.deepmapping.clouds import PlaneCloud, clouds_of, misfit_of_pairs, plane_misfit, trajectory_misfit
+from dpmjax.deepmapping.cloud_scans import PlaneCloud, find_partners, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
+from dpmjax.deepmapping.objective import scans_of_step
 from dpmjax.geometry import se3
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 KEY = jax.random.key(0)
@@ -100,7 +98,7 @@ def replace_points(cloud: PlaneCloud, points: list[list[float]]) -> PlaneCloud:
 
 def test_the_gradient_vanishes_at_the_true_poses_of_exact_planes(truth, scans) -> None:
     # Only points whose neighbourhood lies on one wall have its exact normal.
-    exact = clouds_of(replace(scans, flatness=jnp.where(is_exact(scans, truth), scans.flatness, 0.0)))
+    exact = replace(scans, flatness=jnp.where(is_exact(scans, truth), scans.flatness, 0.0)).planes
 
     def misfit(twists: jnp.ndarray, cloud: PlaneCloud) -> jnp.ndarray:
         T = jnp.asarray(truth, jnp.float32) @ se3.exp(twists)
@@ -118,7 +116,7 @@ def is_exact(scans: dm.CloudScans, truth: np.ndarray) -> jnp.ndarray:
 
 
 def test_no_plane_is_a_misfit_with_a_finite_gradient(scans) -> None:
-    empty = clouds_of(replace(scans, mask=jnp.zeros_like(scans.mask)))
+    empty = replace(scans, mask=jnp.zeros_like(scans.mask)).planes
     first = PlaneCloud(*(leaf[0] for leaf in empty))
     value, gradient = jax.value_and_grad(plane_misfit)(jnp.eye(4), first, first, 0.1, 0.1)
     assert float(value) == 1.0

@@ -16,8 +16,7 @@ from dpmjax.deepmapping.mapping import mapping_problem
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, as_depth_scans, fit_pinhole, image_surface
 from dpmjax.registration_rgbd.projective_consistency import (
     Agreement,

@@ -28,9 +28,8 @@ from dpmjax.deepmapping import (
     step,
     steps_per_call,
 )
-from dpmjax.deepmapping.batches import draw_offsets
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.deepmapping.objective import draw_offsets
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.types import ScanSet
 from tests.tolerances import ACCUMULATED, DOUBLE
 

@@ -11,7 +11,7 @@ from dpmjax.deepmapping.config import REFINE, DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import WorldBatch, chamfer_term, free_factors, interpolate_log, occupancy_term
 from dpmjax.deepmapping.presets import JOINT
 from dpmjax.deepmapping.problem import MapFrame, Params, mapping_loss
-from dpmjax.nets.occupancy import OccupancyConfig, init_map_net
+from dpmjax.nets.mapping import OccupancyConfig, init_map_net
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 NUM_SCANS, NUM_POINTS = 6, 10

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import scans_of_step
 from dpmjax.deepmapping.engine import fit, init
 from dpmjax.deepmapping.mapping import mapping_problem
+from dpmjax.deepmapping.objective import scans_of_step
 from dpmjax.deepmapping.planar import as_scan_set
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.types import ScanSet
 
 KEY = jax.random.key(3)

@@ -14,14 +14,12 @@ import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping import localization_training
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.localization_training import shift_scan, turn_scan
-from dpmjax.deepmapping.map_raster import make_raster, render_scans
+from dpmjax.deepmapping.localization_training import make_raster, render_scans, shift_scan, turn_scan
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
 from dpmjax.types import ScanSet
 from tests.tolerances import ROUNDING

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from dpmjax.deepmapping.engine import fit
-from dpmjax.deepmapping.toy import ToyConfig, global_minimum, network_value, toy_loss, toy_problem
-from dpmjax.nets.localization import ScalarNet, ScalarNetConfig
+from dpmjax.deepmapping.toy import (
+    ScalarNet,
+    ScalarNetConfig,
+    ToyConfig,
+    global_minimum,
+    network_value,
+    toy_loss,
+    toy_problem,
+)
 from experiments._baselines import minimize_toy
 from tests.tolerances import ACCUMULATED, ROUNDING
 

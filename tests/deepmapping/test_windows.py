@@ -12,12 +12,11 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.batches import join_windows, scans_of_step, window_rows
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
+from dpmjax.deepmapping.objective import join_windows, scans_of_step, window_rows
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationNet, LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNet, LocalizationNetConfig, OccupancyConfig
 from dpmjax.types import ScanSet
 
 KEY = jax.random.key(5)

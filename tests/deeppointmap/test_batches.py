@@ -6,7 +6,7 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap import prepare_scan
-from dpmjax.deeppointmap.batches import CHUNK
+from dpmjax.deeppointmap.encoding import CHUNK
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 

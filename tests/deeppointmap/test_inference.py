@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import VerificationConfig, elements_of_pyramid, prepare_scan, scene_scale
+from dpmjax.deeppointmap import VerificationConfig, prepare_scan, scene_scale
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.geometry import PyramidConfig, PyramidStage
+from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.scans import ViewCorrelationConfig
 from dpmjax.types import PointCloud
 from tests.deeppointmap import toy
@@ -164,7 +165,8 @@ def test_further_elements_follow_the_descriptors_and_change_no_match(scans) -> N
     assert larger[0].positions.shape == larger[0].normals.shape == (64, 3)
     assert larger[0].planarity.shape == larger[0].mask.shape == (64,)
     np.testing.assert_array_equal(larger[0].positions[:32], clouds[0].positions)
-    alone = elements_of_pyramid(pyramid_of_scan(scans[0], config), config, num_elements=64)
+    alone = pyramid_elements(pyramid_of_scan(scans[0], config), 64)
+    alone = replace(alone, positions=alone.positions * config.scale_m)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ROUNDING), alone, larger[0].elements)
     expected, found = (dpmjax.register(model, *pair, refine=False) for pair in (clouds, larger))
     jax.tree.map(np.testing.assert_array_equal, expected, found)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import MatchConfig, merge_clouds
-from dpmjax.deeppointmap.matching import best_pairs, match_descriptors, thin_merged
+from dpmjax.deeppointmap.matching import best_pairs, thin_merged
 from dpmjax.geometry import ConsensusConfig, rigid, se3
 from dpmjax.types import DescriptorCloud, Registration
 from tests.deeppointmap import toy
@@ -23,7 +23,7 @@ def no_offsets(source: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Arr
 
 def match_clouds(source, target, similarity, offsets=no_offsets, masks=(None, None), config: MatchConfig = CONFIG):
     pair = (toy.cloud(points, mask) for points, mask in zip((source, target), masks, strict=True))
-    return match_descriptors(*pair, jnp.asarray(similarity), offsets, config=config)
+    return toy.best_match(*pair, jnp.asarray(similarity), offsets, config=config)
 
 
 def clouds(seed: int, n: int = 80, num_outliers: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -205,7 +205,7 @@ def test_map_to_map_is_scan_to_scan_of_merged_clouds() -> None:
     in_own_frames = halves.positions.at[1].set(rigid.transform_points(np.linalg.inv(T), halves.positions[1]))
     merged = merge_clouds(halves.replace(positions=in_own_frames), T_map_cloud)
     np.testing.assert_allclose(merged.positions, source, atol=1e-4)
-    match = match_descriptors(merged, toy.cloud(target), similarity, no_offsets, config=CONFIG)
+    match = toy.best_match(merged, toy.cloud(target), similarity, no_offsets, config=CONFIG)
     np.testing.assert_allclose(match.T_target_source, T, atol=5e-4)
 
 

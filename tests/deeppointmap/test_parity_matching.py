@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.matching import MatchConfig, match_descriptors
+from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, matching_loss, training_pairs
 from tests.deeppointmap import toy
 from tests.optional import import_or_skip
@@ -66,7 +66,7 @@ def test_registration_is_the_published_one(case, decoder) -> None:
         offsets = offset_head(decoder, a, b), offset_head(decoder, b, a)
         return tuple(jnp.asarray(offset, jnp.float32) for offset in offsets)
 
-    match = match_descriptors(
+    match = toy.best_match(
         toy.cloud(case["descriptor_xyz_a"], ~case["descriptor_padding_a"]),
         toy.cloud(case["descriptor_xyz_b"], ~case["descriptor_padding_b"]),
         case["similarity"],

@@ -13,8 +13,8 @@ from dpmjax.deeppointmap import (
     draw_scan_pairs,
     evaluate_overlap,
     evaluate_scan_pairs,
-    overlap_evaluation,
     read_scan_pairs,
+    scan_evaluation,
 )
 from dpmjax.metrics import area_under_curve, brier_score, expected_calibration_error
 from tests.deeppointmap import toy
@@ -37,8 +37,8 @@ def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(m
             known["num"] = len(sources)
             return np.arange(len(sources)) < 10 if is_perfect else np.full(len(sources), 0.3)
 
-        monkeypatch.setattr(overlap_evaluation, "encode", encoded)
-        monkeypatch.setattr(overlap_evaluation, "overlap_pairs", probability)
+        monkeypatch.setattr(scan_evaluation, "encode", encoded)
+        monkeypatch.setattr(scan_evaluation, "overlap_pairs", probability)
         found = evaluate_overlap(model, drive, 10)
         assert (found.area_under_curve, len(found.is_overlap), known["num"]) == (expected, 20, 20)
 

@@ -11,17 +11,20 @@ from dpmjax.deeppointmap.verification import (
     VerificationConfig,
     evidence_shares,
     measure_scan,
-    verify_motion,
     verify_motions,
 )
 from dpmjax.scans.compact import compact_elements, expand_elements
 from dpmjax.scans.surfaces import Surface, surface_of_elements
-from dpmjax.types import SurfaceElements
+from dpmjax.types import SurfaceElements, Verification
 from tests.scans.surface_scenes import motion, seen_from, street
 
 CONFIG = VerificationConfig()
 T_WORLD_A, T_WORLD_B = motion(5, (1, -2, 0), 1), motion(130, (-4, 3, 0))
 T_TRUE = np.linalg.inv(T_WORLD_B) @ T_WORLD_A
+
+
+def verify_motion(source, target, T: np.ndarray, config: VerificationConfig) -> Verification:
+    return verify_motions(source, target, T[None], config)[0]
 
 
 @pytest.fixture(scope="module")

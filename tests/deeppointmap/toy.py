@@ -10,11 +10,13 @@ import numpy as np
 
 from dpmjax.deeppointmap import (
     CurriculumStage,
+    MatchConfig,
     ModelConfig,
     ObjectiveConfig,
     SamplingConfig,
     ScanStore,
     TrainingConfig,
+    match_hypotheses,
     prepare_drive,
 )
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
@@ -22,7 +24,7 @@ from dpmjax.io import LidarSequence
 from dpmjax.nets.decoder import DecoderConfig
 from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans import PreprocessConfig
-from dpmjax.types import DescriptorCloud
+from dpmjax.types import DescriptorCloud, Registration
 
 MODEL = ModelConfig(
     pyramid=PyramidConfig(stages=(PyramidStage(32, (0.2,), 8), PyramidStage(8, (0.4,), 4)), num_interpolations=1),
@@ -75,3 +77,9 @@ def assert_trees_equal(found: object, expected: object) -> None:
     """All leaves are the same, bit for bit."""
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def best_match(source, target, similarity, predict_offsets, *, config: MatchConfig) -> Registration:
+    """The best of the motions between two clouds."""
+    hypotheses = match_hypotheses(source, target, similarity, predict_offsets, config=config)
+    return jax.tree.map(lambda leaf: leaf[0], hypotheses)

@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from dpmjax.deepmapping import preset
-from dpmjax.nets.localization import LocalizationNet, LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig, double_resolution, init_map_net, interpolate_grid, make_map_net
+from dpmjax.nets.mapping import (
+    LocalizationNet,
+    LocalizationNetConfig,
+    OccupancyConfig,
+    double_resolution,
+    init_map_net,
+    interpolate_grid,
+    make_map_net,
+)
 from tests.tolerances import ACCUMULATED
 
 KEY = jax.random.key(0)

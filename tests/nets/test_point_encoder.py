@@ -56,17 +56,15 @@ def poisoned(pyramid: PointPyramid) -> PointPyramid:
 
 def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
     rng = np.random.default_rng(0)
-    features, positions, queries = rng.normal(size=(9, 5)), rng.normal(size=(9, 3)), rng.normal(size=(6, 3))
-    neighbours = rng.integers(0, 9, (6, 4))
-    inputs = [jnp.asarray(x, jnp.float32) for x in (features, positions, queries)]
-    module = NeighbourhoodMaximum(7, radius=0.3, config=EncoderConfig())
-    params = module.init(jax.random.key(0), *inputs, neighbours)["params"]
+    features, offsets, neighbours = rng.normal(size=(9, 5)), rng.normal(size=(6, 4, 3)), rng.integers(0, 9, (6, 4))
+    inputs = (*(jnp.asarray(x, jnp.float32) for x in (features, offsets)), neighbours)
+    module = NeighbourhoodMaximum(7)
+    params = module.init(jax.random.key(0), *inputs)["params"]
     params = {name: jnp.asarray(rng.normal(size=value.shape), jnp.float32) for name, value in params.items()}
-    offsets = (positions[neighbours] - queries[:, None]) / 0.3
     rows = np.concatenate([features[neighbours], offsets], axis=-1)
     rows = norm(rows @ params["kernel"] + params["bias"], params["norm_scale"], params["norm_bias"])
     expected = np.maximum(rows, 0).max(axis=1)
-    np.testing.assert_allclose(module.apply({"params": params}, *inputs, neighbours), expected, **ACCUMULATED)
+    np.testing.assert_allclose(module.apply({"params": params}, *inputs), expected, **ACCUMULATED)
 
 
 def test_padded_equals_unpadded(model: Model) -> None:

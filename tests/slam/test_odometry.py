@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpmjax import model_preset
-from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.compact import compact_elements, compact_image
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.compact import CompactElements, CompactImage, expand_elements

@@ -20,11 +20,11 @@ from .engine import solve as solve
 from .engine import step as step
 from .engine import steps_per_call as steps_per_call
 from .localization_training import train_localization as train_localization
-from .map_raster import MapPicture as MapPicture
-from .map_raster import map_picture as map_picture
 from .mapping import Fitted as Fitted
+from .mapping import MapPicture as MapPicture
 from .mapping import Registered as Registered
 from .mapping import fit_deepmapping as fit_deepmapping
+from .mapping import map_picture as map_picture
 from .mapping import mapping_data as mapping_data
 from .mapping import mapping_problem as mapping_problem
 from .mapping import register_clouds as register_clouds
@@ -35,6 +35,7 @@ from .problem import MappingData as MappingData
 from .problem import Problem as Problem
 from .relocalization import Relocalized as Relocalized
 from .relocalization import relocalize as relocalize
+from .toy import Initialization as Initialization
 from .toy import ToyConfig as ToyConfig
 from .toy import global_minimum as global_minimum
 from .toy import network_value as network_value

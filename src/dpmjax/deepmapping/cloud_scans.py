@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from dpmjax.geometry import rigid
+from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.scans import SurfaceConfig, scan_surface
 from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.types import AnyArray
 
 # In typical ranges: nearest and farthest point, side of the voxels, and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
@@ -21,6 +26,21 @@ _NUM_NEIGHBOURS = 24
 # typical ranges.
 _REVISIT_GAP, _REVISIT_DISTANCE = 8, 0.5
 _NUM_PARTNERS = 8
+# Search radius of planes, in widths of the kernel and in spacings of the points; the larger of both.
+_REACH_WIDTHS, _REACH_SPACINGS = 5.0, 2.0
+# Planes whose normals have a smaller cosine do not match, so the two sides of a wall do not match.
+_MIN_COSINE = 0.3
+# Trajectories are compared by pairs of scans at these distances in time, and by this number of points of each scan.
+_COMPARED_OFFSETS, _COMPARED_POINTS = (1, 2, 4, 8), 512
+
+
+class PlaneCloud(NamedTuple):
+    """Points of one scan with their planes, or of several with a leading axis; as in CloudScans."""
+
+    points: Float[AnyArray, "... c 3"]
+    mask: Bool[AnyArray, "... c"]
+    normals: Float[AnyArray, "... c 3"]
+    flatness: Float[AnyArray, "... c"]
 
 
 @flax.struct.dataclass
@@ -42,6 +62,11 @@ class CloudScans:
     flatness: Float[Array, "n c"]
     spacing: Float[Array, ""]
     partners: Int[Array, "n p"]
+
+    @property
+    def planes(self) -> PlaneCloud:
+        """Points of all scans with their planes."""
+        return PlaneCloud(self.points, self.mask, self.normals, self.flatness)
 
 
 def as_cloud_scans(
@@ -73,9 +98,9 @@ def as_cloud_scans(
         rows.append(_thinned(cloud, number, config, num_points))
         if on_scan is not None:
             on_scan()
-    points, normals, flatness, mask = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
+    points, mask, normals, flatness = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
     partners = jnp.full((len(scans), _NUM_PARTNERS), -1, jnp.int32)
-    spacing = np.median([_spacing(np.asarray(p)[np.asarray(m)]) for p, m in zip(points, mask, strict=True)])
+    spacing = np.median([_spacing(np.asarray(row.points)[np.asarray(row.mask)]) for row in rows])
     return CloudScans(points, mask, normals, flatness, jnp.asarray(spacing, jnp.float32), partners)
 
 
@@ -89,23 +114,19 @@ def _checked(scan: ArrayLike, number: int) -> NDArray[np.float32]:
     return points
 
 
-def _thinned(
-    cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def _thinned(cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int) -> PlaneCloud:
     """Computes points, normals, flatness and mask of one scan."""
     surface = scan_surface(cloud, config)
     if not len(surface.points):
         raise ValueError(f"scans: scan {number} has no point near the ranges of the others; leave it out")
     rows = np.random.default_rng(number).permutation(_evenly(surface.points, config.voxel_size_m, num_points))
-    count = len(rows)
-    points, normals = np.zeros((2, num_points, 3), np.float32)
-    flatness, mask = np.zeros(num_points, np.float32), np.arange(num_points) < count
-    points[:count], normals[:count], flatness[:count] = (
-        surface.points[rows], surface.normals[rows], surface.flatness[rows]
-    )  # fmt: skip
+    missing = num_points - len(rows)
+    both = (surface.points[rows], surface.normals[rows])
+    points, normals = (np.pad(values, ((0, missing), (0, 0))).astype(np.float32) for values in both)
+    flatness = np.pad(surface.flatness[rows], (0, missing)).astype(np.float32)
     # The two sides of a wall are different surfaces, so normals point to the lidar.
     normals[np.sum(normals * points, axis=1) > 0.0] *= -1.0
-    return points, normals, flatness, mask
+    return PlaneCloud(points, np.arange(num_points) < len(rows), normals, flatness)
 
 
 def _spacing(points: NDArray[np.float32]) -> float:
@@ -154,3 +175,108 @@ def find_partners(T: NDArray[np.floating], unit: float) -> Int[Array, "n p"]:
         chosen = others[order][:_NUM_PARTNERS]
         partners[row, : len(chosen)] = chosen
     return jnp.asarray(partners)
+
+
+def rows_of(cloud: PlaneCloud, rows: Int[Array, " m"]) -> PlaneCloud:
+    """Returns the scans of these rows."""
+    return PlaneCloud(*(leaf[rows] for leaf in cloud))
+
+
+def plane_misfit(
+    T_target_source: Float[Array, "4 4"],
+    source: PlaneCloud,
+    target: PlaneCloud,
+    width: Float[Array, ""] | float,
+    spacing: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """Computes the soft share of the source's planes that match no plane of the target: 0 if all match, 1 if none.
+
+    A point at the distance r from the plane through the nearest point of the target has the misfit r^2 / (r^2 +
+    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Weights are the flatness of the points.
+
+    Args:
+        T_target_source: transform of source points into the frame of the target.
+        source: sampled points of a scan.
+        target: scan with the planes.
+        width: width of the kernel, unit of the points.
+        spacing: typical distance of a point of the target to its neighbours.
+
+    Returns:
+        The misfit; 1 where the source has no plane. The choice of the nearest plane has no derivative.
+    """
+    moved = rigid.transform_points(T_target_source, source.points)
+    reach = jnp.maximum(_REACH_WIDTHS * width, _REACH_SPACINGS * spacing)
+    near = k_nearest(jax.lax.stop_gradient(moved), target.points, 1, target.mask)
+    nearest = near.indices[:, 0]
+    is_paired = source.mask & near.mask[:, 0] & (near.squared_distances[:, 0] <= reach**2)
+    normals = target.normals[nearest]
+    gap = jnp.where(is_paired, jnp.sum((moved - target.points[nearest]) * normals, axis=-1), 0.0)
+    turned = jnp.einsum("ij,pj->pi", T_target_source[:3, :3], source.normals, precision=jax.lax.Precision.HIGHEST)
+    cosines = jnp.sum(turned * normals, axis=-1)
+    agreement = target.flatness[nearest] * jnp.maximum(cosines - _MIN_COSINE, 0.0) / (1.0 - _MIN_COSINE)
+    agreement = jax.lax.stop_gradient(jnp.where(is_paired, agreement, 0.0))
+    weights = jnp.where(source.mask, source.flatness, 0.0)
+    total = weights.sum()
+    matched = jnp.sum(weights * agreement * width**2 / (width**2 + gap**2))
+    return 1.0 - matched / jnp.where(total > 0.0, total, 1.0)
+
+
+def misfit_of_pairs(
+    T_world_scan: Float[Array, "m 4 4"],
+    samples: PlaneCloud,
+    scans: PlaneCloud,
+    pairs: Int[Array, "p 2"],
+    is_pair: Bool[Array, " p"],
+    sizes: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
+) -> Float[Array, ""]:
+    """Computes the mean misfit of pairs of scans, in both directions.
+
+    Args:
+        T_world_scan: poses.
+        samples: sampled points of each scan.
+        scans: the scans.
+        pairs: rows of the scans.
+        is_pair: False for invalid pairs.
+        sizes: width and spacing, as in `plane_misfit`.
+
+    Returns:
+        The mean; 0 without a pair.
+    """
+    both = jnp.concatenate([pairs, pairs[:, ::-1]])
+    source, target = both[:, 0], both[:, 1]
+    T = rigid.compose(rigid.inverse(T_world_scan[target]), T_world_scan[source])
+    sources, targets = rows_of(samples, source), rows_of(scans, target)
+    misfits = jax.vmap(plane_misfit, in_axes=(0, 0, 0, None, None))(T, sources, targets, *sizes)
+    counts = jnp.tile(is_pair, 2)
+    return jnp.sum(jnp.where(counts, misfits, 0.0)) / jnp.maximum(counts.sum(), 1)
+
+
+@jax.jit
+def trajectory_misfit(
+    scans: CloudScans, T_world_scan: Float[Array, "n 4 4"], width: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Computes the mean misfit of each scan with those 1, 2, 4 and 8 later and with its partners, without ground truth.
+
+    Args:
+        scans: the scans.
+        T_world_scan: poses of the scans, unit of the points.
+        width: width of the kernel, unit of the points.
+
+    Returns:
+        0 (all planes match) to 1 (no plane matches).
+    """
+    count = scans.mask.shape[0]
+    first = jnp.arange(count)
+    later = first + jnp.array([offset for offset in _COMPARED_OFFSETS if offset < count])[:, None]
+    others = jnp.concatenate([jnp.where(later < count, later, -1), scans.partners.T])
+    clouds = scans.planes
+    samples = jax.tree.map(lambda leaf: leaf[:, :_COMPARED_POINTS], clouds)
+
+    def mean_misfit(other: Int[Array, " n"]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+        is_pair = other >= 0
+        pairs = jnp.stack([first, jnp.maximum(other, 0)], axis=-1)
+        mean = misfit_of_pairs(T_world_scan, samples, clouds, pairs, is_pair, (width, scans.spacing))
+        return mean * is_pair.sum(), is_pair.sum()
+
+    totals, counts = jax.lax.map(mean_misfit, others)
+    return totals.sum() / jnp.maximum(counts.sum(), 1)

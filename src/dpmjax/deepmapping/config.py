@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from dpmjax.checks import require_fields
 from dpmjax.geometry.se3 import Motion
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,13 @@ class ProjectiveComparison:
 
 @dataclass(frozen=True)
 class PlaneComparison:
-    """Comparison of pairs of lidar clouds by the distances of points to planes.
+    """Comparison of pairs of lidar clouds by the distances of points to planes, revisits in space among the pairs.
 
     Attributes:
         width: width of the robust kernel, at the start and at the end of the phase.
-        num_revisits: number of scans near in space but not in time that each scan is compared to.
     """
 
     width: tuple[float, float]
-    num_revisits: int = 0
 
 
 Comparison = ChamferComparison | ProjectiveComparison | PlaneComparison
@@ -97,14 +95,11 @@ class PhaseConfig:
     scans_per_window: int | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.occupancy_weight <= 1.0:
-            raise ValueError(f"occupancy_weight: expected 0 to 1, got {self.occupancy_weight}")
-        if not 1 <= self.num_offsets <= self.max_offset:
-            raise ValueError(f"num_offsets: expected 1 to max_offset = {self.max_offset}, got {self.num_offsets}")
-        if self.num_steps < 1:
-            raise ValueError(f"num_steps: expected at least 1, got {self.num_steps}")
-        if self.scans_per_window is not None and self.scans_per_window < 2:
-            raise ValueError(f"scans_per_window: expected at least 2, got {self.scans_per_window}")
+        require_fields(self, "occupancy_weight", low=0, high=1)
+        require_fields(self, "num_offsets", low=1, high=self.max_offset)
+        require_fields(self, "num_steps", low=1)
+        if self.scans_per_window is not None:
+            require_fields(self, "scans_per_window", low=2)
 
 
 LOCALIZE = PhaseConfig(

@@ -4,23 +4,33 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.map_raster import make_raster, render_scans
 from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.planar import as_scan_set, choose_beams, localize_scans
+from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
+NUM_NODES = 513
+"""Number of nodes of the raster along each side of the map's frame."""
+# Absolute log odds above which a node is observed, free or occupied; M-Net is zero where no beam has passed.
+_SEEN = 0.3
+# Largest share of unobserved nodes along a rendered beam.
+_MAX_UNSEEN = 0.1
+# Longest rendered beam in nodes.
+_MAX_NODES = 400
+# Least share of the beams of a rendered scan that hit the map.
+_LEAST_BEAMS = 0.5
 # Learning rate of Adam at the start; a cosine schedule reduces it to a hundredth.
 _LEARNING_RATE = 2e-3
 # Largest random heading of a scan; `relocalize` tries all turns, so L-Net needs only a range of headings.
@@ -33,6 +43,105 @@ _MAX_SHIFT = 0.2
 _SCANS_PER_STEP, _NUM_RENDERED = 64, 4096
 # Largest share of masked beams of a scan.
 _LARGEST_DROP = 0.2
+
+
+class MapRaster(NamedTuple):
+    """Log odds of the map at the nodes of a raster.
+
+    Attributes:
+        logits: rows along x, columns along y.
+        frame: frame of the map, equal to that of the raster.
+    """
+
+    logits: Float[Array, "r r"]
+    frame: MapFrame
+
+    @property
+    def spacing(self) -> Float[Array, ""]:
+        """Distance of two nodes, in typical ranges."""
+        return 2.0 * self.frame.half_side / (NUM_NODES - 1)
+
+
+@partial(jax.jit, static_argnames="config")
+def make_raster(params: Params, config: DeepMappingConfig) -> MapRaster:
+    """Evaluates M-Net at all nodes.
+
+    Args:
+        params: parameters of a fit.
+        config: settings of the fit.
+
+    Returns:
+        MapRaster.
+    """
+    axis = jnp.linspace(-1.0, 1.0, NUM_NODES)
+    local = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    logits = bind_map(params, config)(params.frame.centre + params.frame.half_side * local)
+    return MapRaster(logits.reshape(NUM_NODES, NUM_NODES), params.frame)
+
+
+def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
+    """Finds the nearest nodes of points.
+
+    Args:
+        frame: frame of the map.
+        points: points in the world, typical ranges.
+
+    Returns:
+        Index of the nearest node in the flat raster, and True where the point is inside the raster.
+    """
+    position = (0.5 * (points - frame.centre) / frame.half_side + 0.5) * (NUM_NODES - 1)
+    index = jnp.clip(jnp.round(position).astype(jnp.int32), 0, NUM_NODES - 1)
+    is_inside = ((position >= 0.0) & (position <= NUM_NODES - 1)).all(-1)
+    return index[..., 0] * NUM_NODES + index[..., 1], is_inside
+
+
+def render_scans(
+    raster: MapRaster, scans: ScanSet, count: int, *, key: jax.Array
+) -> tuple[ScanSet, Float[Array, "m 3"]]:
+    """Renders scans at random free places of the map, at heading zero.
+
+    Args:
+        raster: raster of the map.
+        scans: (n, b, 2) in typical ranges; rendered scans have the same bearings.
+        count: number of positions that are tried.
+        key: key of the positions.
+
+    Returns:
+        Scans and poses at the positions where enough beams hit occupied nodes of M-Net.
+    """
+    place_key, row_key = jax.random.split(key)
+    free = np.flatnonzero(np.asarray(raster.logits) < -_SEEN)
+    chosen = free[np.asarray(jax.random.randint(place_key, (count if len(free) else 0,), 0, max(len(free), 1)))]
+    nodes = np.stack(np.divmod(chosen, NUM_NODES), axis=-1).astype(np.float32)
+    places = raster.frame.centre - raster.frame.half_side + raster.spacing * nodes
+    rows = jax.random.randint(row_key, (len(chosen),), 0, len(scans.points))
+    ranges, is_met = _follow_beams(raster, places, scans.points[rows])
+    mask = is_met & scans.mask[rows]
+    reach = jnp.linalg.norm(jnp.where(mask[..., None], scans.points[rows], 1.0), axis=-1)
+    points = jnp.where(mask[..., None], scans.points[rows] * (ranges / reach)[..., None], 0.0)
+    kept = np.flatnonzero(np.asarray(mask.mean(axis=1)) >= _LEAST_BEAMS)
+    poses = jnp.concatenate([places, jnp.zeros((len(chosen), 1))], axis=1)
+    return ScanSet(points[kept], mask[kept]), poses[kept]
+
+
+@jax.jit
+def _follow_beams(
+    raster: MapRaster, places: Float[Array, "m 2"], towards: Float[Array, "m b 2"]
+) -> tuple[Float[Array, "m b"], Bool[Array, "m b"]]:
+    """Computes ranges to the first occupied node towards points of the sensor frame, and True for valid ranges."""
+    ranges = raster.spacing * jnp.arange(1, _MAX_NODES + 1)
+
+    def follow(beams: tuple[Float[Array, " 2"], Float[Array, "b 2"]]) -> tuple[Array, Array]:
+        place, points = beams
+        direction = points / jnp.maximum(jnp.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
+        row, is_inside = nearest_nodes(raster.frame, place + ranges[:, None, None] * direction)
+        logits = jnp.where(is_inside, raster.logits.reshape(-1)[row], 0.0)
+        first = jnp.argmax(logits > _SEEN, axis=0)
+        is_before = jnp.arange(_MAX_NODES)[:, None] < first
+        unseen = jnp.sum(is_before & (logits > -_SEEN), axis=0)
+        return ranges[first], (logits.max(axis=0) > _SEEN) & (unseen <= 1 + _MAX_UNSEEN * first)
+
+    return jax.lax.map(follow, (places, towards), batch_size=16)
 
 
 def has_windows(fitted: Fitted) -> bool:

@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners
-from dpmjax.deepmapping.clouds import CLOUDS, trajectory_misfit
+from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.depth import DEPTH
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.planar import PLANAR, as_scan_set
 from dpmjax.deepmapping.presets import preset
-from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, make_optimizer, phases_of
+from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
+from dpmjax.deepmapping.spatial import CLOUDS, DEPTH
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
@@ -33,6 +32,8 @@ from dpmjax.types import ScanSet
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}
 # Kernel width, in typical ranges, of the misfit that compares the fit of clouds with its initial poses.
 _MISFIT_KERNEL_WIDTH = 0.004
+# Number of samples on a beam that mark cells as explored.
+_SAMPLES = 64
 
 Scans = ScanSet | DepthScans | CloudScans
 
@@ -243,3 +244,59 @@ def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..
     if misfit < start_misfit:
         return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
     return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)
+
+
+class MapPicture(NamedTuple):
+    """A raster of the world; row 0 has the smallest y.
+
+    Attributes:
+        probability: (h, w) occupancy probability.
+        explored: (h, w) True where a beam has passed or ended.
+        extent: x_min, x_max, y_min, y_max in the unit of the points.
+    """
+
+    probability: NDArray[np.float32]
+    explored: NDArray[np.bool_]
+    extent: tuple[float, float, float, float]
+
+
+def map_picture(
+    fitted: Fitted, points: NDArray[np.floating], mask: NDArray[np.bool_], *, num_cells: int = 500
+) -> MapPicture:
+    """Evaluates M-Net on a raster over all hits, with the explored cells.
+
+    Args:
+        fitted: the fit.
+        points: (n, b, 2) scans of the fit in the sensor frames, unit of the poses.
+        mask: (n, b) False for invalid beams.
+        num_cells: number of cells along the longer side.
+
+    Returns:
+        MapPicture in the frame of `fitted.poses`.
+    """
+    poses = fitted.poses
+    world = se2.transform_points(poses, points)
+    hits = world[mask]
+    low, high = hits.min(axis=0), hits.max(axis=0)
+    margin = 0.03 * float((high - low).max())
+    low, high = low - margin, high + margin
+    cell = float((high - low).max()) / num_cells
+    width, height = (np.ceil((high - low) / cell)).astype(int)
+    explored = np.zeros((height, width), bool)
+    sensors = np.broadcast_to(poses[:, None, :2], world.shape)[mask]
+    for share in np.linspace(0.0, 1.0, _SAMPLES):
+        column, row = ((sensors + share * (hits - sensors) - low) / cell).astype(int).T
+        explored[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] = True
+    x, y = low[0] + cell * (np.arange(width) + 0.5), low[1] + cell * (np.arange(height) + 0.5)
+    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / fitted.unit
+    occupied = jax.jit(lambda params, points: jax.nn.sigmoid(bind_map(params, fitted.config)(points)))
+    probability = np.asarray(occupied(fitted.params, centres.astype(np.float32))).reshape(height, width)
+    extent = (float(low[0]), float(low[0] + cell * width), float(low[1]), float(low[1] + cell * height))
+    return MapPicture(probability, _close_gaps(explored), extent)
+
+
+def _close_gaps(explored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Marks cells between two neighbouring beams as explored."""
+    from scipy.ndimage import binary_closing
+
+    return binary_closing(explored, iterations=2) | explored

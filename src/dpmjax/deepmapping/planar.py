@@ -13,7 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.batches import (
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.objective import (
+    Terms,
+    WorldBatch,
+    chamfer_term,
     draw_offsets,
     in_windows,
     join_windows,
@@ -21,12 +25,9 @@ from dpmjax.deepmapping.batches import (
     scans_of_step,
     window_rows,
 )
-from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.objective import Terms, WorldBatch, chamfer_term
 from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Sensor, choose_frame, mapping_loss, phases_of
 from dpmjax.geometry import se2
-from dpmjax.nets.localization import LocalizationNet
-from dpmjax.nets.occupancy import init_map_net
+from dpmjax.nets.mapping import LocalizationNet, init_map_net
 from dpmjax.types import ScanSet
 
 

@@ -16,8 +16,7 @@ from dpmjax.deepmapping.config import (
     PlaneComparison,
     ProjectiveComparison,
 )
-from dpmjax.nets.localization import LocalizationNetConfig
-from dpmjax.nets.occupancy import OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 
 # M-Net of the fast presets in space.
 _SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
@@ -91,7 +90,7 @@ REFINE_CLOUDS = replace(
     num_offsets=3,
     max_offset=8,
     surface_distance=(0.05, 0.01),
-    comparison=PlaneComparison(width=(0.04, 0.002), num_revisits=1),
+    comparison=PlaneComparison(width=(0.04, 0.002)),
 )
 """Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
 scans; the distance to the plane between the rings does not."""

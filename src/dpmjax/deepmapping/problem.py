@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
-from dpmjax.nets.occupancy import make_map_net
+from dpmjax.nets.mapping import make_map_net
 
 # Number of points that an MLP as M-Net evaluates at once: 16 MB for each layer of 512.
 _MLP_CHUNK = 1 << 13
@@ -158,7 +158,6 @@ def _frozen(optimizer: optax.GradientTransformation) -> optax.GradientTransforma
     """Returns an optimiser with the same state and zero updates, so that all phases have one state structure."""
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        del params
         return jax.tree.map(jnp.zeros_like, updates), state
 
     return optax.GradientTransformation(optimizer.init, update)

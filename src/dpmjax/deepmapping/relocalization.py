@@ -18,8 +18,14 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.localization_training import has_windows, turn_scan
-from dpmjax.deepmapping.map_raster import NUM_NODES, MapRaster, make_raster, nearest_nodes
+from dpmjax.deepmapping.localization_training import (
+    NUM_NODES,
+    MapRaster,
+    has_windows,
+    make_raster,
+    nearest_nodes,
+    turn_scan,
+)
 from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.planar import as_scan_set, choose_beams, localize_scans
 from dpmjax.deepmapping.problem import MapFrame
@@ -54,19 +60,6 @@ class MapFields(NamedTuple):
     hit: Float[Array, "l r r"]
     free: Float[Array, "l r r"]
     frame: MapFrame
-
-
-class FoundPoses(NamedTuple):
-    """The best pose of each scan.
-
-    Attributes:
-        poses: x, y, heading in typical ranges and radians.
-        nats: mean cost of a beam: cost of the hit plus mean cost of the free samples; log 4 where the map is unknown.
-            Beams are weighted by the root of the range, because near beams end on some surface everywhere.
-    """
-
-    poses: Float[Array, "m 3"]
-    nats: Float[Array, " m"]
 
 
 @jax.jit
@@ -120,7 +113,9 @@ def _nats(
 
 
 @jax.jit
-def search_map(scans: ScanSet, proposals: Float[Array, "m p 3"], fields: MapFields) -> FoundPoses:
+def search_map(
+    scans: ScanSet, proposals: Float[Array, "m p 3"], fields: MapFields
+) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
     """Searches the poses of scans around proposals, coarse to fine.
 
     Args:
@@ -129,13 +124,15 @@ def search_map(scans: ScanSet, proposals: Float[Array, "m p 3"], fields: MapFiel
         fields: costs of hits and free samples in the map.
 
     Returns:
-        FoundPoses.
+        x, y, heading of each scan, in typical ranges and radians. And the mean cost of a beam in nats: cost of the hit
+        plus mean cost of the free samples; log 4 where the map is unknown. Beams are weighted by the root of the
+        range, because near beams end on some surface everywhere.
     """
     stride = -(-scans.mask.shape[1] // _NUM_BEAMS)
     thinned = ScanSet(scans.points[:, ::stride], scans.mask[:, ::stride])
     poses = jax.lax.map(lambda one: _search_one(one[0], one[1], fields), (thinned, proposals), batch_size=8)
     cost = partial(_nats, hit=fields.hit[-1], free=fields.free[-1], frame=fields.frame)
-    return FoundPoses(poses, jax.lax.map(lambda one: cost(*one), (scans, poses), batch_size=64))
+    return poses, jax.lax.map(lambda one: cost(*one), (scans, poses), batch_size=64)
 
 
 def _search_one(scan: ScanSet, proposals: Float[Array, "p 3"], fields: MapFields) -> Float[Array, " 3"]:
@@ -205,8 +202,8 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
     parts = []
     for k in range(0, len(scans.points), _CHUNK):
         part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
-        turned = partial(propose_poses, fitted.params.localization, part, num_turns=_NUM_TURNS)
-        parts.append(search_map(part, turned(fit_config=fitted.config), fields))
+        proposals = propose_poses(fitted.params.localization, part, num_turns=_NUM_TURNS, fit_config=fitted.config)
+        parts.append(search_map(part, proposals, fields))
     poses, nats = (np.concatenate([np.asarray(x, np.float64) for x in each]) for each in zip(*parts, strict=True))
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])

@@ -7,8 +7,9 @@ second is the weights and the input of a network with the output x. Both are pro
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -16,9 +17,61 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from dpmjax.checks import require_fields, require_one_of, require_positive_fields
 from dpmjax.deepmapping.problem import Problem
-from dpmjax.nets.localization import ScalarNet, ScalarNetConfig
 from dpmjax.types import AnyArray
+
+Initialization = Literal["xavier-relu", "xavier", "he", "lecun", "pytorch"]
+
+# Scale, fan and distribution of `variance_scaling`.
+_KERNELS: dict[str, tuple[float, Any, Any]] = {
+    "xavier-relu": (2.0, "fan_avg", "uniform"),
+    "xavier": (1.0, "fan_avg", "uniform"),
+    "he": (2.0, "fan_in", "normal"),
+    "lecun": (1.0, "fan_in", "truncated_normal"),
+    "pytorch": (1.0 / 3.0, "fan_in", "uniform"),
+}
+
+
+@dataclass(frozen=True)
+class ScalarNetConfig:
+    """Shape of the network. The features are the paper's; its initialisation is unpublished.
+
+    Attributes:
+        features: channels of the hidden layers, each followed by an ELU.
+        initialization: "xavier-relu": Xavier-uniform with the gain of ReLU, as in the published L-Net; "xavier":
+            without the gain; "he"; "lecun" (Flax's default); "pytorch": PyTorch's default. Biases are zero, or for
+            "pytorch" uniform like the weights.
+    """
+
+    features: tuple[int, ...] = (10, 20, 30, 40)
+    initialization: Initialization = "xavier-relu"
+
+    def __post_init__(self) -> None:
+        require_one_of("initialization", self.initialization, get_args(Initialization))
+
+
+class ScalarNet(nn.Module):
+    """A multi-layer perceptron from one number to one number."""
+
+    config: ScalarNetConfig
+
+    @nn.compact
+    def __call__(self, z: Float[Array, ""]) -> Float[Array, ""]:
+        """The value x that the auxiliary variable z stands for."""
+        x = z[None]
+        for features in self.config.features:
+            x = nn.elu(self._linear(features, x))
+        return self._linear(1, x)[0]
+
+    def _linear(self, features: int, x: Float[Array, " c"]) -> Float[Array, " f"]:
+        kernel_init = nn.initializers.variance_scaling(*_KERNELS[self.config.initialization])
+        bound = x.shape[0] ** -0.5 if self.config.initialization == "pytorch" else 0.0
+
+        def bias_init(key: jax.Array, shape: Any, dtype: Any = float) -> Array:
+            return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+        return nn.Dense(features, kernel_init=kernel_init, bias_init=bias_init)(x)
 
 
 @dataclass(frozen=True)
@@ -39,10 +92,8 @@ class ToyConfig:
     num_steps: int = 1000
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0.0:
-            raise ValueError(f"learning_rate: expected a number above 0, got {self.learning_rate}")
-        if self.num_steps < 1:
-            raise ValueError(f"num_steps: expected at least 1, got {self.num_steps}")
+        require_positive_fields(self, "learning_rate")
+        require_fields(self, "num_steps", low=1)
 
 
 @flax.struct.dataclass
@@ -111,7 +162,6 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
 
 
 def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
-    del data
     net_key, z_key = jax.random.split(key)
     z = jax.random.normal(z_key)
     params = ToyParams(jnp.zeros(()), ScalarNet(config.net).init(net_key, z), z)
@@ -119,23 +169,19 @@ def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
 
 
 def _optimizer(config: ToyConfig, phase: ToyConfig) -> optax.GradientTransformation:
-    del phase
     return optax.sgd(config.learning_rate)
 
 
 def _loss(
     config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None, step: Array, key: jax.Array
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    del step, key
     x = _poses(config, phase, params, data)
     return toy_loss(x), x
 
 
 def _poses(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> Float[Array, ""]:
-    del phase, data
     return params.x if config.form == "direct" else network_value(config, params)
 
 
 def _next_phase(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> ToyParams:
-    del config, phase, data
     return params

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 from scipy.optimize import minimize
 from scipy.special import expit
 
@@ -20,30 +20,53 @@ from dpmjax.types import Registration, Verification
 CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
 WEAK_FEATURES = ("score_capped", "facing_gap_root")
-OVERLAP_FEATURES = (
-    "scan_similarity",
-    "similarity_median",
-    "similarity_high",
-    "score_median",
-    "score_high",
-    "mutual_share",
-    "support",
-    "near_support",
-    "support_second",
-    "offset_disagreement_m",
-    "distance_m",
-    "met_share",
-    "met_similarity",
-    "spread_m",
-    "log_radius",
-    "log_radius_ratio",
-)
-"""`deeppointmap.overlap_prediction` computes them."""
-
 MAX_RMSE_M = 5.0
 MAX_SCORE = 3.0
 """Higher log odds tell nothing more where walls hold one direction only: wrong motions have them, too."""
 RIDGE = 1e-3
+
+
+class OverlapEvidence(NamedTuple):
+    """Features from which overlap is predicted; similarities are cosines, shares are in [0, 1].
+
+    Attributes:
+        scan_similarity: of the mean encoder features of both clouds.
+        similarity_median: median, over descriptors, of the similarity to the best descriptor of the other cloud.
+        similarity_high: a high quantile of the same.
+        score_median: median of the dual softmax with the best descriptor of the other cloud.
+        score_high: a high quantile of the same.
+        mutual_share: share of the descriptors whose best ones choose them in turn.
+        support: consensus support of the best motion, as a share of the pairs.
+        near_support: the same where the motion is shorter than 20 m, falling to 0 beyond.
+        support_second: support of the best other motion.
+        offset_disagreement_m: mean difference, over inliers, of the two offsets that are predicted from both sides.
+        distance_m: length of the motion.
+        met_share: share of the descriptors that meet a descriptor of the other cloud under the motion.
+        met_similarity: mean similarity of those that meet.
+        spread_m: spread of the inliers in the horizontal plane.
+        log_radius: logarithm of the smaller of the mean distances of the descriptors from both origins.
+        log_radius_ratio: logarithm of their ratio.
+    """
+
+    scan_similarity: Float[Array, ""]
+    similarity_median: Float[Array, ""]
+    similarity_high: Float[Array, ""]
+    score_median: Float[Array, ""]
+    score_high: Float[Array, ""]
+    mutual_share: Float[Array, ""]
+    support: Float[Array, ""]
+    near_support: Float[Array, ""]
+    support_second: Float[Array, ""]
+    offset_disagreement_m: Float[Array, ""]
+    distance_m: Float[Array, ""]
+    met_share: Float[Array, ""]
+    met_similarity: Float[Array, ""]
+    spread_m: Float[Array, ""]
+    log_radius: Float[Array, ""]
+    log_radius_ratio: Float[Array, ""]
+
+
+OVERLAP_FEATURES = OverlapEvidence._fields
 
 
 @dataclass(frozen=True)

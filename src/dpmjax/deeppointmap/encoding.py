@@ -1,9 +1,13 @@
-"""Encoding: a raw scan to its descriptors."""
+"""Encoding: raw scans to their descriptors; many in chunks of one size, so that one program is compiled."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -13,6 +17,9 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.scans.preprocess import first_of_each_voxel, preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
+
+CHUNK = 4
+"""Number of scans, or of pairs, in one call of a compiled program."""
 
 EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 """Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4."""
@@ -47,6 +54,35 @@ def encode(
     return encode_pyramid(model, pyramid, num_elements=num_elements)
 
 
+def encode_scans(
+    model: Model,
+    scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]],
+    *,
+    scale: float = 1.0,
+    num_elements: int | None = None,
+) -> DescriptorCloud:
+    """Encodes many raw scans; they may have different numbers of points.
+
+    A `ValueError` says if there is no scan, or if points are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        scans: points in metres, each in the frame of its lidar.
+        scale: see `encode`.
+        num_elements: see `encode`.
+
+    Returns:
+        Stacked clouds, as `merge_clouds` takes them: positions (s, n, 3), features (s, m, c), mask (s, n).
+    """
+    require_some("scans", scans)
+    parts = []
+    for start in range(0, len(scans), CHUNK):
+        # JAX still encodes the chunk before.
+        pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
+        parts.append(_encode_chunk(model, stack_chunk(pyramids), num_elements=num_elements))
+    return join_chunks(parts, len(scans))
+
+
 def scene_scale(scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], config: ModelConfig) -> float:
     """Chooses the factor by which scans are enlarged so that rooms fill the range of the encoder as streets do.
 
@@ -57,7 +93,7 @@ def scene_scale(scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], config: M
     Returns:
         1 outdoors; 2 or 4 where the thinned points of all scans are near.
     """
-    extent_m = max((_extent_m(_array_of(points), config) for points in scans), default=0.0)
+    extent_m = max((_extent_m(valid_points(points), config) for points in scans), default=0.0)
     if extent_m == 0:
         return 1.0
     return float(np.clip(2.0 ** np.round(np.log2(FULL_EXTENT_M / extent_m)), 1, MAX_SCALE))
@@ -72,7 +108,8 @@ def _extent_m(points: Float[np.ndarray, "n 3"], config: ModelConfig) -> float:
     return float(np.percentile(np.linalg.norm(thinned, axis=1), EXTENT_PERCENT)) if len(thinned) else 0.0
 
 
-def _array_of(points: PointCloud | Float[AnyArray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def valid_points(points: PointCloud | Float[AnyArray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Returns the points of a scan that its mask allows, as an array of NumPy."""
     return np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
 
 
@@ -134,3 +171,25 @@ def pyramid_of_cloud(cloud: PointCloud, config: ModelConfig, *, num_threads: int
     """
     scaled = np.asarray(cloud.points) / np.float32(config.scale_m)
     return build_pyramid_on_host(scaled, np.asarray(cloud.mask), config.pyramid, num_threads=num_threads)
+
+
+@functools.partial(jax.jit, static_argnames="num_elements")
+def _encode_chunk(model: Model, pyramids: Any, *, num_elements: int | None) -> DescriptorCloud:
+    return jax.lax.map(functools.partial(encode_pyramid, model, num_elements=num_elements), pyramids)
+
+
+def stack_chunk(items: list[Any]) -> Any:
+    """Stacks up to `CHUNK` trees of arrays; the last is repeated to fill the chunk."""
+    filled = items + [items[-1]] * (CHUNK - len(items))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
+
+
+def join_chunks(parts: Sequence[Any], num: int) -> Any:
+    """Joins the results of chunks, on the host: there, another number of parts compiles nothing."""
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num]), *jax.device_get(parts))
+
+
+def require_some(name: str, items: Sequence[Any]) -> None:
+    """Raises a `ValueError` if there is no item."""
+    if len(items) == 0:
+        raise ValueError(f"{name}: expected at least one, got none")

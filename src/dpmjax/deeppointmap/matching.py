@@ -40,6 +40,9 @@ MIN_NUM_FIRST = 64
 MIN_INLIER_SCORE = 0.5
 """Pairs with higher scores are the first inliers."""
 
+MIN_NUM_INLIERS = 30
+"""A choice of fewer inliers is rejected (published configuration)."""
+
 MAX_NUM_PAIRS = 512
 """Largest number of pairs per direction. More pairs do not make a motion more exact, and the cost of the consensus is
 cubic."""
@@ -63,7 +66,6 @@ class MatchConfig:
         temperature: temperature of both softmaxes.
         pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
         num_rounds: number of times that the inliers are chosen again.
-        min_num_inliers: a choice of fewer inliers is rejected.
         consensus: if given, the first inliers are the pairs that support one common motion. This tolerates many wrong
             pairs, as from networks with little training or in repetitive places.
     """
@@ -71,16 +73,15 @@ class MatchConfig:
     temperature: float = 0.1
     pair_ratio: float = 0.5
     num_rounds: int = 3
-    min_num_inliers: int = 30
     consensus: ConsensusConfig | None = None
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "temperature", "pair_ratio")
-        require_fields(self, "num_rounds", "min_num_inliers", low=1)
+        require_fields(self, "num_rounds", low=1)
         require_fields(self, "pair_ratio", low=0, high=4)
 
 
-def match_descriptors(
+def match_hypotheses(
     source: DescriptorCloud,
     target: DescriptorCloud,
     similarity: Float[AnyArray, "m n"],
@@ -88,7 +89,7 @@ def match_descriptors(
     *,
     config: MatchConfig,
 ) -> Registration:
-    """Estimates the motion between two descriptor clouds (DeepPointMap section 3.2, eq. 1 to 3).
+    """Estimates the best distinct motions between two descriptor clouds (DeepPointMap section 3.2, eq. 1 to 3).
 
     The pairs with the highest products of both softmaxes of the similarity count twice: as T (p + offset) = q and as
     T p = q + offset. A weighted SVD over both sets solves eq. 3 with the scores as weights; then the errors decide
@@ -102,36 +103,11 @@ def match_descriptors(
         target: the same in the target frame.
         similarity: cosine of each pair of descriptors, in [-1, 1].
         predict_offsets: the offset head on pairs of rows; it is called once, with static shapes.
-        config: thresholds.
-
-    Returns:
-        The motion, its score and the pairs; see `Registration`.
-    """
-    if config.consensus is not None:
-        config = replace(config, consensus=replace(config.consensus, num_motions=1))
-    hypotheses = match_hypotheses(source, target, similarity, predict_offsets, config=config)
-    return jax.tree.map(lambda leaf: leaf[0], hypotheses)
-
-
-def match_hypotheses(
-    source: DescriptorCloud,
-    target: DescriptorCloud,
-    similarity: Float[AnyArray, "m n"],
-    predict_offsets: PredictOffsets,
-    *,
-    config: MatchConfig,
-) -> Registration:
-    """Estimates the best distinct motions between two descriptor clouds, one for each motion of the consensus.
-
-    Args:
-        source: see `match_descriptors`.
-        target: the same in the target frame.
-        similarity: cosine of each pair of descriptors.
-        predict_offsets: the offset head on pairs of rows.
         config: thresholds; without `consensus` there is one motion.
 
     Returns:
-        All fields with a leading axis h, best support first. Where there are fewer motions, `support` is 0.
+        The motions, their scores and pairs, with a leading axis h, best support first. Where there are fewer motions,
+        `support` is 0.
     """
     best = best_pairs(jnp.asarray(similarity), source.mask, target.mask, config=config)
     points = source.positions[best.source_indices], target.positions[best.target_indices]
@@ -292,7 +268,7 @@ def _choose_inliers(pairs: _PointPairs, first: Bool[Array, " p"], config: MatchC
         spread = jnp.std(errors, where=is_inlier)
         limit = (jnp.mean(errors, where=is_inlier) + INLIER_SIGMAS * spread) * ERROR_SLACK
         chosen = pairs.is_used & (errors <= limit)  # none without an inlier, where the limit is NaN
-        return jnp.where(jnp.sum(chosen) >= config.min_num_inliers, chosen, is_inlier)
+        return jnp.where(jnp.sum(chosen) >= MIN_NUM_INLIERS, chosen, is_inlier)
 
     return lax.fori_loop(0, config.num_rounds, choose, first)
 
@@ -338,14 +314,9 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
         parts = values[:, :num_described], values[:, num_described:]
         return jnp.concatenate([part.reshape(-1, *values.shape[2:]) for part in parts])
 
-    return DescriptorCloud(
-        positions=joined(positions_map),
-        features=joined(clouds.features),
-        mask=joined(clouds.mask),
-        directions=joined(directions),
-        normals=None if normals_map is None else joined(normals_map),
-        planarity=None if clouds.planarity is None else joined(clouds.planarity),
-    )
+    placed = replace(clouds, positions=positions_map, directions=directions, normals=normals_map)
+    merged: DescriptorCloud = jax.tree.map(joined, placed)
+    return merged
 
 
 def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -22,10 +21,9 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
-from dpmjax.geometry.pyramid_storage import StoredPyramid, moved_pyramid
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
-from dpmjax.types import AnyArray, DescriptorCloud, PointPyramid, SurfaceElements
+from dpmjax.types import DescriptorCloud, PointPyramid
 
 
 @flax.struct.dataclass
@@ -133,54 +131,12 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
     if directions is None:
         directions = ray_directions(level.positions)
     num_elements = model.config.num_descriptors if num_elements is None else num_elements
-    elements = elements_of_pyramid(pyramid, model.config, num_elements=num_elements)
-    return DescriptorCloud(
-        positions=elements.positions,
-        features=features,
-        mask=elements.mask,
-        directions=directions,
-        normals=elements.normals,
-        planarity=elements.planarity,
-    )
-
-
-@functools.partial(jax.jit, static_argnames=("config", "num_elements"))
-def elements_of_pyramid(pyramid: PointPyramid, config: ModelConfig, *, num_elements: int) -> SurfaceElements:
-    """Computes the surface elements of a scan in metres, without the networks: those of `encode_pyramid`.
-
-    Args:
-        pyramid: one scan in normalised coordinates, from `config.pyramid`; masked points may hold anything.
-        config: scale and pyramid.
-        num_elements: at least the number of descriptors, at most the number of points of the first stage.
-
-    Returns:
-        Elements in the frame of the lidar, in the order of farthest points.
-
-    Raises:
-        ValueError: if the number is out of range.
-    """
-    if num_elements < config.num_descriptors:
-        raise ValueError(
-            f"num_elements: expected at least the {config.num_descriptors} descriptors, got {num_elements}"
-        )
-    elements = pyramid_elements(pyramid, num_elements)
-    return replace(elements, positions=elements.positions * config.scale_m)
-
-
-def encode_stored(model: Model, stored: StoredPyramid, T_new_lidar: Float[AnyArray, "4 4"]) -> DescriptorCloud:
-    """Encodes one scan from its stored pyramid, after a rigid motion.
-
-    Args:
-        model: a model whose `config.pyramid` built the pyramid.
-        stored: the pyramid of the scan.
-        T_new_lidar: the motion, metres.
-
-    Returns:
-        As `encode_pyramid`, in the frame after the motion.
-    """
-    # A rigid motion in metres is one in normalised coordinates with a shorter translation.
-    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
-    return encode_pyramid(model, moved_pyramid(stored, T_new_lidar * unit))
+    if num_elements < model.config.num_descriptors:
+        expected = f"expected at least the {model.config.num_descriptors} descriptors"
+        raise ValueError(f"num_elements: {expected}, got {num_elements}")
+    elements: Any = pyramid_elements(pyramid, num_elements)
+    positions = elements.positions * model.config.scale_m
+    return DescriptorCloud(positions, features, elements.mask, directions, elements.normals, elements.planarity)
 
 
 @jax.jit

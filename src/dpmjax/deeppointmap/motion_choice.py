@@ -18,7 +18,6 @@ from dpmjax.deeppointmap.verification import (
     MeasuredScan,
     VerificationConfig,
     compare_scans,
-    verify_motion,
     verify_motions,
 )
 from dpmjax.geometry import rigid
@@ -128,7 +127,9 @@ def choose_motion(
     if is_weak := weak_share(*axes) < config.max_weak_share:
         starts = sliding_motions(*axes, SLIDING_STEP_M)
         num_slid = len(starts)
-        finalists += _aligned(scans, _best_along(scans, axes, starts, config), FINE, config)
+        slid = _moved(scans, starts, COARSE)
+        order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
+        finalists += _aligned(scans, [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE, config)
     motions = [*finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
@@ -161,18 +162,6 @@ def _moved(
     return np.stack([one.T_target_source for one in found])
 
 
-def _best_along(
-    scans: tuple[MeasuredScan, MeasuredScan],
-    axes: tuple[WallAxis, WallAxis],
-    starts: Float[np.ndarray, "s 4 4"],
-    config: VerificationConfig,
-) -> list[_Candidate]:
-    """Returns the motions that the elements that face the axis support most, coarsely aligned."""
-    slid = _moved(scans, starts, COARSE)
-    order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
-    return [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]]
-
-
 def _facing_elements(
     scans: tuple[MeasuredScan, MeasuredScan],
     axes: tuple[WallAxis, WallAxis],
@@ -180,19 +169,13 @@ def _facing_elements(
     config: VerificationConfig,
 ) -> Float[np.ndarray, " s"]:
     """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
-    settings = replace(config, num_samples=NUM_FACING)
-    first, second = (
-        scan._replace(surface=facing_surface(scan.surface, axis.axis)) for scan, axis in zip(scans, axes, strict=True)
-    )
-    sides = (
-        compare_scans(first, scans[1], T_target_source, settings),
-        compare_scans(second, scans[0], rigid.inverse(T_target_source), settings),
-    )
-    counts = [
-        (side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible)
-        @ facing_weights(scan.surface, axis.axis, MAX_FACING)[:NUM_FACING]
-        for side, scan, axis in zip(sides, (first, second), axes, strict=True)
-    ]
+    settings, counts = replace(config, num_samples=NUM_FACING), []
+    motions = T_target_source, rigid.inverse(T_target_source)
+    for scan, other, axis, T_other_scan in zip(scans, scans[::-1], axes, motions, strict=True):
+        surface = facing_surface(scan.surface, axis.axis)
+        side = compare_scans(scan._replace(surface=surface), other, T_other_scan, settings)
+        values = side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible
+        counts.append(values @ facing_weights(surface, axis.axis, MAX_FACING)[:NUM_FACING])
     return np.mean(counts, axis=0)
 
 
@@ -205,22 +188,15 @@ def _candidates(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
 ) -> Iterator[list[_Candidate]]:
     """Yields hypotheses, some at a time, from the second time on in turn with motions from the views of the scans."""
-    hypotheses = _batched([_Candidate(row, T) for row, T in enumerate(T_target_source)])
-    yield hypotheses[0]
-    searched = _batched([_Candidate(None, T) for T in _searched(source, target, config)])
-    for number in range(max(len(searched), len(hypotheses) - 1)):
-        yield from (*searched[number : number + 1], *hypotheses[number + 1 : number + 2])
-
-
-def _searched(source: MeasuredScan, target: MeasuredScan, config: VerificationConfig) -> Float[np.ndarray, "s 4 4"]:
-    if config.views.num_motions == 0:
-        return np.zeros((0, 4, 4))
-    return correlate_views(source.surface, target.surface, config.views)
-
-
-def _batched(candidates: list[_Candidate]) -> list[list[_Candidate]]:
-    starts = range(0, len(candidates), HYPOTHESES_AT_ONCE)
-    return [candidates[start : start + HYPOTHESES_AT_ONCE] for start in starts]
+    hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
+    yield hypotheses[:HYPOTHESES_AT_ONCE]
+    searched: list[_Candidate] = []
+    if config.views.num_motions > 0:
+        searched = [_Candidate(None, T) for T in correlate_views(source.surface, target.surface, config.views)]
+    further = hypotheses[HYPOTHESES_AT_ONCE:]
+    for start in range(0, max(len(searched), len(further)), HYPOTHESES_AT_ONCE):
+        some = slice(start, start + HYPOTHESES_AT_ONCE)
+        yield from filter(None, (searched[some], further[some]))
 
 
 def refine_motion(
@@ -239,7 +215,7 @@ def refine_motion(
     """
     start = motion.T_target_source
     T = align_surfaces(source.surface, target.surface, start, REFINEMENT).T_target_source
-    found = verify_motion(source, target, T, config)
+    found = verify_motions(source, target, T[None], config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
     return VerifiedMotion(motion.row, T, found._replace(**kept))
 

@@ -8,22 +8,20 @@ turns them into a probability. A model without one, as a published one, answers 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from dpmjax.deeppointmap.confidence import OverlapEvidence
+from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
-from dpmjax.deeppointmap.model import (
-    Model,
-    correlate,
-    descriptor_similarity,
-    overlap_logit,
-    predict_offsets,
-    unit_rows,
-)
+from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
+from dpmjax.deeppointmap.prepared_scans import PreparedScan, RawScan, ScanOrCloud, descriptors_of, require_pairs
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
@@ -48,44 +46,62 @@ HIGH = 0.9
 MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
 
 
-class OverlapEvidence(NamedTuple):
-    """Features from which overlap is predicted; similarities are cosines, shares are in [0, 1].
+def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
+    """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
 
-    Attributes:
-        scan_similarity: of the mean encoder features of both clouds.
-        similarity_median: median, over descriptors, of the similarity to the best descriptor of the other cloud.
-        similarity_high: a high quantile of the same.
-        score_median: median of the dual softmax with the best descriptor of the other cloud.
-        score_high: a high quantile of the same.
-        mutual_share: share of the descriptors whose best ones choose them in turn.
-        support: consensus support of the best motion, as a share of the pairs.
-        near_support: the same where the motion is shorter than 20 m, falling to 0 beyond.
-        support_second: support of the best other motion.
-        offset_disagreement_m: mean difference, over inliers, of the two offsets that are predicted from both sides.
-        distance_m: length of the motion.
-        met_share: share of the descriptors that meet a descriptor of the other cloud under the motion.
-        met_similarity: mean similarity of those that meet.
-        spread_m: spread of the inliers in the horizontal plane.
-        log_radius: logarithm of the smaller of the mean distances of the descriptors from both origins.
-        log_radius_ratio: logarithm of their ratio.
+    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) rests it on the match of the
+    descriptors. It is fitted on simulated towns and buildings. Half of the pairs overlapped, a quarter was 20 to 40 m
+    apart, and a quarter was farther apart or of different places. Where overlap is rarer, the probability is too high.
+    A model without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights
+    only.
+
+    A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
+
+    Args:
+        model: encoder and decoder.
+        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
+        target: the same; the order matters a little.
+
+    Returns:
+        The probability; 0 where a scan is empty or a feature is not finite.
     """
+    clouds = [
+        descriptors_of(scan if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan))
+        for scan in (source, target)
+    ]
+    return overlap_probability(model, *(cloud.described for cloud in clouds))
 
-    scan_similarity: Float[Array, ""]
-    similarity_median: Float[Array, ""]
-    similarity_high: Float[Array, ""]
-    score_median: Float[Array, ""]
-    score_high: Float[Array, ""]
-    mutual_share: Float[Array, ""]
-    support: Float[Array, ""]
-    near_support: Float[Array, ""]
-    support_second: Float[Array, ""]
-    offset_disagreement_m: Float[Array, ""]
-    distance_m: Float[Array, ""]
-    met_share: Float[Array, ""]
-    met_similarity: Float[Array, ""]
-    spread_m: Float[Array, ""]
-    log_radius: Float[Array, ""]
-    log_radius_ratio: Float[Array, ""]
+
+def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
+    """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
+
+    A `ValueError` says if the lengths differ or are 0.
+
+    Args:
+        model: encoder and decoder.
+        sources: raw scans, prepared scans or descriptor clouds; clouds must have one capacity.
+        targets: the same, one for each source.
+
+    Returns:
+        The probabilities.
+    """
+    return _of_pairs(overlap_probability, model, sources, targets)
+
+
+def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
+    """Computes the features of the overlap probability of many pairs.
+
+    A `ValueError` says if the lengths differ or are 0.
+
+    Args:
+        model: encoder and decoder.
+        sources: as in `overlap_pairs`.
+        targets: the same, one for each source.
+
+    Returns:
+        A row for each pair, in the order of `confidence.OVERLAP_FEATURES`.
+    """
+    return jnp.stack(_of_pairs(overlap_evidence, model, sources, targets), axis=1)
 
 
 @jax.jit
@@ -146,6 +162,29 @@ def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) ->
         logit = jnp.sum(evidence * np.asarray(fitted.weights, np.float32)) + fitted.bias
     is_known = jnp.any(a.mask) & jnp.any(b.mask) & jnp.isfinite(logit)
     return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
+
+
+def _of_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
+    """Applies the function of a pair to all of them; each scan is encoded once."""
+    require_pairs(sources, targets)
+    clouds: dict[int, DescriptorCloud] = {}
+    raw: dict[int, RawScan] = {}
+    for scan in (*sources, *targets):
+        if isinstance(scan, DescriptorCloud | PreparedScan):
+            clouds[id(scan)] = descriptors_of(scan).described
+        else:
+            raw[id(scan)] = scan
+    if raw:
+        encoded = jax.device_get(encode_scans(model, list(raw.values())).described)
+        clouds |= {key: jax.tree.map(lambda leaf, row=row: leaf[row], encoded) for row, key in enumerate(raw)}
+    pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]
+    chunks = (stack_chunk(pairs[start : start + CHUNK]) for start in range(0, len(pairs), CHUNK))
+    return join_chunks([_of_chunk(function, model, some) for some in chunks], len(pairs))
+
+
+@functools.partial(jax.jit, static_argnames="function")
+def _of_chunk(function: Any, model: Model, pairs: Any) -> Any:
+    return jax.vmap(lambda pair: function(model, *pair))(pairs)
 
 
 def _best_motion(

@@ -1,12 +1,12 @@
-"""Registration of scans and maps: hypotheses from descriptors, verified by the scans; and whether two overlap."""
+"""Registration of scans and maps: hypotheses from descriptors, verified by the scans."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,90 +14,31 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan, scene_scale
+from dpmjax.deeppointmap.encoding import encode, scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
-from dpmjax.deeppointmap.model import (
-    Model,
-    correlate,
-    descriptor_similarity,
-    encode_pyramid,
-    predict_offsets,
-)
+from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, weak_direction_of
-from dpmjax.deeppointmap.overlap_prediction import overlap_probability
-from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
+from dpmjax.deeppointmap.prepared_scans import (
+    NUM_THREADS,
+    PreparedScan,
+    RawScan,
+    Scale,
+    ScanOrCloud,
+    descriptors_of,
+    prepare_scans,
+    require_pairs,
+)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
 from dpmjax.scans.plane_information import WeakDirection
-from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration, Verification
-
-NUM_THREADS = 2
+from dpmjax.types import DescriptorCloud, Registration, Verification
 
 NUM_ELEMENTS = 1024
 """Number of surface elements of a scan that is refined against a cloud."""
 
-
-class PreparedScan(NamedTuple):
-    """A scan that is ready for any number of registrations.
-
-    Attributes:
-        descriptors: of the scan; positions in metres times `scale`.
-        measured: surface and free space of the scan, metres.
-        scale: factor by which the points were enlarged for the encoder.
-    """
-
-    descriptors: DescriptorCloud
-    measured: MeasuredScan
-    scale: float = 1.0
-
-
-RawScan = PointCloud | Float[AnyArray, "_n 3"]
-"""Points in metres, in the frame of the lidar."""
-
-ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
-"""A raw scan; or the same prepared; or descriptors of a scan or of a map."""
-
-Scale = float | Literal["auto"]
-"""Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`."""
-
-
-def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:
-    """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
-
-    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
-
-    Args:
-        model: encoder and configuration.
-        points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
-        scale: see `encode`.
-
-    Returns:
-        Descriptors, surface and free space.
-    """
-    return prepare_scans(model, [points], scale=scale)[0]
-
-
-def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
-    """Prepares scans in their order; threads measure their surfaces while JAX encodes.
-
-    A `ValueError` says if the points of a scan are no real numbers (n, 3).
-
-    Args:
-        model: encoder and configuration.
-        scans: points in metres, each in the frame of its lidar.
-        scale: see `encode`.
-
-    Returns:
-        The prepared scans.
-    """
-    # Threads run NumPy only: compiled programs wait for threads of JAX, and may wait for each other.
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
-        clouds, measured = [], []
-        for points in scans:
-            pyramid = pyramid_of_scan(points, model.config, scale=scale)
-            measured.append(pool.submit(_measured, points, model.config.verification))
-            clouds.append(encode_pyramid(model, pyramid))
-        return [PreparedScan(cloud, future.result(), scale) for cloud, future in zip(clouds, measured, strict=True)]
+OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
+"""Fields of `Registration` that are 0 for a motion that no pairs of descriptors support."""
 
 
 def register(
@@ -169,27 +110,55 @@ def register_each(
     """
     refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
-    prepared = _prepared(model, pairs, scale, num_elements=_num_elements(model) if refine else None)
+    num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
+    prepared = _prepared(model, pairs, scale, num_elements=num_elements)
     matching, verification = config or model.config.matching, model.config.verification
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         started = []
         for pair in pairs:
             source, target = (prepared[id(scan)] for scan in pair)
-            clouds = _descriptors(source), _descriptors(target)
+            clouds = descriptors_of(source), descriptors_of(target)
             in_cloud_units = match_clouds(model, *clouds, config=matching)
             pair_scale = _shared_scale(source, target, scale)
             hypotheses = _in_metres(in_cloud_units, pair_scale)
-            motions: Future[_Motions] | None = None
             if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
                 motions = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
             elif refine and all(cloud.normals is not None for cloud in clouds):
                 motions = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
+            else:
+                motions = pool.submit(_Motions, 0, np.asarray(hypotheses.T_target_source[0]))
             started.append((hypotheses, motions))
-        return [
-            _finished(model, hypotheses, None if motions is None else motions.result())
-            for hypotheses, motions in started
-        ]
+        return [_finished(model, hypotheses, motions.result()) for hypotheses, motions in started]
+
+
+def register_pairs(
+    model: Model,
+    sources: Sequence[ScanOrCloud],
+    targets: Sequence[ScanOrCloud],
+    *,
+    config: MatchConfig | None = None,
+    refine: bool | None = None,
+    scale: Scale = 1.0,
+) -> Registration:
+    """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
+
+    A `ValueError` says if the lengths differ or are 0, and what `register` would say of a pair.
+
+    Args:
+        model: encoder and decoder.
+        sources: raw scans, prepared scans or descriptor clouds; clouds must have one capacity.
+        targets: the same, one for each source.
+        config: see `register`.
+        refine: see `register`.
+        scale: see `register`; all raw scans share one.
+
+    Returns:
+        All fields with a leading axis, in the order of the pairs.
+    """
+    require_pairs(sources, targets)
+    found = register_each(model, list(zip(sources, targets, strict=True)), config=config, refine=refine, scale=scale)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
 
 
 def match_clouds(
@@ -207,28 +176,6 @@ def match_clouds(
         All hypotheses, with a leading axis, as arrays of NumPy on the host.
     """
     return jax.device_get(trace_match(model, source.described, target.described, config=config))
-
-
-def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
-    """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
-
-    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) rests it on the match of the
-    descriptors. It is fitted on simulated towns and buildings. Half of the pairs overlapped, a quarter was 20 to 40 m
-    apart, and a quarter was farther apart or of different places. Where overlap is rarer, the probability is too high.
-    A model without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights
-    only.
-
-    A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
-
-    Args:
-        model: encoder and decoder.
-        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
-        target: the same; the order matters a little.
-
-    Returns:
-        The probability; 0 where a scan is empty or a feature is not finite.
-    """
-    return overlap_probability(model, _as_cloud(model, source).described, _as_cloud(model, target).described)
 
 
 def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
@@ -251,15 +198,6 @@ class _Motions(NamedTuple):
     evidence: Verification | None = None
     verification: Verification | None = None
     weak: WeakDirection | None = None
-
-
-def _num_elements(model: Model) -> int:
-    return min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
-
-
-def _measured(points: RawScan, config: VerificationConfig) -> MeasuredScan:
-    array = np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
-    return measure_scan(array, config)
 
 
 def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
@@ -327,40 +265,18 @@ def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Regis
     return _Motions(0, T_target_source)
 
 
-def _finished(model: Model, hypotheses: Registration, motions: _Motions | None) -> Registration:
-    row = 0 if motions is None else motions.row
-    evidence = gather_evidence(hypotheses, row, None if motions is None else motions.evidence)
-    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[0 if row is None else row]), hypotheses)
+def _finished(model: Model, hypotheses: Registration, motions: _Motions) -> Registration:
+    row, evidence = motions.row, gather_evidence(hypotheses, motions.row, motions.evidence)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row or 0]), hypotheses)
     if row is None:
-        match = _without_inliers(match)
-    if motions is not None:
-        T = jnp.asarray(motions.T_target_source, match.T_target_source.dtype)
-        match = replace(match, T_target_source=T, verification=motions.verification)
-    if motions is not None and motions.weak is not None:
-        direction, sigma_m = (jnp.asarray(value, match.T_target_source.dtype) for value in motions.weak)
+        none = {name: jnp.zeros_like(getattr(match, name)) for name in OF_THE_INLIERS}
+        match = replace(match, rmse=jnp.full_like(match.rmse, jnp.inf), **none)
+    T = jnp.asarray(motions.T_target_source, match.T_target_source.dtype)
+    match = replace(match, T_target_source=T, verification=motions.verification)
+    if motions.weak is not None:
+        direction, sigma_m = (jnp.asarray(value, T.dtype) for value in motions.weak)
         match = replace(match, weak_direction=direction, weak_sigma_m=sigma_m)
     return with_confidence(match, evidence, model.config.calibration)
-
-
-def _without_inliers(match: Registration) -> Registration:
-    zero = jnp.zeros_like(match.support)
-    return replace(
-        match,
-        confidence=zero,
-        mean_score=zero,
-        rmse=zero + jnp.inf,
-        support=zero,
-        num_inliers=jnp.zeros_like(match.num_inliers),
-        is_inlier=jnp.zeros_like(match.is_inlier),
-    )
-
-
-def _descriptors(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
-    return scan.descriptors if isinstance(scan, PreparedScan) else scan
-
-
-def _as_cloud(model: Model, scan: ScanOrCloud) -> DescriptorCloud:
-    return _descriptors(scan) if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -16,10 +16,7 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.free_space import RangeImage, range_image, view_points
-from dpmjax.scans.surface_alignment import (
-    AlignmentLevel,
-    nearest_planes,
-)
+from dpmjax.scans.surface_alignment import AlignmentLevel, nearest_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
 from dpmjax.types import Verification
@@ -119,23 +116,6 @@ def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -
     return MeasuredScan(surface, range_image(surface.points))
 
 
-def verify_motion(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
-) -> Verification:
-    """Compares two scans under a motion.
-
-    Args:
-        source: a scan.
-        target: the other.
-        T_target_source: the motion.
-        config: tolerances.
-
-    Returns:
-        Shares of points that are visible, that meet planes and that lie in free space, and the log odds of the motion.
-    """
-    return verify_motions(source, target, np.asarray(T_target_source)[None], config)[0]
-
-
 def verify_motions(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
 ) -> list[Verification]:
@@ -148,7 +128,8 @@ def verify_motions(
         config: tolerances.
 
     Returns:
-        One result of `verify_motion` for each motion.
+        For each motion, shares of points that are visible, that meet planes and that lie in free space, and the log
+        odds that the motion is right.
     """
     sides = _both_sides(source, target, T_target_source, config)
     is_thin = len(target.surface.points) < SPARSE_SHARE * len(source.surface.points)
@@ -234,15 +215,12 @@ def _both_sides(
 
 
 def _evidence(sides: Sequence[ComparedScan]) -> Float[np.ndarray, "s 6"]:
-    shares = []
-    for is_level in (False, True):
-        of_kind = [side.is_visible & (side.is_level == is_level) for side in sides]
-        shares += [
-            [_share(seen & side.meets) for seen, side in zip(of_kind, sides, strict=True)],
-            [_share(seen) for seen in of_kind],
-            [_share(seen & side.is_contradicted) for seen, side in zip(of_kind, sides, strict=True)],
-        ]
-    return np.mean(shares, axis=1).T
+    of_sides = []
+    for side in sides:
+        kinds = [side.is_visible & (side.is_level == is_level) for is_level in (False, True)]
+        counted = side.meets, side.is_visible, side.is_contradicted
+        of_sides.append([_share(seen & some) for seen in kinds for some in counted])
+    return np.mean(of_sides, axis=0).T
 
 
 def _share(points: Bool[np.ndarray, "s n"]) -> Float[np.ndarray, " s"]:

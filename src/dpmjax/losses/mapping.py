@@ -86,10 +86,8 @@ def occupancy_loss(
     """
     logits, labels, weights = as_float("logits", logits), as_float("labels", labels), as_float("weights", weights)
     for name, array in (("labels", labels), ("weights", weights)):
-        try:
-            is_right = jnp.broadcast_shapes(array.shape, logits.shape) == logits.shape
-        except ValueError:
-            is_right = False
+        sizes = zip(reversed(array.shape), reversed(logits.shape), strict=False)
+        is_right = array.ndim <= logits.ndim and all(size in (1, whole) for size, whole in sizes)
         if not is_right:
             raise ValueError(f"{name}: expected a shape that broadcasts to {logits.shape}, got {array.shape}")
     return _occupancy_loss(logits, labels, weights)

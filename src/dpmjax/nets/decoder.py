@@ -11,7 +11,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import require_count
+from dpmjax.checks import require_fields
 from dpmjax.nets.attention import AttentionLayer, embed_positions
 from dpmjax.nets.layers import ComputeDtype, TwoLayers, linear, require_compute_dtype
 from dpmjax.types import DescriptorCloud
@@ -40,8 +40,7 @@ class DecoderConfig:
     compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:
-        for name in ("input_channels", "num_layers", "num_heads"):
-            require_count(name, getattr(self, name))
+        require_fields(self, "input_channels", "num_layers", "num_heads", low=1)
         if self.model_channels < 6 or self.model_channels % self.num_heads:
             expected = f"expected at least 6 and a multiple of num_heads = {self.num_heads}"
             raise ValueError(f"model_channels: {expected}, got {self.model_channels}")

@@ -16,7 +16,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from dpmjax.checks import require_count, require_one_of
+from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry.bearing import ray_directions, to_ray_frame, wall_normals
 from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
 from dpmjax.nets.neighbourhood import maximum_of_normalised
@@ -48,9 +48,7 @@ class EncoderConfig:
     compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:
-        require_count("stem_channels", self.stem_channels)
-        require_count("expansion", self.expansion)
-        require_count("output_channels", self.output_channels)
+        require_fields(self, "stem_channels", "expansion", "output_channels", low=1)
         require_one_of("frame", self.frame, get_args(Frame))
         require_compute_dtype(self.compute_dtype)
 
@@ -60,31 +58,22 @@ class NeighbourhoodMaximum(nn.Module):
 
     Attributes:
         num_features: channels of the result.
-        radius: radius of the neighbourhood, normalised coordinates.
-        config: frame of the offsets, and type of the product over features; the product over offsets is float32.
+        compute_dtype: type of the product over features; the product over offsets is float32.
     """
 
     num_features: int
-    radius: float
-    config: EncoderConfig
+    compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
     def __call__(
-        self,
-        features: Float[Array, "n c"],
-        positions: Float[AnyArray, "n 3"],
-        queries: Float[AnyArray, "m 3"],
-        neighbours: Int[AnyArray, "m k"],
-        directions: Float[Array, "m 2"] | None = None,
+        self, features: Float[Array, "n c"], offsets: Float[Array, "m k 3"], neighbours: Int[AnyArray, "m k"]
     ) -> Float[Array, "m f"]:
         """Pools the neighbourhood of each query.
 
         Args:
             features: features of the level that holds the neighbours.
-            positions: positions of that level.
-            queries: positions of the queries.
+            offsets: from each query to its neighbours, as a share of the radius.
             neighbours: rows of the neighbours of each query.
-            directions: directions of the frames of the queries; None for that of the lidar.
 
         Returns:
             Features of the queries.
@@ -96,13 +85,10 @@ class NeighbourhoodMaximum(nn.Module):
         norm_bias = self.param("norm_bias", nn.initializers.zeros_init(), (num_features,))
         # The norm removes the mean over channels; removing it from the weights is cheaper.
         kernel, bias = kernel - kernel.mean(axis=1, keepdims=True), bias - bias.mean()
-        dtype = jnp.dtype(self.config.compute_dtype)
+        dtype = jnp.dtype(self.compute_dtype)
         from_features = jnp.matmul(
             features.astype(dtype), kernel[:-3].astype(dtype), preferred_element_type=jnp.float32
         )
-        offsets = jnp.asarray(positions[neighbours] - queries[:, None]) / self.radius
-        if directions is not None:
-            offsets = to_ray_frame(offsets, directions[:, None])
         # relu grows with its argument, so it may follow the maximum.
         maximum = maximum_of_normalised(from_features + bias, offsets, kernel[-3:], neighbours, scale)
         return nn.relu(maximum + norm_bias)
@@ -112,38 +98,30 @@ class InvertedResidual(nn.Module):
     """Neighbourhood maximum, then a narrow-wide-narrow network of two layers, added to the input.
 
     Attributes:
-        radius: radius of the neighbourhood, normalised coordinates.
-        config: expansion, frame of the offsets and type of the matrix products.
+        config: expansion and type of the matrix products.
     """
 
-    radius: float
     config: EncoderConfig
 
     @nn.compact
     def __call__(
-        self,
-        features: Float[Array, "m f"],
-        positions: Float[AnyArray, "m 3"],
-        neighbours: Int[AnyArray, "m k"],
-        directions: Float[Array, "m 2"] | None = None,
+        self, features: Float[Array, "m f"], offsets: Float[Array, "m k 3"], neighbours: Int[AnyArray, "m k"]
     ) -> Float[Array, "m f"]:
         """Refines the features of one level.
 
         Args:
             features: features of the level.
-            positions: positions of the level.
-            neighbours: rows of the neighbours in the same level.
-            directions: directions of the frames of the points; None for that of the lidar.
+            offsets: from each point to its neighbours in the same level, as a share of the radius.
+            neighbours: rows of these neighbours.
 
         Returns:
             New features of the level.
         """
-        num_features = features.shape[1]
-        pool = NeighbourhoodMaximum(num_features, self.radius, self.config, name="neighbourhood")
-        x = pool(features, positions, positions, neighbours, directions)
-        x = linear(num_features * self.config.expansion, self.config.compute_dtype, "expand")(x)
+        num_features, dtype = features.shape[1], self.config.compute_dtype
+        x = NeighbourhoodMaximum(num_features, dtype, name="neighbourhood")(features, offsets, neighbours)
+        x = linear(num_features * self.config.expansion, dtype, "expand")(x)
         x = nn.relu(layer_norm("expand_norm")(x))
-        x = linear(num_features, self.config.compute_dtype, "contract")(x)
+        x = linear(num_features, dtype, "contract")(x)
         return nn.relu(layer_norm("contract_norm")(x) + features)
 
 
@@ -172,12 +150,17 @@ class Stage(nn.Module):
         Returns:
             Features of this level.
         """
-        abstraction = NeighbourhoodMaximum(self.num_features, self.radii[0], self.config, name="set_abstraction")
         directions = frame_directions(self.config.frame, finer, level)
-        x = abstraction(features, finer.positions, level.positions, level.neighbours[0], directions)
-        for block, radius in enumerate(self.radii[1:]):
-            residual = InvertedResidual(radius, self.config, name=f"inverted_residual_{block}")
-            x = residual(x, level.positions, level.neighbours[block + 1], directions)
+
+        def offsets(positions: Float[AnyArray, "n 3"], block: int) -> Float[Array, "m k 3"]:
+            offsets = jnp.asarray(positions[level.neighbours[block]] - level.positions[:, None]) / self.radii[block]
+            return offsets if directions is None else to_ray_frame(offsets, directions[:, None])
+
+        abstraction = NeighbourhoodMaximum(self.num_features, self.config.compute_dtype, name="set_abstraction")
+        x = abstraction(features, offsets(finer.positions, 0), level.neighbours[0])
+        for block in range(1, len(self.radii)):
+            residual = InvertedResidual(self.config, name=f"inverted_residual_{block - 1}")
+            x = residual(x, offsets(level.positions, block), level.neighbours[block])
         return x
 
 

@@ -17,12 +17,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
+from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 from dpmjax.geometry.se3 import Motion, motion_matrices
-from dpmjax.registration_rgbd.adjustment import gap_equations, improve_motions, motion_scales
-from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample
-from dpmjax.registration_rgbd.projective_consistency import Agreement, both_ways, surface_gap
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, surface_gap
+from dpmjax.registration_rgbd.projective_consistency import (
+    Agreement,
+    both_ways,
+    gap_equations,
+    improve_motions,
+    motion_scales,
+)
 
 # Largest translation between neighbouring images along each axis, metres.
 MAX_TRANSLATION = 0.7
@@ -76,8 +82,7 @@ class DepthSearchConfig:
     turn_weight: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.num_trajectories, self.num_candidates, self.num_varied) < 1:
-            raise ValueError(f"all counts must be at least 1, got {self}")
+        require_fields(self, "num_trajectories", "num_candidates", "num_varied", low=1)
 
 
 def depth_search(motion: Motion) -> DepthSearchConfig:
@@ -178,7 +183,7 @@ def propose_motions(
         (k, 4, 4) T_last_next, the best one first.
     """
     scan, num_scans = len(T_world_camera), views.surfaces.shape[0]
-    num_checked = min(max(_NUM_REFERENCES, _NUM_CHECKED), num_scans - 1)
+    num_checked = min(_NUM_CHECKED, num_scans - 1)
     # A window of fixed length; with fewer earlier images the first is repeated with weight 0.
     before = scan - 1 - np.arange(num_checked)
     rows = np.maximum(before, 0)

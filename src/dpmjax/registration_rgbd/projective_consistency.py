@@ -2,10 +2,15 @@
 
 Correspondences come from projection instead of a nearest-neighbour search. Two images are compared by one projection in
 each direction. A point is compared with the interpolated surface between the pixels, not with the nearest pixel.
+
+`improve_motions` adjusts poses: Levenberg-Marquardt on the distances along z of points to the surfaces that they are
+projected to, with a robust weight. A step counts only if it improves the consistency.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import rigid
-from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample
+from dpmjax.geometry.se3 import Motion, motion_matrices
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, surface_gap
 
 # Cost of a contradiction in matches, and least cost, at coarse tolerances; tolerance up to which the full cost holds.
 # Along a bare wall a wrong pose matches nearly everywhere. At a coarse tolerance inexact poses cause contradictions.
@@ -25,6 +31,11 @@ _CONTRADICTED_POINT, _CLEAR, _NEAR = 20.0, 0.04, 0.25
 # Matches are normalised by the visible points, because normalisation by all points would favour overlap. This share of
 # all points is added to the visible ones, so that matches in a small overlap have a low score.
 _UNSEEN = 0.1
+# Damping as a share of the mean information: initial value, least value, divisor after an accepted step, and factor
+# after a rejected step.
+_DAMPING, _LEAST_DAMPING, _BETTER, _WORSE = 1e-3, 1e-5, 4.0, 8.0
+# Longest step, in tolerances: of the typical range, and radians.
+_LONGEST_STEP = 4.0
 
 
 class Agreement(NamedTuple):
@@ -79,49 +90,6 @@ def image_agreement(
 def _match_and_contradiction(gap: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Computes match and contradiction of points with a surface, 0 to 1 each; the gap is in tolerances."""
     return jnp.exp(-(gap**2)), jax.nn.sigmoid(3.0 * (gap - 2.0))
-
-
-def surface_gap(
-    T_other_camera: Float[Array, "4 4"],
-    sample: PixelSample,
-    surface_other: Float[Array, "4 r c"],
-    pinhole: Pinhole,
-) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """Computes the distances of points in front of the surface of another camera's image.
-
-    Args:
-        T_other_camera: motion of the points into the frame of a second camera.
-        sample: points of one image.
-        surface_other: `image_surface` of that camera.
-        pinhole: pinhole of that camera.
-
-    Returns:
-        Distance as a share of the surface's depth, negative behind the surface; and True for points that are projected
-        to a surface, else the distance is 0.
-    """
-    seen = rigid.transform_points(T_other_camera, sample.points)
-    depth = seen[:, 2]
-    safe = jnp.maximum(depth, 1e-3)
-    column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
-    row = pinhole.fy * seen[:, 1] / safe + pinhole.cy
-    inverse, is_smooth = _inverse_depth_at(surface_other, row, column)
-    is_visible = sample.mask & (depth > 1e-3) & is_smooth
-    return jnp.where(is_visible, 1.0 - depth * inverse, 0.0), is_visible
-
-
-def _inverse_depth_at(
-    surface: Float[Array, "4 r c"], row: Float[Array, " p"], column: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """Interpolates the inverse depth between four pixels; the mask is True where they lie on one surface."""
-    num_rows, num_columns = surface.shape[1:]
-    top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, num_rows - 1)
-    left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, num_columns - 1)
-    # One look-up in each of four flat arrays takes a seventh of the time of four look-ups in the image.
-    cell = top * num_columns + left
-    value, along_row, along_column, twist = (flat[cell] for flat in surface.reshape(4, -1))
-    is_inside = (row >= 0.0) & (row <= num_rows) & (column >= 0.0) & (column <= num_columns)
-    v, u = jnp.where(is_inside, row - top, 0.0), jnp.where(is_inside, column - left, 0.0)
-    return value + along_row * u + along_column * v + twist * u * v, is_inside & (value > 0.0)
 
 
 def both_ways(
@@ -245,3 +213,80 @@ def projective_consistency(
     offsets = jnp.arange(1, scans.mask.shape[0] // 2 + 1)
     T = jnp.asarray(T_world_camera, scans.points.dtype)
     return consistency_of_pairs(T, scans.pixels, scans, offsets, jnp.asarray(tolerance))
+
+
+class _Progress(NamedTuple):
+    """Current motions, the score of these, and the damping of the next step."""
+
+    motions: Float[Array, "n 4 4"]
+    score: Float[Array, ""]
+    damping: Float[Array, ""]
+
+
+def motion_scales(motion: Motion, unit: Float[Array, ""] | float, tolerance: Float[Array, ""]) -> Float[Array, " k"]:
+    """Returns the unit of each value of a motion in an adjustment: translations in tolerances, angles in radians.
+
+    Args:
+        motion: degrees of freedom of the camera.
+        unit: typical range of the images, unit of the points.
+        tolerance: share of the depth.
+
+    Returns:
+        Three values, or six of a full motion.
+    """
+    return tolerance * (jnp.array([unit] * 2 + [1.0]) if motion == "planar" else jnp.array([unit] * 3 + [1.0] * 3))
+
+
+def gap_equations(
+    gap: Float[Array, " p"], weight: Float[Array, " p"] | Bool[Array, " p"], slopes: Float[Array, "p *k"]
+) -> tuple[Float[Array, "*kk"], Float[Array, "*k"]]:
+    """Computes the Gauss-Newton normal equations of surface residuals with Welsch weights.
+
+    Args:
+        gap: residuals in tolerances; the Welsch weight is 0.6 at 1 and 0.14 at 2.
+        weight: further weight of each residual, 0 for invalid ones.
+        slopes: derivatives of the residuals with respect to each value.
+
+    Returns:
+        The normal equations, (*k, *k) and (*k).
+    """
+    robust = weight * jnp.exp(-0.5 * gap**2)
+    weighted = robust.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes
+    return jnp.tensordot(weighted, slopes, (0, 0)), jnp.tensordot(gap, weighted, (0, 0))
+
+
+def improve_motions(
+    equations: Callable[[Float[Array, "n 4 4"]], tuple[Float[Array, "nk nk"], Float[Array, " nk"]]],
+    score: Callable[[Float[Array, "n 4 4"]], Float[Array, ""]],
+    scales: Float[Array, " k"],
+    *,
+    count: int,
+    num_iterations: int,
+) -> Float[Array, "n 4 4"]:
+    """Optimises motions from zero by Levenberg-Marquardt; a step is accepted only if the score grows.
+
+    Args:
+        equations: normal equations of values in `scales`, applied after given motions.
+        score: score of motions; more is better.
+        scales: unit of each value of a motion.
+        count: number of motions.
+        num_iterations: number of steps.
+
+    Returns:
+        The motions.
+    """
+
+    def iterate(progress: _Progress, _: None) -> tuple[_Progress, None]:
+        matrix, gradient = equations(progress.motions)
+        size = len(gradient)
+        matrix += (progress.damping * jnp.trace(matrix) / size + _LEAST_DAMPING) * jnp.eye(size)
+        values = jnp.linalg.solve(matrix, -gradient).reshape(count, -1)
+        values *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.abs(values).max(), 1e-6))
+        motions = rigid.compose(progress.motions, motion_matrices(scales * values))
+        tried = _Progress(motions, score(motions), jnp.maximum(progress.damping / _BETTER, _LEAST_DAMPING))
+        rejected = progress._replace(damping=progress.damping * _WORSE)
+        return jax.tree.map(partial(jnp.where, tried.score > progress.score), tried, rejected), None
+
+    none = jnp.broadcast_to(jnp.eye(4), (count, 4, 4))
+    start = _Progress(none, score(none), jnp.asarray(_DAMPING))
+    return jax.lax.scan(iterate, start, length=num_iterations)[0].motions

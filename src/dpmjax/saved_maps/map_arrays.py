@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.compact_scans import CompactScan, round_features
+from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
 from dpmjax.saved_maps.map_coding import (
     NUM_ELEMENTS,
     ElementCodes,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.deskew import deskew
 from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan, best_of

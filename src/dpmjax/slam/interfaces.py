@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.keyframes import Pose, Submap

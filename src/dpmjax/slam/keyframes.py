@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deeppointmap.compact_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
 from dpmjax.slam.config import MapOrigin

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.checks import require_fields
-from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.slam.interfaces import Match, SlamMethods
 from dpmjax.slam.keyframes import (
     KeyframeMap,

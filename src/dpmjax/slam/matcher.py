@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.batches import overlap_pairs
-from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.motion_choice import REFINEMENT
-from dpmjax.deeppointmap.scan_registration import PreparedScan, distinct_motions, match_clouds, register_each
+from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
+from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_scan
+from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
 from dpmjax.deeppointmap.verification import PLANE_DISTANCE_M
 from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.plane_information import plane_information

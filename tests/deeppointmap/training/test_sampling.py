@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
-from dpmjax.deeppointmap.training.layouts import PAIR_PROBABILITY, stage_layouts
+from dpmjax.deeppointmap.training.curriculum import PAIR_PROBABILITY, stage_layouts
 from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
 

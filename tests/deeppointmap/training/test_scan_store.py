@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from dpmjax.deeppointmap import ScanStore, init_model, prepare_drive
-from dpmjax.deeppointmap.model import encode_stored
+from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError
 from dpmjax.sequences import LidarSequence
@@ -65,7 +65,7 @@ def test_poses_follow_the_motions_of_the_scans() -> None:
 def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
     store, model = ScanStore([prepare_drive(short(), toy.TRAINING)]), init_model(jax.random.key(0), toy.TRAINING.model)
     scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
-    clouds = jax.vmap(functools.partial(encode_stored, model))(scans.pyramids, scans.T_augmented_lidar)
+    clouds = jax.vmap(functools.partial(encode_sample, model))(scans)
     np.testing.assert_array_equal(clouds.mask, placed.mask)
     found = rigid.transform_points(placed.T_world_scan, np.asarray(clouds.positions))
     np.testing.assert_allclose(found[placed.mask], placed.positions_world[placed.mask], atol=1e-3)

@@ -12,15 +12,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from dpmjax.deeppointmap.training.curriculum import TrainingConfig
-from dpmjax.deeppointmap.training.layouts import stage_layouts
-from dpmjax.deeppointmap.training.sampling import (
-    PlacedScans,
-    RegistrationSample,
-    arrange_groups,
-    draw_groups,
-    stack,
-)
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig, stage_layouts
+from dpmjax.deeppointmap.training.sampling import PlacedScans, RegistrationSample, arrange_groups, draw_groups, stack
 from dpmjax.deeppointmap.training.scan_store import ScanStore
 
 SAMPLE_STREAM, EPOCH_STREAM = 3101, 3102

@@ -11,18 +11,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import flax.struct
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
+from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
 from dpmjax.deeppointmap.training.data_pipeline import SampleMaker
-from dpmjax.deeppointmap.training.drives import prepare_drives
 from dpmjax.deeppointmap.training.processes import (
     BATCH_AXIS,
     device_mesh,
@@ -32,20 +34,149 @@ from dpmjax.deeppointmap.training.processes import (
     place,
     together,
 )
-from dpmjax.deeppointmap.training.records import (
-    Speed,
-    StepRecord,
-    Trained,
-    TrainingHooks,
-    TrainingLostError,
-    TrainingProgress,
-    after_evaluation,
-    begin_training,
-    uncalibrated,
-)
-from dpmjax.deeppointmap.training.scan_store import ScanStore
-from dpmjax.deeppointmap.training.step import finish, make_step
+from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drives
+from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
 from dpmjax.sequences import LidarSequence
+from dpmjax.types import AnyArray
+
+
+class TrainingLostError(ArithmeticError):
+    """The loss is not finite."""
+
+
+@flax.struct.dataclass
+class TrainingProgress:
+    """The state of training and the best parameters so far; a checkpoint of it resumes the run exactly.
+
+    Attributes:
+        state: state after the last step.
+        best_params: parameters with the best score; the initial ones before the first evaluation.
+        best_score: the best score; -1 before the first evaluation.
+        best_step: number of steps before the best evaluation; 0 before the first.
+    """
+
+    state: TrainingState
+    best_params: dict[str, Any]
+    best_score: Float[AnyArray, ""]
+    best_step: Int[AnyArray, ""]
+
+
+class Speed(NamedTuple):
+    """Seconds of steps.
+
+    Attributes:
+        run_s: seconds of all steps but the first of each stage.
+        compile_s: seconds of the first step of each stage.
+        num_scans: number of scans that the steps of `run_s` processed.
+    """
+
+    run_s: float = 0.0
+    compile_s: float = 0.0
+    num_scans: int = 0
+
+    @property
+    def scans_per_s(self) -> float:
+        """Number of scans that a second of steps processes; 0 before the second step."""
+        return self.num_scans / self.run_s if self.run_s > 0 else 0.0
+
+
+class StepRecord(NamedTuple):
+    """Report of the loop after a step.
+
+    Attributes:
+        step: number of steps done.
+        stage: stage of the step.
+        report: measures of the step.
+        score: score of an evaluation after this step; NaN without one.
+        speed: seconds of the steps of this call.
+    """
+
+    step: int
+    stage: CurriculumStage
+    report: TrainingReport
+    score: float
+    speed: Speed
+
+
+@dataclass(frozen=True)
+class TrainingHooks:
+    """Functions that the loop calls. `evaluate` and `on_report` are called in process 0 only.
+
+    Attributes:
+        evaluate: scores a model, larger is better; the model with the best score is kept.
+        evaluate_every: number of steps from one evaluation to the next.
+        on_report: gets the record and the progress after each step.
+        stop: called before each step; any number but 0 ends training in all processes.
+        finish: called before each step until it returns True in any process; from then on the learning rate falls, as
+            `training.finish` describes.
+    """
+
+    evaluate: Callable[[Model], float] | None = None
+    evaluate_every: int = 100
+    on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
+    stop: Callable[[], int] = int
+    finish: Callable[[], bool] = bool
+
+    def __post_init__(self) -> None:
+        require_fields(self, "evaluate_every", low=1)
+
+
+class Trained(NamedTuple):
+    """Result of training.
+
+    Attributes:
+        model: the model with the best score; the last one without an evaluation.
+        progress: progress after the last step.
+        stopped_by: the number that `stop` returned; 0 after the last step.
+        speed: seconds of the steps of this call.
+    """
+
+    model: Model
+    progress: TrainingProgress
+    stopped_by: int
+    speed: Speed
+
+
+def begin_training(config: TrainingConfig, *, seed: int = 0, start: Model | None = None) -> TrainingProgress:
+    """Makes the progress before the first step.
+
+    Args:
+        config: settings of training.
+        seed: seed of the parameters.
+        start: a model whose parameters take the place of random ones; the optimiser begins at zero with any.
+
+    Returns:
+        Progress without an evaluation.
+
+    Raises:
+        ValueError: if the parameters of `start` have other shapes than those of `config.model`.
+    """
+    state = init_training(jax.random.key(seed), config)
+    if start is not None:
+        shapes = [jax.tree.map(np.shape, params) for params in (start.params, state.params)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                "start: expected parameters of config.model, got others; replace(config, model=start.config)"
+            )
+        state = replace(state, params=start.params)
+    return TrainingProgress(state, state.params, np.asarray(-1, np.float32), np.asarray(0, np.int32))
+
+
+def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgress:
+    """Keeps the parameters of the state if no score was better; of equal scores, the later one counts.
+
+    Args:
+        progress: progress before the evaluation.
+        score: score of the parameters of the state.
+
+    Returns:
+        The new progress.
+    """
+    if not score >= float(progress.best_score):
+        return progress
+    state = progress.state
+    return TrainingProgress(state, state.params, np.asarray(score, np.float32), np.asarray(state.step, np.int32))
+
 
 NO_HOOKS = TrainingHooks()
 
@@ -85,7 +216,8 @@ def train(
     """
     if cache is not None and isinstance(drives, ScanStore):
         raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
-    config = replace(config, model=uncalibrated(config.model))
+    # Calibrations belong to the parameters that they were fitted for.
+    config = replace(config, model=replace(config.model, calibration=None, overlap=None))
     if not isinstance(start, TrainingProgress):
         start = begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
@@ -101,7 +233,7 @@ def _run_steps(
     mesh, num_local = device_mesh(), jax.local_device_count()
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
-    clock, stopped_by, is_finishing = _Clock(config.sampling.num_scans * jax.device_count()), 0, False
+    speed, seen, stopped_by, is_finishing = Speed(), set[CurriculumStage](), 0, False
     first_sample = jax.process_index() * num_local
     number, end = int(progress.state.step), int(progress.state.end)
     with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
@@ -119,15 +251,21 @@ def _run_steps(
             with together():  # the next batch is prepared while the device computes
                 batch = next(batches, None) if number < end else None
             report = jax.device_get(report)
-            clock.add(stage, time.perf_counter() - begun)
+            seconds = time.perf_counter() - begun
+            if stage in seen:
+                num_scans = speed.num_scans + config.sampling.num_scans * jax.device_count()
+                speed = speed._replace(run_s=speed.run_s + seconds, num_scans=num_scans)
+            else:
+                seen.add(stage)
+                speed = speed._replace(compile_s=speed.compile_s + seconds)
             progress = replace(progress, state=state)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, config, hooks)
             with together():
                 if hooks.on_report is not None and is_first():
-                    hooks.on_report(StepRecord(number, stage, report, score, clock.speed), progress)
-    return progress, stopped_by, clock.speed
+                    hooks.on_report(StepRecord(number, stage, report, score, speed), progress)
+    return progress, stopped_by, speed
 
 
 def _evaluate_when_due(
@@ -146,20 +284,3 @@ def _evaluate_when_due(
 def _local(tree: Any) -> Any:
     # Every device holds the same; the arrays of one device are enough.
     return jax.tree.map(lambda x: jax.numpy.asarray(np.asarray(x)), tree)
-
-
-class _Clock:
-    """Sums up the seconds of steps; the first step of each stage counts as compilation."""
-
-    def __init__(self, scans_per_step: int) -> None:
-        self.speed, self._scans, self._scans_per_step = Speed(0.0, 0.0, 0.0), 0, scans_per_step
-        self._seen: set[CurriculumStage] = set()
-
-    def add(self, stage: CurriculumStage, seconds: float) -> None:
-        if stage not in self._seen:
-            self._seen.add(stage)
-            self.speed = self.speed._replace(compile_s=self.speed.compile_s + seconds)
-            return
-        self._scans += self._scans_per_step
-        run_s = self.speed.run_s + seconds
-        self.speed = self.speed._replace(run_s=run_s, scans_per_s=self._scans / run_s)

@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.matching import thinned_mask
-from dpmjax.deeppointmap.training.curriculum import SamplingConfig
-from dpmjax.deeppointmap.training.layouts import GroupShape, Layout
+from dpmjax.deeppointmap.training.curriculum import GroupShape, Layout, SamplingConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 from dpmjax.types import AnyArray

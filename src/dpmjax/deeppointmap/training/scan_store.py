@@ -1,10 +1,4 @@
-"""The scans of training on disk: a few variants of each, thinned, occluded, jittered, and their point pyramids.
-
-    drives = [prepare_drive(drive, config, folder=Path("cache")) for drive in drives]
-    store = ScanStore(drives)
-
-Preprocessing, augmentation and pyramids are done once. A step reads the pyramids of its scans and moves them.
-"""
+"""The scans of drives, prepared for training: thinned, varied, their pyramids stored in files or in memory."""
 
 from __future__ import annotations
 
@@ -23,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
-from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import SamplingConfig, TrainingConfig
 from dpmjax.deeppointmap.training.sampling import PlacedScans, SampleScans, ScanTable
 from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, sampled_positions, stored_pyramids
 from dpmjax.scans.augment import AugmentConfig, augment_scan, random_motions_on_host
@@ -34,6 +29,8 @@ from dpmjax.sequences import LidarSequence
 from dpmjax.types import PointCloud
 
 LOGGER = logging.getLogger("dpmjax.training")
+PUBLISHED = SamplingConfig()
+
 VARIANT_STREAM = 3104
 FORMAT = 2
 """Raise it when the same scans and settings shall give other files."""
@@ -222,3 +219,62 @@ def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
         except ValueError as error:
             digest.update(str(error).encode())
     return digest.hexdigest()[:24]
+
+
+def prepare_drives(
+    drives: Sequence[LidarSequence], config: TrainingConfig, *, folder: Path | None = None, seed: int = 0
+) -> ScanStore:
+    """Prepares the scans of all drives, in order.
+
+    Args:
+        drives: with poses.
+        config: settings of training.
+        folder: where prepared scans are kept for later calls; None keeps them in memory.
+        seed: seed of the variants.
+
+    Returns:
+        The scans of all drives.
+
+    Raises:
+        ValueError: if there is no drive, or if `why_useless` gives a reason against one.
+    """
+    if not drives:
+        raise ValueError("drives: expected at least one, got none")
+    for drive in drives:
+        if (reason := why_useless(drive, config.sampling)) is not None:
+            raise ValueError(f"drives: {drive.name}: {reason}")
+    prepared = []
+    for number, drive in enumerate(drives):
+        LOGGER.info("prepares %s, %d scans, drive %d of %d", drive.name, len(drive), number + 1, len(drives))
+        prepared.append(prepare_drive(drive, config, folder=folder, seed=seed))
+    return ScanStore(prepared)
+
+
+def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> str | None:
+    """Finds a reason why nothing can be learned from a drive, or measured on it. Reads scans up to the first good one.
+
+    Args:
+        drive: to be checked.
+        sampling: distances between the scans of a pair.
+
+    Returns:
+        The reason; None where there is none.
+    """
+    if drive.T_world_lidar is None:
+        return "no poses; a pose for each scan is needed"
+    positions = drive.T_world_lidar[:, :3, 3]
+    tree = cKDTree(positions)
+    limits = sampling.min_distance_m, sampling.max_distance_m
+    num_too_near, num_near = (tree.count_neighbors(tree, limit) for limit in limits)
+    if num_near == num_too_near:
+        found = f"{len(positions)} scans, no two of them {limits[0]} to {limits[1]} m apart"
+        return f"{found}; such pairs are needed (are the poses in metres?)"
+    reasons = []
+    for number in range(len(drive)):
+        try:
+            drive.read_scan(number)
+        except ValueError as error:
+            reasons.append(str(error))
+        else:
+            return None
+    return f"all {len(drive)} scans are bad; the first, {reasons[0]}"

@@ -28,7 +28,7 @@ from dpmjax.deeppointmap.model import (
     Model,
     coarse_features,
     correlate,
-    encode_stored,
+    encode_pyramid,
     init_model,
     predict_offsets,
     similarity_features,
@@ -42,13 +42,9 @@ from dpmjax.deeppointmap.training.objective import (
     matching_loss,
     training_pairs,
 )
-from dpmjax.deeppointmap.training.sampling import (
-    GroupBatch,
-    MapOfScans,
-    RegistrationSample,
-    SampleScans,
-)
+from dpmjax.deeppointmap.training.sampling import GroupBatch, MapOfScans, RegistrationSample, SampleScans
 from dpmjax.geometry.bearing import directions_of
+from dpmjax.geometry.pyramid_storage import moved_pyramid
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
@@ -188,7 +184,7 @@ def batch_loss(
     model = Model(params, config.model)
 
     def of_sample(sample: RegistrationSample) -> list[tuple[Array, ObjectiveTerms]]:
-        clouds = _in_parts(functools.partial(_encoded, model), sample.scans, config.scans_at_once)
+        clouds = _in_parts(functools.partial(encode_sample, model), sample.scans, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
             num = config.sampling.max_descriptors
@@ -208,8 +204,19 @@ def batch_loss(
     return loss, terms
 
 
-def _encoded(model: Model, scan: SampleScans) -> DescriptorCloud:
-    return encode_stored(model, scan.pyramids, scan.T_augmented_lidar)
+def encode_sample(model: Model, scan: SampleScans) -> DescriptorCloud:
+    """Encodes one stored scan after its motion.
+
+    Args:
+        model: a model whose `config.pyramid` built the pyramid.
+        scan: one scan of a sample.
+
+    Returns:
+        As `encode_pyramid`, in the frame after the motion.
+    """
+    # A rigid motion in metres is one in normalised coordinates with a shorter translation.
+    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
+    return encode_pyramid(model, moved_pyramid(scan.pyramids, scan.T_augmented_lidar * unit))
 
 
 def _map_pair_loss(

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import init_model, model_preset
-from dpmjax.deeppointmap.compact_scans import compact_scan, expand_scan, round_directions, round_features
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
-from dpmjax.deeppointmap.model import elements_of_pyramid, model_fingerprint
+from dpmjax.deeppointmap.model import model_fingerprint
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
+from dpmjax.deeppointmap.prepared_scans import compact_scan, expand_scan, round_directions, round_features
 from dpmjax.deeppointmap.verification import VerificationConfig, measure_scan
 from dpmjax.geometry import rigid
+from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.types import DescriptorCloud
 from tests.scans.surface_scenes import motion, seen_from, street
@@ -28,10 +29,10 @@ NUM_ELEMENTS, NUM_DESCRIPTORS = 1536, 16
 def cloud_of(points: np.ndarray, seed: int = 0) -> DescriptorCloud:
     """Elements of a scan, of which the first have random descriptors."""
     config, rng = model_preset("small"), np.random.default_rng(seed)
-    elements = jax.device_get(elements_of_pyramid(pyramid_of_scan(points, config), config, num_elements=NUM_ELEMENTS))
+    elements = jax.device_get(pyramid_elements(pyramid_of_scan(points, config), NUM_ELEMENTS))
     angles = rng.uniform(-np.pi, np.pi, NUM_DESCRIPTORS)
     return DescriptorCloud(
-        elements.positions,
+        elements.positions * config.scale_m,
         (rng.normal(size=(NUM_DESCRIPTORS, 8)) * rng.uniform(0.01, 100, (NUM_DESCRIPTORS, 1))).astype(np.float32),
         elements.mask,
         np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),

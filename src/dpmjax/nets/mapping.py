@@ -1,14 +1,8 @@
-"""M-Net: a place goes in, the log odds of its being occupied come out (DeepMapping sections 3.2 and 3.3).
-
-`MapMLP` is the paper's. `MapGrid` is a network of one layer over multi-resolution hat functions: a sum of learned grids
-from coarse to fine, each interpolated between its nodes. It is as continuous as the MLP. Each level has twice the cells
-of the one before, so that the sum is one grid of the finest level. A sample costs four reads (in 3-D eight) instead of
-half a million multiplications, and a step changes the map only near the samples. The levels are switched on from coarse
-to fine: first the basin of the poses is wide, later the map is sharp.
-"""
+"""L-Net and M-Net: the pose of a scan, and the occupancy of the map (DeepMapping sections 3.2 to 3.4, 4.2)."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from itertools import product
@@ -18,9 +12,108 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from dpmjax.nets.localization import HE_LIKE
+HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
+"""Xavier-uniform with the gain of ReLU, as in the published networks."""
+
+
+@dataclass(frozen=True)
+class LocalizationNetConfig:
+    """Shape of L-Net. The defaults are the paper's (section 4.1).
+
+    Attributes:
+        kind: "conv" for beams or pixels in order, "point" (PointNet, supplement A) for any set of points.
+        features: channels of the layers before the maximum over the beams.
+        strides: strides of the same layers; "point" ignores them.
+        is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
+        hidden: channels of the layers after the maximum.
+        output_scale: factor on the initial weights of the last layer; a small one lets all poses begin near zero.
+    """
+
+    kind: Literal["conv", "point"] = "conv"
+    features: tuple[int, ...] = (64, 128, 1024)
+    strides: tuple[int, ...] = (1, 1, 1)
+    is_circular: bool = False
+    hidden: tuple[int, ...] = (512, 256)
+    output_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind == "conv" and len(self.strides) != len(self.features):
+            raise ValueError(f"strides: expected one for each of {len(self.features)} layers, got {self.strides}")
+
+
+# Distance of the three taps of a convolution along each axis, in beams or pixels: that of the published program.
+_DILATION = 3
+
+
+class DilatedConvolution(nn.Module):
+    """A dilated convolution of three taps along each axis: 3 for beams, 3 x 3 for an image.
+
+    It is one matrix product: XLA's own convolution is ten times slower on CPUs.
+    """
+
+    features: int
+    stride: int
+    is_circular: bool
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*size c"]) -> Float[Array, "*size_out f"]:
+        """The output has the size of the input divided by the stride.
+
+        Args:
+            x: channels of the beams (b, c) or of the pixels (h, w, c).
+
+        Returns:
+            Channels of every `stride`-th beam or pixel.
+        """
+        *size, _ = x.shape
+        padded = jnp.pad(
+            x, [(_DILATION, _DILATION)] * len(size) + [(0, 0)], mode="wrap" if self.is_circular else "constant"
+        )
+        taps = [
+            padded[tuple(slice(k * _DILATION, k * _DILATION + n, self.stride) for k, n in zip(tap, size, strict=True))]
+            for tap in itertools.product(range(3), repeat=len(size))
+        ]
+        return nn.Dense(self.features, kernel_init=HE_LIKE)(jnp.concatenate(taps, axis=-1))
+
+
+class LocalizationNet(nn.Module):
+    """L-Net for one scan or depth image; `vmap` over the set."""
+
+    config: LocalizationNetConfig
+    num_outputs: int = 3
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "*size d"], mask: Bool[Array, "*size"]) -> Float[Array, " o"]:
+        """Pose of the sensor.
+
+        Args:
+            points: (b, 2) or (h, w, 3) in the sensor frame, about -1 to 1.
+            mask: False for beams that measured nothing.
+
+        Returns:
+            For planar scans x, y, heading in radians; for depth images the numbers of a motion.
+        """
+        config = self.config
+        x = jnp.where(mask[..., None], points, 0.0)
+        for layer, features in enumerate(config.features):
+            if config.kind == "conv":
+                stride = config.strides[layer]
+                x = DilatedConvolution(features, stride, config.is_circular)(x)
+                mask = mask[(slice(None, None, stride),) * mask.ndim]
+            else:
+                x = nn.Dense(features, kernel_init=HE_LIKE)(x)
+            if layer < len(config.features) - 1:
+                x = nn.relu(x)
+        # The published network has no activation before the maximum.
+        axes = tuple(range(mask.ndim))
+        x = jnp.max(jnp.where(mask[..., None], x, -jnp.inf), axis=axes, initial=-1e30)
+        x = jnp.where(mask.any(), x, 0.0)
+        for features in config.hidden:
+            x = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
+        last = nn.initializers.variance_scaling(2.0 * config.output_scale**2, "fan_avg", "uniform")
+        return nn.Dense(self.num_outputs, kernel_init=last)(x)
 
 
 @dataclass(frozen=True)
@@ -68,7 +161,6 @@ class MapMLP(nn.Module):
         Returns:
             Logits.
         """
-        del level_weights
         x = points
         for features in self.features:
             y = nn.relu(nn.Dense(features, kernel_init=HE_LIKE)(x))
@@ -123,7 +215,13 @@ def double_resolution(grid: Float[Array, "*size"]) -> Float[Array, "*size_out"]:
 
 
 class MapGrid(nn.Module):
-    """M-Net of multi-resolution hat functions over the square [-1, 1]^2, or the cube."""
+    """M-Net of multi-resolution hat functions over the square [-1, 1]^2, or the cube: the sum of learned grids.
+
+    Each level has twice the cells of the one before, so that the sum is one grid of the finest level. It is as
+    continuous as the MLP. A sample costs four reads (in 3-D eight) instead of half a million multiplications, and a
+    step changes the map only near the samples. The levels are switched on from coarse to fine: first the basin of the
+    poses is wide, later the map is sharp.
+    """
 
     resolutions: tuple[int, ...]
 

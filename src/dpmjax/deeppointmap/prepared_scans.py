@@ -1,0 +1,192 @@
+"""A scan that is ready for registrations; and the same in small integers, as maps keep it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int8
+
+from dpmjax.deeppointmap.encoding import pyramid_of_scan, require_some, valid_points
+from dpmjax.deeppointmap.model import Model, encode_pyramid
+from dpmjax.deeppointmap.verification import MeasuredScan, measure_scan
+from dpmjax.scans.compact import (
+    CompactElements,
+    CompactImage,
+    compact_elements,
+    compact_image,
+    expand_elements,
+    expand_image,
+)
+from dpmjax.scans.free_space import RangeImage
+from dpmjax.scans.surfaces import surface_of_elements
+from dpmjax.types import AnyArray, DescriptorCloud, PointCloud
+
+MAX_CODE = np.iinfo(np.int8).max
+
+NUM_THREADS = 2
+
+
+class PreparedScan(NamedTuple):
+    """A scan that is ready for any number of registrations.
+
+    Attributes:
+        descriptors: of the scan; positions in metres times `scale`.
+        measured: surface and free space of the scan, metres.
+        scale: factor by which the points were enlarged for the encoder.
+    """
+
+    descriptors: DescriptorCloud
+    measured: MeasuredScan
+    scale: float = 1.0
+
+
+RawScan = PointCloud | Float[AnyArray, "_n 3"]
+"""Points in metres, in the frame of the lidar."""
+
+ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
+"""A raw scan; or the same prepared; or descriptors of a scan or of a map."""
+
+Scale = float | Literal["auto"]
+"""Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`."""
+
+
+def descriptors_of(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
+    """Returns the descriptors of a prepared scan, or the cloud itself."""
+    return scan.descriptors if isinstance(scan, PreparedScan) else scan
+
+
+def require_pairs(sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> None:
+    """Raises a `ValueError` if the lengths differ or are 0."""
+    require_some("sources", sources)
+    if len(sources) != len(targets):
+        raise ValueError(f"targets: expected {len(sources)}, one for each source, got {len(targets)}")
+
+
+def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:
+    """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
+
+    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
+
+    Args:
+        model: encoder and configuration.
+        points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        scale: see `encode`.
+
+    Returns:
+        Descriptors, surface and free space.
+    """
+    return prepare_scans(model, [points], scale=scale)[0]
+
+
+def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
+    """Prepares scans in their order; threads measure their surfaces while JAX encodes.
+
+    A `ValueError` says if the points of a scan are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        scans: points in metres, each in the frame of its lidar.
+        scale: see `encode`.
+
+    Returns:
+        The prepared scans.
+    """
+    # Threads run NumPy only: compiled programs wait for threads of JAX, and may wait for each other.
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        clouds, measured = [], []
+        for points in scans:
+            pyramid = pyramid_of_scan(points, model.config, scale=scale)
+            measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification))
+            clouds.append(encode_pyramid(model, pyramid))
+        return [PreparedScan(cloud, future.result(), scale) for cloud, future in zip(clouds, measured, strict=True)]
+
+
+class CompactScan(NamedTuple):
+    """Compact form in which a map stores a scan, as arrays of NumPy.
+
+    Attributes:
+        elements: surface elements in the order of farthest points; the first m have features.
+        features: (m, c) in steps.
+        feature_steps: (m,) step of the features of each descriptor, float32.
+        directions: (m,) azimuths of the frames of the descriptors, pi as 127.
+        image: range image.
+    """
+
+    elements: CompactElements
+    features: Int8[np.ndarray, "m c"]
+    feature_steps: Float[np.ndarray, " m"]
+    directions: Int8[np.ndarray, " m"]
+    image: CompactImage
+
+    @property
+    def cloud(self) -> DescriptorCloud:
+        """Descriptors and surface elements, as float32 arrays of NumPy."""
+        elements = expand_elements(self.elements)
+        angles = self.directions * (np.pi / MAX_CODE)
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
+        features = self.features * self.feature_steps[:, None]
+        # Arrays of NumPy stand for those of JAX.
+        parts: tuple[Any, ...] = (elements.positions, features, elements.mask, directions)
+        parts += elements.normals, elements.planarity
+        return DescriptorCloud(*parts)
+
+
+def compact_scan(cloud: DescriptorCloud, image: RangeImage) -> CompactScan:
+    """Rounds what registration and verification need of a scan.
+
+    Args:
+        cloud: descriptors of one scan with surface elements and directions.
+        image: free space of the scan.
+
+    Returns:
+        The compact scan.
+    """
+    return CompactScan(
+        compact_elements(cloud.elements),
+        *round_features(np.asarray(cloud.features, np.float32)),
+        round_directions(np.asarray(cloud.directions)),
+        compact_image(image),
+    )
+
+
+def round_features(
+    features: Float[np.ndarray, "m c"],
+) -> tuple[Int8[np.ndarray, "m c"], Float[np.ndarray, " m"]]:
+    """Rounds the features of each descriptor to 127 steps of their largest absolute value.
+
+    Args:
+        features: of the descriptors.
+
+    Returns:
+        The features in steps, and the steps.
+    """
+    steps = np.maximum(np.abs(features).max(axis=1, initial=0), 1e-12).astype(np.float32) / np.float32(MAX_CODE)
+    return np.rint(features / steps[:, None]).astype(np.int8), steps
+
+
+def round_directions(directions: Float[np.ndarray, "m 2"]) -> Int8[np.ndarray, " m"]:
+    """Rounds horizontal directions to azimuths 1.4 degrees apart.
+
+    Args:
+        directions: unit vectors.
+
+    Returns:
+        Azimuths, pi as 127.
+    """
+    return np.rint(np.arctan2(directions[:, 1], directions[:, 0]) * (MAX_CODE / np.pi)).astype(np.int8)
+
+
+def expand_scan(compact: CompactScan) -> PreparedScan:
+    """Makes a scan ready for registrations, in a millisecond.
+
+    Args:
+        compact: from `compact_scan`.
+
+    Returns:
+        Descriptors, surface and free space.
+    """
+    cloud = compact.cloud
+    return PreparedScan(cloud, MeasuredScan(surface_of_elements(cloud.elements), expand_image(compact.image)))
