@@ -15,7 +15,7 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M
 from dpmjax.deeppointmap.scan_pairs import draw_rows, scan_distances, true_poses
 from dpmjax.geometry import se2
-from dpmjax.metrics.proportions import area_under_curve, brier_score
+from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud
 
