@@ -34,7 +34,8 @@ def error_boxes_figure(
     Returns:
         The figure.
     """
-    figure = figures.new_figure(1.6 + 0.75 * max(len(methods) for methods in panels.values()) * len(panels), 4.4)
+    num_methods = max(len(methods) for methods in panels.values())
+    figure = figures.new_figure(1.6 + 0.75 * num_methods * len(panels), 4.4, layout="tight")
     axes = np.atleast_1d(figure.subplots(1, len(panels)))
     for number, (ax, (measure, methods)) in enumerate(zip(axes, panels.items(), strict=True)):
         values = [np.maximum(np.asarray(errors, float), 1e-4) for errors in methods.values()]
@@ -48,7 +49,6 @@ def error_boxes_figure(
         ax.grid(axis="y", alpha=0.25)
         if threshold is not None and number == 0:
             ax.axhline(threshold, color=ACCENT, linewidth=0.8, linestyle="--")
-    figure.tight_layout()
     return figure
 
 
@@ -76,7 +76,7 @@ def success_grids_figure(
             raise ValueError(f"{method}: expected {expected}, got {rates.shape}")
     num_lines = -(-len(grids) // GRIDS_IN_A_LINE)
     num_in_line = -(-len(grids) // num_lines)
-    figure = figures.new_figure(1.2 + 2.1 * num_in_line, num_lines * (1.3 + 0.42 * len(row_names)))
+    figure = figures.new_figure(1.2 + 2.1 * num_in_line, num_lines * (1.3 + 0.42 * len(row_names)), layout="tight")
     axes = figure.subplots(num_lines, num_in_line, squeeze=False)
     for ax in axes.flat[len(grids) :]:
         ax.remove()
@@ -93,7 +93,6 @@ def success_grids_figure(
     for ax in axes[:, 0]:
         ax.set_yticks(range(len(row_names)), list(row_names), fontsize=8)
         ax.set_ylabel(row_label, fontsize=8)
-    figure.tight_layout()
     return figure
 
 
@@ -115,7 +114,7 @@ def toy_figure(
     """
     x, loss = map(np.asarray, curve)
     network_end = tuple(float(np.asarray(values)[-1]) for values in visited)
-    figure = figures.new_figure(8.0, 4.6)
+    figure = figures.new_figure(8.0, 4.6, layout="tight")
     axes = figure.add_subplot()
     ends: dict[str, Any] = {"mec": "white", "ls": "none", "zorder": 6}
     axes.plot(x, loss, color=INK, lw=1.2, label="L(x)", zorder=2)
@@ -128,7 +127,6 @@ def toy_figure(
     axes.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
     axes.set_xlim(float(x.min()), float(x.max()))
     axes.set_ylim(top=1.5 * float(loss.max()))
-    figure.tight_layout()
     return figure
 
 
@@ -152,7 +150,7 @@ def endings_figure(
     if not ends or set(ends) != set(shares):
         raise ValueError(f"expected shares of the same methods as ends; got {sorted(ends)} and {sorted(shares)}")
     shown = np.asarray(x, np.float64)
-    figure = figures.new_figure(8.0, 1.8 + 0.95 * len(ends))
+    figure = figures.new_figure(8.0, 1.8 + 0.95 * len(ends), layout="tight")
     top, *rows = figure.subplots(1 + len(ends), 1, sharex=True, height_ratios=(1.8, *([1.0] * len(ends))))
     top.plot(shown, np.asarray(loss), color=INK, lw=1.2)
     figures.style_axes(top, y_label="L(x)")
@@ -163,7 +161,6 @@ def endings_figure(
         axes.set_yscale("symlog", linthresh=1.0)
         figures.annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
         figures.style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "")
-    figure.tight_layout()
     return figure
 
 
@@ -197,7 +194,7 @@ def matches_figure(scans: MatchedScans, T_target_source: ArrayLike, *, title: st
         The figure.
     """
     a, b, T, pa, pb = (np.asarray(x, np.float64) for x in (*scans[:2], T_target_source, *scans[2:4]))
-    figure = figures.new_figure(12.0, 4.6)
+    figure = figures.new_figure(12.0, 4.6, layout="tight")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
     laid = (a @ T[:3, :3].T + T[:3, 3])[:, :2]
@@ -210,7 +207,6 @@ def matches_figure(scans: MatchedScans, T_target_source: ArrayLike, *, title: st
         left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
     figures.set_title(left, title)
     figures.set_title(right, "source laid onto target")
-    figure.tight_layout()
     return figure
 
 
@@ -239,7 +235,7 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
     Returns:
         The figure.
     """
-    figure = figures.new_figure(9.0, 4.2 * len(pairs))
+    figure = figures.new_figure(9.0, 4.2 * len(pairs), layout="tight")
     grid = figure.subplots(len(pairs), len(pairs[0].motions), squeeze=False)
     for row, pair in zip(grid, pairs, strict=True):
         for axes, (label, T) in zip(row, pair.motions.items(), strict=True):
@@ -251,5 +247,4 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
             corners = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
             figures.frame_map(axes, figures.plane_limits(corners, 0.05))
             figures.set_title(axes, f"{pair.title}\n{label}", 9)
-    figure.tight_layout()
     return figure

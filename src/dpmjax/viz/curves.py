@@ -164,7 +164,7 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
     values = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
     if len(x) == 0 or not values or any(len(curve) != len(x) for curve in values.values()):
         raise ValueError(f"expected one or more steps and curves as long; got {len(x)} steps, {len(values)} curves")
-    figure = figures.new_figure(8.0, 1.0 + 1.5 * len(values))
+    figure = figures.new_figure(8.0, 1.0 + 1.5 * len(values), layout="tight")
     rows = figure.subplots(len(values), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, curve) in zip(rows, values.items(), strict=True):
         is_known = np.isfinite(curve)
@@ -174,7 +174,6 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
         if many:
             axes.plot(x[is_known], _smoothed(curve[is_known]), color=LOSS_COLOR, lw=1.6)
         figures.style_axes(axes, "step" if axes is rows[-1] else "", name)
-    figure.tight_layout()
     return figure
 
 
@@ -205,7 +204,7 @@ def reliability_figure(
     """
     confidence, right = np.asarray(confidence, float), np.asarray(is_right, bool)
     bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
-    figure = figures.new_figure(4.6, 4.6)
+    figure = figures.new_figure(4.6, 4.6, layout="tight")
     axes = figure.subplots()
     figures.style_axes(axes, *labels)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--")
@@ -213,9 +212,8 @@ def reliability_figure(
     used = counts > 0
     x, y = (np.bincount(bins, values, NUM_BINS)[used] / counts[used] for values in (confidence, right))
     axes.plot(x, y, "o-", color=ACCENT, lw=1.4, ms=4)
-    for count, *place in zip(counts[used], x, y, strict=True):
-        axes.annotate(str(count), place, xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
+    for count, left, up in zip(counts[used], x, y, strict=True):
+        axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
     brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
     figures.set_title(axes, f"{title}\n{len(right)} pairs, Brier score {brier:.3f}")
-    figure.tight_layout()
     return figure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -40,11 +40,11 @@ class Limits(NamedTuple):
         return self.y_max - self.y_min
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """Returns a white figure that belongs to no window and to no global state."""
+def new_figure(width_in: float, height_in: float, layout: Literal["tight"] | None = None) -> Figure:
+    """Returns a white figure that belongs to no window and to no global state; "tight" makes room for labels."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_in, height_in), facecolor="white")
+    return Figure(figsize=(width_in, height_in), facecolor="white", layout=layout)
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:

@@ -159,7 +159,7 @@ def from_above_figure(
     sensors = [T[:, :3, 3] for T in aligned]
     low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
     limits = figures.plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.12)
-    figure = figures.new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5)
+    figure = figures.new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5, layout="tight")
     colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
     axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
     # Few points would hardly be seen.
@@ -171,7 +171,6 @@ def from_above_figure(
         axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
         figures.frame_map(axes, limits, "m" if axes is axes_row[0] else None)
         figures.set_title(axes, title, loc="left")
-    figure.tight_layout()
     return figure
 
 
@@ -202,7 +201,7 @@ def localization_figure(
     shown = np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]])
     limits = figures.plane_limits(np.percentile(shown, [0.5, 99.5], axis=0), 0.06)
     width_in, height_in = figures.size_in(limits)
-    figure = figures.new_figure(width_in + 0.3, height_in + 0.8)
+    figure = figures.new_figure(width_in + 0.3, height_in + 0.8, layout="tight")
     axes = figure.subplots()
     axes.scatter(points[:, 0], points[:, 1], s=0.4, color=MUTED, alpha=0.35, linewidths=0, rasterized=True)
     axes.plot(path[:, 0], path[:, 1], ".", color=INK, ms=3, label=f"{len(path)} keyframes", zorder=4)
@@ -215,5 +214,4 @@ def localization_figure(
     figures.frame_map(axes, limits, "m")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
     figures.set_title(axes, title)
-    figure.tight_layout()
     return figure
