@@ -176,7 +176,7 @@ def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
     poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
     for tag, places, values in _by_tag(lines):
         numbers = values[:, : tag.pose_size]
-        is_finite = np.isfinite(numbers).all(axis=1)
+        is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(numbers).all(axis=1))
         lengths = np.linalg.norm(np.clip(numbers[:, 3:], -2, 2), axis=1)
         is_good = is_finite & ((tag.pose_size != 7) | (np.abs(lengths - 1) <= 0.1))
         if not is_good.all():
