@@ -8,13 +8,37 @@ import numpy as np
 from scipy.io import savemat
 
 from dpmjax.geometry import rigid
-from dpmjax.io import LidarSequence, ScanSequence, iterate_scans, write_kitti, write_pcd
+from dpmjax.io import InputError, LidarSequence, ScanSequence, write_kitti
+from dpmjax.io.clouds import parse_ply
 from dpmjax.io.files import read_bytes
 from dpmjax.io.pcd import parse_pcd
-from dpmjax.io.ply import parse_ply
 
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written drives have it in the lidar.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def write_pcd(path: Path, points: np.ndarray) -> Path:
+    """Writes points in the layout of the DeepMapping authors: fields x y z, float32, binary, one row of points."""
+    cloud = np.zeros((len(points), 3), "<f4")
+    cloud[:, : points.shape[1]] = points
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(cloud)}\nDATA binary\n"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(header.encode() + cloud.tobytes())
+    return path
+
+
+def readable_scans(sequence: LidarSequence) -> dict[int, np.ndarray]:
+    """Reads the scans of a drive by their numbers, without the damaged ones."""
+    scans = {}
+    for index in range(len(sequence)):
+        try:
+            scans[index] = sequence.read_scan(index)
+        except InputError:
+            continue
+    return scans
 
 
 def write_deepmapping_folder(folder: Path, sequence: ScanSequence) -> Path:
@@ -33,7 +57,7 @@ def write_kitti_sequence(root: Path, name: str, sequence: LidarSequence) -> Path
     folder = root / "sequences" / name
     (folder / "velodyne").mkdir(parents=True)
     kept = []
-    for index, points in iterate_scans(sequence):
+    for index, points in readable_scans(sequence).items():
         rows = np.zeros((len(points), 4), "<f4")
         rows[:, :3] = points
         (folder / "velodyne" / f"{len(kept):06d}.bin").write_bytes(rows.tobytes())

@@ -5,7 +5,7 @@ NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -141,6 +141,24 @@ class Relations(NamedTuple):
     times_from: FloatArray
     times_to: FloatArray
     T_from_to: FloatArray
+
+
+def pad_scans(scans: Sequence[NDArray[np.floating]]) -> tuple[NDArray[np.float32], BoolArray]:
+    """Stacks planar scans of different numbers of beams.
+
+    Args:
+        scans: n scans, each (its number of beams, 2) end points; NaN for beams that measured nothing.
+
+    Returns:
+        points: (n, b, 2) float32; zero where masked.
+        mask: (n, b) True where a beam measured something; beams behind the last of a scan are masked.
+    """
+    mask = np.zeros((len(scans), max(len(scan) for scan in scans)), bool)
+    points = np.zeros((*mask.shape, 2), np.float32)
+    for row, valid, scan in zip(points, mask, scans, strict=True):
+        valid[: len(scan)] = ~np.isnan(scan).any(axis=1)
+        row[valid] = scan[valid[: len(scan)]]
+    return points, mask
 
 
 def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:

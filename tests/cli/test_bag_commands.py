@@ -10,9 +10,9 @@ import pytest
 from dpmjax.cli import localize, map2d, program, slam
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.result_files import load_json
-from dpmjax.io import write_pcd
 from tests.cli.test_slam import run, table
 from tests.cli.test_slam_fuzz import leave_networks_out
+from tests.data_sets import write_pcd
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.slam.test_odometry import motion, planes, seen_from
 

@@ -10,9 +10,10 @@ import pytest
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_numbers import run_status, why_failed
-from dpmjax.io import write_pcd, write_tum
+from dpmjax.io import write_tum
 from tests.cli.test_slam import run
 from tests.cli.test_slam_fuzz import leave_networks_out
+from tests.data_sets import write_pcd
 from tests.slam.test_odometry import motion, planes, seen_from
 
 

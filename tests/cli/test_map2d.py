@@ -16,10 +16,10 @@ from evo.tools import file_interface
 
 from dpmjax.cli.command import Interrupted, run_command
 from dpmjax.cli.map2d import NAME, Config, main
-from dpmjax.io import ScanSequence, write_pcd
+from dpmjax.io import ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
-from tests.data_sets import write_deepmapping_folder
+from tests.data_sets import write_deepmapping_folder, write_pcd
 
 REPOSITORY = Path(__file__).parents[2]
 NUM_SCANS = 16

@@ -11,8 +11,8 @@ from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.program import main
 from dpmjax.cli.register import motion_text
 from dpmjax.cli.result_files import load_json
-from dpmjax.io import read_lidar_file, write_pcd
-from tests.data_sets import read_ply
+from dpmjax.io import read_lidar_file
+from tests.data_sets import read_ply, write_pcd
 from tests.deeppointmap import toy
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from dpmjax.cli.drives import STEP_M, DriveOptions, find_sources, keep_scans, open_drive, route_drive
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, write_kitti, write_tum
-from dpmjax.simulation.town import driving
+from dpmjax.simulation import motion
 from dpmjax.types import PointCloud
 
 # Axes of a camera that looks ahead: x right, y down, z forward.
@@ -37,7 +37,7 @@ def without_rays(monkeypatch, tmp_path) -> Path:
     def scan_town(primitives, pose, time, **_) -> PointCloud:
         return PointCloud(jnp.asarray(pose[None, :3, 3], jnp.float32), jnp.ones(1, bool))
 
-    monkeypatch.setattr(driving, "scan_town", scan_town)
+    monkeypatch.setattr(motion, "scan_town", scan_town)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -14,9 +14,10 @@ import pytest
 from dpmjax import model_preset
 from dpmjax.cli import slam, slam_files
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.io import write_kitti, write_pcd, write_ply, write_tum
+from dpmjax.io import write_kitti, write_ply, write_tum
 from dpmjax.slam import Match, Proposal, SlamConfig, SlamMethods, SurfaceGeometry
 from tests.cli.test_slam import run
+from tests.data_sets import write_pcd
 from tests.slam.test_odometry import compacted, motion, planes, seen_from
 
 NUM_FUZZED = int(os.environ.get("DPMJAX_NUM_FUZZED_DRIVES", "40"))

@@ -5,9 +5,9 @@ import tarfile
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, write_pcd
+from dpmjax.io import InputError
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from tests.data_sets import read_pcd, write_deepmapping_folder
+from tests.data_sets import read_pcd, write_deepmapping_folder, write_pcd
 
 POINTS = np.array([[1, 2, 3], [4, 5, 6], [-7, 8.5, 0]], np.float32)
 

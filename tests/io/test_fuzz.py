@@ -20,7 +20,7 @@ from scipy.io import savemat
 import dpmjax
 from dpmjax import io
 from dpmjax.sequences import InputError, LidarSequence, ScanSequence
-from tests.data_sets import write_deepmapping_folder
+from tests.data_sets import readable_scans, write_deepmapping_folder, write_pcd
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.io.test_las import write_las
 from tests.io.test_pcd import compressed
@@ -233,7 +233,7 @@ def write_planar_bag(folder, rng, *, kind):
 def write_plain_drive(folder, rng):
     """Scans with stamps, and a TUM file of another rate."""
     for index in range(3):
-        io.write_pcd(folder / f"{index}.pcd", cloud(rng))
+        write_pcd(folder / f"{index}.pcd", cloud(rng))
     (folder / "times.txt").write_text("10.0\n10.1\n10.2\n")
     io.write_tum(folder / "groundtruth.txt", np.tile(np.eye(4), (20, 1, 1)), times=10 + 0.01 * np.arange(20))
     return folder
@@ -264,7 +264,7 @@ def write_graph(folder, _, *, text):
 
 def read_drive(path):
     sequence = io.open_lidar_sequence(path)
-    return [sequence, list(io.iterate_scans(sequence))]
+    return [sequence, list(readable_scans(sequence).values())]
 
 
 SCANS = {
@@ -280,7 +280,7 @@ SCANS = {
 LIDAR_FILES = {
     "bin": write_bin,
     "npy": write_npy_3d,
-    "pcd": lambda folder, rng: io.write_pcd(folder / "0.pcd", cloud(rng)),
+    "pcd": lambda folder, rng: write_pcd(folder / "0.pcd", cloud(rng)),
     "ascii pcd": write_ascii_pcd,
     "ply": lambda folder, rng: io.write_ply(folder / "0.ply", cloud(rng)),
     "ascii ply": write_ascii_ply,
@@ -402,7 +402,7 @@ def assert_good(result: object) -> None:
     if isinstance(result, list):
         sequence, scans = result
         assert isinstance(sequence, LidarSequence)
-        assert all(np.isfinite(scan.points).all() and len(scan.points) for scan in scans)
+        assert all(np.isfinite(points).all() and len(points) for points in scans)
         T = sequence.T_world_lidar
         assert T is None or np.isnan(T[~sequence.has_reference]).all()
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dpmjax.io import InputError, open_lidar_sequence, write_kitti, write_pcd, write_tum
+from dpmjax.io import InputError, open_lidar_sequence, write_kitti, write_tum
 from dpmjax.io.references import to_seconds
-from dpmjax.io.scan_names import sort_scans, strays_among
+from dpmjax.io.scan_files import sort_scans, strays_among
+from tests.data_sets import write_pcd
 
 NUM = 8
 EPOCH = 1_600_000_000.0

@@ -12,7 +12,7 @@ from scipy.io import savemat
 from dpmjax import io, simulation
 from dpmjax.io import InputError
 from dpmjax.io.depth import Camera, back_project
-from dpmjax.simulation.apartment import cast_depth
+from dpmjax.simulation.apartments import cast_depth
 from tests.tolerances import ROUNDING
 
 CAMERA = Camera(8, 6, 6.0, 6.5, 3.5, 2.5)

@@ -18,8 +18,7 @@ from dpmjax.simulation import (
     scan_town,
     simulate_scene,
 )
-from dpmjax.simulation.town.cast import cast_turn
-from dpmjax.simulation.town.culling import near_world
+from dpmjax.simulation.town.cast import cast_turn, near_world
 from dpmjax.simulation.town.kinds import KINDS
 from dpmjax.simulation.town.primitives import SOFT, SOLID, pack_bodies
 from dpmjax.simulation.town.scan import make_rays

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.io import iterate_scans, open_lidar_sequence
+from dpmjax.io import open_lidar_sequence
 from dpmjax.simulation import (
     HDL32E,
     HDL64E,
@@ -18,10 +18,10 @@ from dpmjax.simulation import (
     TownConfig,
     drive,
     make_town,
+    motion,
     scan_town,
     simulate_lidar_sequence,
 )
-from dpmjax.simulation.town import driving
 from dpmjax.simulation.town.terrain import with_equal_passes
 from tests.data_sets import write_kitti_sequence
 
@@ -125,7 +125,7 @@ def test_a_car_that_turns_slowly_takes_longer_on_the_same_way():
 
 
 def test_nothing_stands_in_the_lane(town, monkeypatch):
-    monkeypatch.setattr(driving, "_SWAY_M", 0.0)
+    monkeypatch.setattr(motion, "_SWAY_M", 0.0)
     boxes = town.primitives.boxes
     mask = np.asarray(boxes.mask)
     lane = drive(town, DriveConfig()).T_world_lidar[:, :2, 3]
@@ -170,8 +170,8 @@ def test_a_simulated_sequence_is_written_and_read_as_kitti(tmp_path):
     np.testing.assert_allclose(again.times, sequence.times, atol=1e-6)
     relative = np.linalg.inv(sequence.T_world_lidar[0]) @ sequence.T_world_lidar
     np.testing.assert_allclose(again.T_world_lidar, relative, atol=1e-6)
-    for mine, theirs in zip(iterate_scans(sequence), iterate_scans(again), strict=True):
-        np.testing.assert_array_equal(mine.points, theirs.points)
+    for mine, theirs in zip(sequence, again, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_a_street_is_laid_along_a_real_drive(real_data):

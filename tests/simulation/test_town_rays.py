@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import LidarSensor
-from dpmjax.simulation.town.cast import cast_turn
-from dpmjax.simulation.town.culling import near_world
+from dpmjax.simulation.town.cast import cast_turn, near_world
 from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_ground, cross_spheroid, ground_height
 from dpmjax.simulation.town.primitives import (
     GROUND,

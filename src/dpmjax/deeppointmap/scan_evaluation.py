@@ -25,7 +25,7 @@ from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.geometry import se2
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
-from dpmjax.metrics.proportions import area_under_curve, brier_score
+from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import weakref
 from collections.abc import Collection, Iterator
@@ -11,13 +12,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import natural_key, refusing
-from dpmjax.io.messages import import_for
+from dpmjax.io.files import import_for, natural_key, refusing
 from dpmjax.sequences import InputError, require
 
+POINT_CLOUD, LASER_SCAN = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan"
+LIVOX_CLOUDS = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+MULTI_ECHO_SCAN = "sensor_msgs/msg/MultiEchoLaserScan"
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _ADVICE = "copy the bag again, or reindex it (rosbag reindex, ros2 bag reindex)"
-_PACKETS = ("VelodyneScan", "PacketMsg", "VelodynePacket", "RslidarPacket", "UdpFrame", "HesaiScan", "PandarScan")
+# Advice for bags without scans of the wanted kind, by the types that they have.
+_OTHER_KINDS = {
+    ("LaserScan", "MultiEchoLaserScan"): "planar scans are mapped by dpmjax map2d",
+    ("PointCloud2", "CustomMsg"): "clouds are mapped by dpmjax slam",
+    ("VelodyneScan", "PacketMsg", "VelodynePacket", "RslidarPacket", "UdpFrame", "HesaiScan", "PandarScan"): (
+        "raw packets are not read: play them through the driver and record its PointCloud2"
+    ),
+}
 
 
 class Topic(NamedTuple):
@@ -32,6 +42,11 @@ class Topic(NamedTuple):
     name: str
     kind: str
     num_messages: int
+
+    @property
+    def short_kind(self) -> str:
+        """The type without its package."""
+        return self.kind.rpartition("/")[2]
 
 
 class _Place(NamedTuple):
@@ -53,10 +68,8 @@ def _bag_files(path: Path) -> list[Path]:
         return [path]
     if (path / "metadata.yaml").is_file() and any(path.glob("*.mcap*")) | any(path.glob("*.db3*")):
         return [path]
-    for suffix in _SUFFIXES:
-        if found := sorted(path.glob(f"*{suffix}"), key=lambda file: natural_key(file.name)):
-            return found
-    return []
+    parts = (sorted(path.glob(f"*{suffix}"), key=lambda file: natural_key(file.name)) for suffix in _SUFFIXES)
+    return next((found for found in parts if found), [])
 
 
 class Bag:
@@ -78,6 +91,7 @@ class Bag:
         typesys = import_for(path, "rosbags.typesys", "ros")
         self.path = path
         self._lock = threading.Lock()
+        self._places: dict[str, list[_Place]] = {}
         with _refusing(path):
             # A bag without definitions of its types has the standard ones.
             types = typesys.get_typestore(typesys.Stores.LATEST)
@@ -87,7 +101,10 @@ class Bag:
         with _refusing(path):
             topics = self._reader.topics.items()
             self.topics = [Topic(name, str(info.msgtype), int(info.msgcount)) for name, info in topics]
-        self._places: dict[str, list[_Place]] = {}
+
+    def of_kinds(self, kinds: Collection[str]) -> list[Topic]:
+        """Finds the topics of these types that have messages."""
+        return [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
 
     def choose(self, kinds: Collection[str], topic: str | None, what: str) -> Topic:
         """Chooses the topic of scans.
@@ -103,24 +120,22 @@ class Bag:
         Raises:
             InputError: no such topic, one of another type, none at all, or several.
         """
-        held = ", ".join(f"{each.name} ({each.kind.rpartition('/')[2]})" for each in self.topics) or "none"
+        held = ", ".join(f"{each.name} ({each.short_kind})" for each in self.topics) or "none"
+        fitting = self.of_kinds(kinds)
         if topic is not None:
             named = next((each for each in self.topics if each.name.strip("/") == topic.strip("/")), None)
             if named is None:
                 raise InputError(self.path, f"no topic {topic}, it has {held}", "name one of those with --topic")
             found = f"topic {topic} has messages {named.kind} ({named.num_messages})"
-            is_good = named.kind in kinds and named.num_messages > 0
-            require(is_good, self.path, found, f"name a topic of {what}; the bag has {held}")
+            require(named in fitting, self.path, found, f"name a topic of {what}; the bag has {held}")
             return named
-        fitting = [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
-        require(len(fitting) > 0, self.path, f"no {what}; its topics are {held}", self._advice())
+        present = {each.short_kind for each in self.topics}
+        advices = (advice for others, advice in _OTHER_KINDS.items() if present.intersection(others))
+        advice = next(advices, "record LaserScan, PointCloud2 or Livox's CustomMsg")
+        require(len(fitting) > 0, self.path, f"no {what}; its topics are {held}", advice)
         names = ", ".join(each.name for each in fitting)
         require(len(fitting) == 1, self.path, f"{len(fitting)} topics of {what}: {names}", "name one with --topic")
         return fitting[0]
-
-    def of_kinds(self, *kinds: str) -> list[Topic]:
-        """Finds the topics of these types that have messages."""
-        return [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
 
     def stamps(self, topic: str) -> NDArray[np.int64]:
         """Reads the times of the messages.
@@ -154,8 +169,7 @@ class Bag:
         self.stamps(topic)
         place = self._places[topic][index]
         with self._lock, _refusing(self.path):
-            start = place.recorded_ns
-            found = list(self._reader.messages(self._connections(topic), start=start, stop=start + 1))
+            found = list(self._messages(topic, start=place.recorded_ns, stop=place.recorded_ns + 1))
             connection, _, content = found[place.number]
             return self._reader.deserialize(content, connection.msgtype)
 
@@ -172,42 +186,27 @@ class Bag:
             InputError: the bag is damaged.
         """
         with self._lock, _refusing(self.path):
-            for connection, _, content in self._reader.messages(self._connections(topic)):
+            for connection, _, content in self._messages(topic):
                 yield self._reader.deserialize(content, connection.msgtype)
 
-    def _connections(self, topic: str) -> list[Any]:
-        return [each for each in self._reader.connections if each.topic == topic]
+    def _messages(self, topic: str, **times: int) -> Iterator[Any]:
+        return self._reader.messages([each for each in self._reader.connections if each.topic == topic], **times)
 
     def _find_places(self, topic: str) -> list[_Place]:
         """Returns all messages in the order of the times of their headers."""
         places: list[_Place] = []
         with self._lock, _refusing(self.path):
             seen: dict[int, int] = {}
-            for _, recorded_ns, content in self._reader.messages(self._connections(topic)):
+            for _, recorded_ns, content in self._messages(topic):
                 number = seen.get(recorded_ns, 0)
                 seen[recorded_ns] = number + 1
-                places.append(_Place(self._stamp(content), recorded_ns, number))
+                # The time of the header follows a number (ROS 1), or the encoding (ROS 2).
+                order = ">" if self._reader.is2 and content[1] == 0 else "<"
+                seconds, nanoseconds = struct.unpack_from(f"{order}II", content, 4)
+                places.append(_Place(seconds * 10**9 + nanoseconds, recorded_ns, number))
         if any(place.stamp_ns <= 0 for place in places):
             places = [place._replace(stamp_ns=place.recorded_ns) for place in places]
         return sorted(places)
-
-    def _stamp(self, content: bytes) -> int:
-        """Reads the time of the header of a message: after a number (ROS 1), or after the encoding (ROS 2)."""
-        start, order = (4, "big" if content[1] == 0 else "little") if self._reader.is2 else (4, "little")
-        words = (content[start : start + 4], content[start + 4 : start + 8])
-        seconds, nanoseconds = (int.from_bytes(word, order) for word in words)  # type: ignore[arg-type]
-        return seconds * 10**9 + nanoseconds
-
-    def _advice(self) -> str:
-        """Returns the advice for a bag without scans of the wanted kind."""
-        kinds = [each.kind.rpartition("/")[2] for each in self.topics]
-        if "LaserScan" in kinds or "MultiEchoLaserScan" in kinds:
-            return "planar scans are mapped by dpmjax map2d"
-        if "PointCloud2" in kinds or "CustomMsg" in kinds:
-            return "clouds are mapped by dpmjax slam"
-        if any(kind in _PACKETS for kind in kinds):
-            return "raw packets are not read: play them through the driver and record its PointCloud2"
-        return "record LaserScan, PointCloud2 or Livox's CustomMsg"
 
 
 def _refusing(path: Path) -> Any:

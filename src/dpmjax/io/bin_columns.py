@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dpmjax.io.files import read_bytes
 from dpmjax.sequences import InputError, Note, require
 
-LAYOUTS = (3, 4, 5, 6)
+_LAYOUTS = (3, 4, 5, 6)
 USUAL_COLUMNS = 4
 _NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
 # Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
@@ -52,21 +52,18 @@ def find_columns(path: Path, content: bytes) -> Columns:
     Raises:
         InputError: the file has no whole number of points of the layout, or of any.
     """
-    fitting = [n for n in LAYOUTS if len(content) % (4 * n) == 0]
+    fitting = [n for n in _LAYOUTS if len(content) % (4 * n) == 0]
     inferred = _columns_by_values(np.frombuffer(content[: len(content) // 4 * 4], "<f4"))
     is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
     if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
         return Columns(_NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides"))
+    check_size(path, len(content), inferred or USUAL_COLUMNS)
     if inferred is not None:
-        check_size(path, len(content), inferred)
         text = f"{path}: {inferred} columns a point, inferred from the values; --columns decides"
         return Columns(inferred, None if inferred == USUAL_COLUMNS else Note(text))
-    require(USUAL_COLUMNS in fitting, path, *_no_whole_number(len(content), USUAL_COLUMNS))
-    if len(fitting) == 1 or not content:
-        return Columns(USUAL_COLUMNS)
     others = " or ".join(str(n) for n in fitting if n != USUAL_COLUMNS)
     text = f"{path}: 4 columns a point are assumed, {others} would fit as well; --columns decides"
-    return Columns(USUAL_COLUMNS, Note(text, is_doubt=True))
+    return Columns(USUAL_COLUMNS, Note(text, is_doubt=True) if others and content else None)
 
 
 def check_size(path: str | Path, size: int, columns: int) -> None:
@@ -80,7 +77,10 @@ def check_size(path: str | Path, size: int, columns: int) -> None:
     Raises:
         InputError: the size is no whole number of points.
     """
-    require(size % (4 * columns) == 0, path, *_no_whole_number(size, columns))
+    found = f"{size} bytes are no whole number of points of {columns} float32: truncated, or other columns"
+    others = [str(n) for n in _LAYOUTS if n != columns and size % (4 * n) == 0]
+    advice = "copy the file again" + (f", or say --columns {' or '.join(others)}" if others else "")
+    require(size % (4 * columns) == 0, path, found, advice)
 
 
 def read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
@@ -124,22 +124,16 @@ def columns_of_drive(files: Iterable[Path]) -> Columns:
     return Columns(USUAL_COLUMNS)
 
 
-def _no_whole_number(size: int, columns: int) -> tuple[str, str]:
-    others = [str(n) for n in LAYOUTS if n != columns and size % (4 * n) == 0]
-    found = f"{size} bytes are no whole number of points of {columns} float32: truncated, or other columns"
-    return found, "copy the file again" + (f", or say --columns {' or '.join(others)}" if others else "")
-
-
 def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     """Finds the layout of the largest mutual information of column and value; None where no layout stands out."""
     values = values[:_MOST_VALUES]
-    num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(LAYOUTS)))
+    num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(_LAYOUTS)))
     if num_bins < 4:
         return None
     finite = np.nan_to_num(values.astype(np.float64))
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
     bins = np.searchsorted(edges, finite, side="right")
-    bits = {n: _information_bits(bins, n, len(edges) + 1) for n in LAYOUTS}
+    bits = {n: _information_bits(bins, n, len(edges) + 1) for n in _LAYOUTS}
     if bits[6] < _SIX_RATIO * bits[3]:
         del bits[6]
     (best, most), (_, second), *_ = sorted(bits.items(), key=lambda entry: -entry[1])

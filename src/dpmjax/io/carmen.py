@@ -1,26 +1,29 @@
 """CARMEN logs: planar scans of a front laser, the robot's odometry, and poses by a SLAM program.
 
-A scan has two poses. A log as recorded has both at the places of its ODOM lines: they are the raw
-odometry, and there is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the
-second the raw odometry; where both are equal, the raw odometry is lost.
+A scan has two poses. A log as recorded has both at the places of its ODOM lines: they are the raw odometry, and there
+is no reference. In a log that a SLAM program has corrected, the first pose is the reference and the second the raw
+odometry; where both are equal, the raw odometry is lost.
 """
 
 from __future__ import annotations
 
+import bisect
+import dataclasses
 import gzip
+import logging
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import read_bytes, refusing
-from dpmjax.io.log_order import in_order_of_time
-from dpmjax.sequences import FloatArray, ScanSequence, require
+from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, pad_scans, require
 
-_LARGEST_NUMBER = 1e18
+_log = logging.getLogger(__name__)
 _FLASER = "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp"
 _ROBOTLASER1 = (
     "a line reads ROBOTLASER1 type start_angle field_of_view step max_range accuracy remission_mode n r1..rn m i1..im "
@@ -28,18 +31,20 @@ _ROBOTLASER1 = (
 )
 # Words of a ROBOTLASER1 line before its ranges, and after its poses up to the last time stamp.
 _HEAD, _TAIL = 9, 8
+_LARGEST_NUMBER = 1e18
+_SHORTEST_SCALE_M = 7.9  # Least range of the code for "no echo" of the lasers of these logs.
+_LONGEST_RANGE_M = 1e6
+_CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
+# Poses of a log as recorded are those of its ODOM lines, within the distance from one such line to the next.
+_SAME_PLACE_M = 0.5
+# Equal poses, metres and radians.
+_SAME_POSE = 1e-4
+# A line is moved to the position of its time stamp if that shortens the detour of its odometry to this share.
+_SHORTER_WAY = 0.5
 
 
-class ScanLine(NamedTuple):
-    """One scan.
-
-    Attributes:
-        ranges: metres.
-        angles: directions of the beams, radians, counter-clockwise from straight ahead.
-        pose: x, y, theta of the laser.
-        odometry: x, y, theta of the robot by its wheels.
-        time: time of the measurement (ipc_timestamp); 0 where the line has none.
-    """
+class _Scan(NamedTuple):
+    """A scan: ranges (b,) m at angles (b,) from straight ahead, x y theta of laser and robot, time (0 for none)."""
 
     ranges: FloatArray
     angles: FloatArray
@@ -48,49 +53,57 @@ class ScanLine(NamedTuple):
     time: float
 
 
-class CarmenLines(NamedTuple):
-    """Contents of a log.
-
-    Attributes:
-        scans: scans in the order of the file.
-        is_newer: True where the scans are ROBOTLASER1 lines.
-        odometry: (m, 4) time, x, y, theta of the ODOM lines.
-        is_of_slam: True where there are NEFF lines of the SLAM program GMapping, so that the poses are its result.
-    """
-
-    scans: list[ScanLine]
-    is_newer: bool
-    odometry: FloatArray
-    is_of_slam: bool
-
-
-def read_carmen_lines(path: str | Path) -> CarmenLines:
-    """Reads the lines of a log: FLASER lines, or ROBOTLASER1 lines where there is no FLASER line.
+def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> ScanSequence:
+    """Reads a CARMEN log: its FLASER lines, or its ROBOTLASER1 lines where there is no FLASER line.
 
     Args:
-        path: text, also packed by gzip.
+        path: `.log`, `.clf` or their `.gz`.
+        max_range: readings of this many metres or more are masked as no echo. None takes the largest reading of the
+            log, less 0.1 m, if that reading is beyond 7.9 m, and masks no long reading otherwise. Readings of zero and
+            below are always masked.
 
     Returns:
-        At least one scan.
+        The scans in metres; scans with fewer beams than the longest are padded with masked beams. Poses are those of
+        the laser; the corrected ones are the reference. No times where the log's stand still. Lines of another moment
+        are in the order of time; the reference of such a scan follows from the one before by the odometry.
 
     Raises:
-        InputError: the file cannot be read, has no such line, or one lacks values or holds words that are no numbers.
+        InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
+            that are no numbers.
     """
     content = read_bytes(path)
     with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
         text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
-    lines = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
-    found, newer, wheels, slam = (
-        [(number, words) for number, words in lines if words[:1] == [kind]]
-        for kind in ("FLASER", "ROBOTLASER1", "ODOM", "NEFF")
-    )
-    is_newer = not found
-    found = found or newer
+    lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ("FLASER", "ROBOTLASER1", "ODOM", "NEFF")}
+    for number, words in enumerate(map(str.split, text.splitlines()), 1):
+        if words and words[0] in lines:
+            lines[words[0]].append((number, words))
+    is_newer = not lines["FLASER"]
+    found, parse = (lines["ROBOTLASER1"], _parse_newer) if is_newer else (lines["FLASER"], _parse_older)
     require(len(found) > 0, path, "no FLASER and no ROBOTLASER1 line", "give a CARMEN log of a front laser")
-    parse = _parse_newer if is_newer else _parse_older
     scans = [parse(words, f"{path}:{number}") for number, words in found]
-    odometry = [values for _, words in wheels if (values := _parse_odometry(words)) is not None]
-    return CarmenLines(scans, is_newer, np.array(odometry, np.float64).reshape(-1, 4), bool(slam))
+    largest = max(float(scan.ranges.max()) for scan in scans)
+    limit = largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
+    limit = min(limit if max_range is None else max_range, _LONGEST_RANGE_M)
+    points, mask = pad_scans([_end_points(scan, limit) for scan in scans])
+    times = np.array([scan.time for scan in scans])
+    poses, odometry = np.array([scan.pose for scan in scans]), np.array([scan.odometry for scan in scans])
+    if is_newer:
+        # The second pose is that of the robot, on which the laser is fixed somewhere.
+        mounting = np.median(se2.relative(odometry, poses), axis=0)
+        odometry = np.asarray(se2.compose(odometry, np.broadcast_to(mounting, odometry.shape)))
+    are_equal = bool(np.abs(poses - odometry).max() < _SAME_POSE)
+    # NEFF lines are those of the SLAM program GMapping.
+    is_raw = (are_equal and is_newer) or _is_at_wheels([words for _, words in lines["ODOM"]], poses, times)
+    reference = None if is_raw and not lines["NEFF"] else poses
+    wheels = None if are_equal and reference is not None else odometry
+    name = Path(path).name.split(".")[0]
+    return _in_order_of_time(ScanSequence(name, points, mask, "m", True, reference, wheels, times), path)
+
+
+def _end_points(scan: _Scan, limit: float) -> FloatArray:
+    ranges = np.where((scan.ranges > 0) & (scan.ranges < limit), scan.ranges, np.nan)
+    return ranges[:, None] * np.column_stack([np.cos(scan.angles), np.sin(scan.angles)])
 
 
 def scan_angles(num_beams: int) -> FloatArray:
@@ -109,7 +122,7 @@ def scan_angles(num_beams: int) -> FloatArray:
     return -np.pi / 2 + step * np.arange(num_beams, dtype=np.float64)
 
 
-def _parse_older(words: list[str], source: str) -> ScanLine:
+def _parse_older(words: list[str], source: str) -> _Scan:
     with refusing(source, "not a FLASER line ({error})", _FLASER, (ValueError, IndexError, OverflowError)):
         count = int(words[1])
         values = np.array(words[2 : 2 + count + 6], np.float64)
@@ -117,10 +130,10 @@ def _parse_older(words: list[str], source: str) -> ScanLine:
     found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
     require(count >= 1 and len(values) >= count + 6, source, found, _FLASER)
     _check_numbers(values[:count], [*values[count:], time], source)
-    return ScanLine(values[:count], scan_angles(count), values[count : count + 3], values[count + 3 :], time)
+    return _Scan(values[:count], scan_angles(count), values[count : count + 3], values[count + 3 :], time)
 
 
-def _parse_newer(words: list[str], source: str) -> ScanLine:
+def _parse_newer(words: list[str], source: str) -> _Scan:
     with refusing(source, "not a ROBOTLASER1 line ({error})", _ROBOTLASER1, (ValueError, IndexError, OverflowError)):
         start, step, count = float(words[2]), float(words[4]), int(words[8])
         ranges: FloatArray = np.array(words[_HEAD : _HEAD + count], np.float64)
@@ -131,17 +144,7 @@ def _parse_newer(words: list[str], source: str) -> ScanLine:
     require(count >= 1 and len(ranges) == count and len(poses) == 6, source, found, _ROBOTLASER1)
     require(step > 0 and abs(start) < 7, source, f"angles from {start} by {step} radians", _ROBOTLASER1)
     _check_numbers(ranges, [start, step, *poses, time], source)
-    angles = start + step * np.arange(count, dtype=np.float64)
-    return ScanLine(ranges, angles, poses[:3], poses[3:], time)
-
-
-def _parse_odometry(words: list[str]) -> list[float] | None:
-    """Parses time and pose; None for a damaged line, because scans have odometry of their own."""
-    try:
-        values = [float(words[7]), *map(float, words[1:4])]
-    except (ValueError, IndexError):
-        return None
-    return values if np.isfinite(values).all() else None
+    return _Scan(ranges, start + step * np.arange(count, dtype=np.float64), poses[:3], poses[3:], time)
 
 
 def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> None:
@@ -149,73 +152,101 @@ def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> 
     require(is_good, source, "NaN, infinite or huge values", "remove the line")
 
 
-_SHORTEST_SCALE_M = 7.9  # Least range of the code for "no echo" of the lasers of these logs.
-_LONGEST_RANGE_M = 1e6
-# Poses of a log as recorded are those of its ODOM lines, within the distance from one such line to the next.
-_SAME_PLACE_M = 0.5
-# Equal poses, metres and radians.
-_SAME_POSE = 1e-4
-_CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
-
-
-def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> ScanSequence:
-    """Reads a CARMEN log.
-
-    Args:
-        path: `.log`, `.clf` or their `.gz`.
-        max_range: readings of this many metres or more are masked as no echo. None takes the largest reading of the
-            log, less 0.1 m, if that reading is beyond 7.9 m, and masks no long reading otherwise. Readings of zero and
-            below are always masked.
-
-    Returns:
-        The scans in metres; scans with fewer beams than the longest are padded with masked beams. Poses are those of
-        the laser; the corrected ones are the reference. No times where the log's stand still. Lines of another moment
-        are in the order of time; the reference of such a scan follows from the one before by the odometry.
-
-    Raises:
-        InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
-            that are no numbers.
-    """
-    log = read_carmen_lines(path)
-    lines = log.scans
-    capacity = max(len(line.ranges) for line in lines)
-    points = np.zeros((len(lines), capacity, 2), np.float32)
-    mask = np.zeros((len(lines), capacity), bool)
-    limit = _no_echo_limit(lines) if max_range is None else max_range
-    for row, valid, line in zip(points, mask, lines, strict=True):
-        count = len(line.ranges)
-        valid[:count] = (line.ranges > 0) & (line.ranges < min(limit, _LONGEST_RANGE_M))
-        ranges = np.where(valid[:count], line.ranges, 0.0)
-        row[:count] = ranges[:, None] * np.column_stack([np.cos(line.angles), np.sin(line.angles)])
-    points[~mask] = 0  # no -0.0
-    reference, odometry = _reference_and_odometry(log)
-    times = np.array([line.time for line in lines])
-    sequence = ScanSequence(Path(path).name.split(".")[0], points, mask, "m", True, reference, odometry, times)
-    return in_order_of_time(sequence, path)
-
-
-def _reference_and_odometry(log: CarmenLines) -> tuple[FloatArray | None, FloatArray | None]:
-    poses, odometry = np.array([line.pose for line in log.scans]), np.array([line.odometry for line in log.scans])
-    if log.is_newer:
-        # The second pose is that of the robot, on which the laser is fixed somewhere.
-        mounting = np.median(se2.relative(odometry, poses), axis=0)
-        odometry = np.asarray(se2.compose(odometry, np.broadcast_to(mounting, odometry.shape)))
-    are_equal = bool(np.abs(poses - odometry).max() < _SAME_POSE)
-    if not log.is_of_slam and ((are_equal and log.is_newer) or _is_at_wheels(log, poses)):
-        return None, odometry
-    return poses, None if are_equal else odometry
-
-
-def _is_at_wheels(log: CarmenLines, poses: FloatArray) -> bool:
-    """Returns True where most poses lie at the ODOM line next in time."""
-    if not len(log.odometry):
+def _is_at_wheels(lines: list[list[str]], poses: FloatArray, times: FloatArray) -> bool:
+    """Returns True where most poses lie at the ODOM line next in time; damaged lines do not count."""
+    wheels = []
+    for words in lines:
+        try:
+            row = [float(words[7]), *map(float, words[1:4])]
+        except (ValueError, IndexError):
+            continue
+        if np.isfinite(row).all():
+            wheels.append(row)
+    if not wheels:
         return False
-    ordered = log.odometry[np.argsort(log.odometry[:, 0], kind="stable")]
-    after = np.searchsorted(ordered[:, 0], [line.time for line in log.scans])
-    nearest = ordered[np.clip(after, 0, len(ordered) - 1)]
+    ordered = np.array(sorted(wheels, key=lambda row: row[0]))
+    nearest = ordered[np.clip(np.searchsorted(ordered[:, 0], times), 0, len(ordered) - 1)]
     return float(np.median(np.hypot(*(nearest[:, 1:3] - poses[:, :2]).T))) < _SAME_PLACE_M
 
 
-def _no_echo_limit(lines: list[ScanLine]) -> float:
-    largest = max(float(line.ranges.max()) for line in lines)
-    return largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
+def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
+    """Moves scans of another time to the positions of their time stamps.
+
+    Some published logs have lines with the scan, time stamp and odometry of another time, while their corrected poses
+    are in order. There the time stamps are out of order, and the odometry jumps by metres and back. Time and odometry
+    are interpolated where the stamp alone is wrong. Without any order of the stamps the sequence gets no times.
+    """
+    times, odometry, rows = sequence.times, sequence.odometry_poses, np.arange(len(sequence))
+    assert times is not None
+    if np.ptp(times) == 0:
+        return dataclasses.replace(sequence, times=None)
+    ordered = _longest_increasing(times)
+    late = np.setdiff1d(rows, ordered)
+    if 2 * len(late) > len(times):
+        _log.warning("%s: time stamps are in no order; lines stay in their order, times are dropped", path)
+        return dataclasses.replace(sequence, times=None)
+    moved = np.zeros(len(times), bool)
+    if odometry is not None:
+        by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
+        moved[late] = by_time < _SHORTER_WAY * by_row
+    if len(late):
+        message = "%s: %d of %d lines are of another moment; %d are moved to their time, the others are interpolated"
+        _log.warning(message, path, len(late), len(times), moved.sum())
+    known = np.union1d(ordered, np.flatnonzero(moved))
+    stamps = np.interp(rows, ordered, times[ordered])
+    stamps[known] = times[known]
+    order = np.argsort(stamps, kind="stable")
+    if odometry is not None:
+        odometry = _interpolated(odometry, ordered, known)
+    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=odometry)
+    return _carry_reference(repaired.take(order), moved[order])
+
+
+def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArray[np.int64]) -> FloatArray:
+    """Interpolates unknown odometry between the ordered lines."""
+    pose = odometry[ordered].copy()
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    between = np.column_stack([np.interp(np.arange(len(odometry)), ordered, column) for column in pose.T])
+    between[:, 2] = np.pi - (np.pi - between[:, 2]) % (2 * np.pi)
+    between[known] = odometry[known]
+    return between
+
+
+def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.int64], keys: FloatArray) -> FloatArray:
+    """Computes the increase of the path length by each late line, inserted at the position of its key."""
+    after = np.searchsorted(keys[ordered], keys[late])
+    before, after = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
+
+    def way(start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
+        step = se2.relative(odometry[start], odometry[end])
+        return np.hypot(step[:, 0], step[:, 1]) + np.abs(se2.wrap_angle(step[:, 2]))
+
+    return way(before, late) + way(late, after) - way(before, after)
+
+
+def _carry_reference(sequence: ScanSequence, moved: BoolArray) -> ScanSequence:
+    """Computes the reference of moved scans from the reference before and the odometry."""
+    reference, odometry = sequence.reference_poses, sequence.odometry_poses
+    if reference is None or odometry is None or not moved.any():
+        return sequence
+    rows = np.arange(len(moved))
+    before = np.maximum.accumulate(np.where(moved, -1, rows))
+    before = np.where(before < 0, np.flatnonzero(~moved)[0], before)
+    carried = se2.compose(reference[before], se2.relative(odometry[before], odometry))
+    return dataclasses.replace(sequence, reference_poses=np.where(moved[:, None], carried, reference))
+
+
+def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
+    """Finds the indices of the longest strictly increasing subsequence (patience sorting)."""
+    tails: list[float] = []
+    ends: list[int] = []
+    before = np.full(len(values), -1)
+    for index, value in enumerate(values.tolist()):
+        pile = bisect.bisect_left(tails, value)
+        tails[pile : pile + 1] = [value]
+        ends[pile : pile + 1] = [index]
+        before[index] = ends[pile - 1] if pile else -1
+    chain = [ends[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])

@@ -11,10 +11,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from dpmjax.io.array_files import parse_mat
 from dpmjax.io.files import natural_key, read_bytes, refusing
-from dpmjax.io.foreign_arrays import parse_mat
 from dpmjax.io.pcd import parse_pcd
-from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, require
+from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, pad_scans, require
 
 _PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
@@ -43,10 +43,9 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
     require(len(names) > 0, path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
     scans = [parse_pcd(files[name], f"{path}/{name}").points[:, :2] for name in names]
-    points = np.zeros((len(scans), max(len(scan) for scan in scans), 2), np.float32)
-    for row, scan in zip(points, scans, strict=True):
-        row[: len(scan)] = np.where(np.isfinite(scan).all(axis=1, keepdims=True), scan, 0)
-    mask = (points != 0).any(axis=2)
+    for scan in scans:
+        scan[~np.isfinite(scan).all(axis=1) | (scan == 0).all(axis=1)] = np.nan
+    points, mask = pad_scans(scans)
     found = "every point of every scan is zero (an invalid beam)"
     require(mask.any(), path, found, "give scans that measured something")
     largest = np.abs(points).max()

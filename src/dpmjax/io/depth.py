@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.io.array_files import parse_mat, read_depth_png
 from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
-from dpmjax.io.foreign_arrays import parse_mat, read_depth_png
 from dpmjax.io.poses import homogeneous
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 

@@ -15,11 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.io.files import read_lines, refusing, write_atomically
-from dpmjax.io.graph_tags import IGNORED, TAGS, advice_of, information_of, poses_of
+from dpmjax.io.files import is_number, read_lines, refusing, write_atomically
+from dpmjax.io.poses import homogeneous
 from dpmjax.pose_graph.chordal import spanning_tree_poses
 from dpmjax.pose_graph.graph import Edges, PoseGraph, is_semidefinite, nearest_semidefinite
 from dpmjax.sequences import FloatArray, InputError, require
+
+
+class _Tag(NamedTuple):
+    """A kind of line.
+
+    Attributes:
+        num_nodes: 1 for a vertex, 2 for an edge.
+        pose_size: numbers of its pose: x y heading, x y z roll pitch yaw, or x y z qx qy qz qw.
+        triangle: rows and columns of the information matrix, in the order of its numbers.
+    """
+
+    num_nodes: int
+    pose_size: int
+    triangle: tuple[NDArray[np.int64], NDArray[np.int64]] = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+    @property
+    def tangent_size(self) -> int:
+        """Degrees of freedom of the pose."""
+        return 3 if self.pose_size == 3 else 6
 
 
 class _Line(NamedTuple):
@@ -29,6 +48,33 @@ class _Line(NamedTuple):
     tag: str
     nodes: list[int]
     values: list[float]
+
+
+# The first four tags are of g2o, the others of TORO, which writes xx xy yy, then heading heading, x heading, y heading.
+_TAGS = {
+    "VERTEX_SE2": _Tag(1, 3),
+    "VERTEX_SE3:QUAT": _Tag(1, 7),
+    "EDGE_SE2": _Tag(2, 3, np.triu_indices(3)),
+    "EDGE_SE3:QUAT": _Tag(2, 7, np.triu_indices(6)),
+    "VERTEX2": _Tag(1, 3),
+    "VERTEX3": _Tag(1, 6),
+    "EDGE2": _Tag(2, 3, (np.array([0, 0, 1, 2, 0, 1]), np.array([0, 1, 1, 2, 2, 2]))),
+    "EDGE3": _Tag(2, 6, np.triu_indices(6)),
+}
+# EQUIV marks nodes that TORO may collapse on request; their edges stand in the file, too.
+_IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET", "EQUIV")
+_READ = "give VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO)"
+# Advice for other tags, by parts of their names.
+_OTHER_TAGS = {
+    (
+        "SWITCH",
+        "MAXMIX",
+    ): "switchable and mixture edges are not read: give plain edges, a robust kernel lets wrong ones go",
+    ("PRIOR",): "priors of single poses are not read: leave them out, and fix nodes with FIX",
+    ("XY", "LANDMARK", "POINT", "LINE", "PLANE", "BEARING", "CAM"): (
+        "landmarks are not read: leave their lines out; poses and edges between poses are optimised"
+    ),
+}
 
 
 def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
@@ -50,26 +96,127 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
             edge.
     """
     lines, fixed = _read_lines(path)
-    vertices = [line for line in lines if TAGS[line.tag].num_nodes == 1]
-    edge_lines = [line for line in lines if TAGS[line.tag].num_nodes == 2]
-    require(len(lines) > 0, path, "no vertices and no edges", advice_of(""))
+    vertices = [line for line in lines if _TAGS[line.tag].num_nodes == 1]
+    edge_lines = [line for line in lines if _TAGS[line.tag].num_nodes == 2]
+    require(len(lines) > 0, path, "no vertices and no edges", _READ)
     if vertices:
         ids = np.array([line.nodes[0] for line in vertices], np.int64)
     else:
         ids = np.unique([node for line in edge_lines for node in line.nodes])
     row_of = {int(node): row for row, node in enumerate(ids)}
-    size = TAGS[lines[0].tag].tangent_size
-    target, source = (_rows_of(path, edge_lines, row_of, end) for end in (0, 1))
+    size = _TAGS[lines[0].tag].tangent_size
+    for end in (0, 1):
+        for line in edge_lines:
+            found = f"node {line.nodes[end]} has no vertex"
+            require(line.nodes[end] in row_of, f"{path}: line {line.number}", found, "add its VERTEX line")
+    target, source = np.array([[row_of[node] for node in line.nodes] for line in edge_lines], np.int64).reshape(-1, 2).T
     measurements, information = _poses(path, edge_lines, size), _information(path, edge_lines, size, nearest_psd)
-    edges = Edges(source, target, measurements, information)
+    edges, poses = Edges(source, target, measurements, information), _poses(path, vertices, size)
     with (
         refusing(path, "node {error} has no vertex", "add its VERTEX line", (KeyError,)),
         refusing(path, "{error}", "mend the file", (ValueError,)),
     ):
         is_fixed = np.zeros(len(ids), bool)
         is_fixed[[row_of[int(node)] for node in fixed]] = True
-        poses = _poses(path, vertices, size) if vertices else spanning_tree_poses(len(ids), edges)
+        poses = poses if vertices else spanning_tree_poses(len(ids), edges)
         return PoseGraph.create(poses, edges, is_fixed=is_fixed, ids=ids)
+
+
+def _read_lines(path: str | Path) -> tuple[list[_Line], list[str]]:
+    """Reads vertices and edges in the order of the file, and the nodes after FIX."""
+    lines: list[_Line] = []
+    fixed: list[str] = []
+    for number, text in enumerate(read_lines(path), 1):
+        tag, *words = text.split() or ["#"]
+        if tag.startswith("#") or tag in _IGNORED:
+            continue
+        if tag == "FIX":
+            fixed += words
+            continue
+        source = f"{path}: line {number}"
+        advice = next((advice for parts, advice in _OTHER_TAGS.items() if any(part in tag for part in parts)), _READ)
+        require(tag in _TAGS, source, f"'{tag[:40]}' is not read here", advice)
+        if lines and _TAGS[lines[0].tag].tangent_size != _TAGS[tag].tangent_size:
+            found = f"'{tag}' is not read here, line {lines[0].number} is '{lines[0].tag}'"
+            raise InputError(source, found, "give a graph in the plane, or one in space")
+        lines.append(_parse(source, number, tag, words))
+    return lines, fixed
+
+
+def _parse(source: str, number: int, tag: str, words: list[str]) -> _Line:
+    """Parses a vertex or an edge from the words after its tag."""
+    num_nodes, pose_size, triangle = _TAGS[tag]
+    count = num_nodes + pose_size + len(triangle[0])
+    found = f"{len(words)} values after {tag}"
+    if len(words) == num_nodes + pose_size != count:
+        found += ", the information matrix is missing"
+    require(len(words) == count, source, found, f"give {count} values")
+    try:
+        nodes, values = [int(word) for word in words[:num_nodes]], [float(word) for word in words[num_nodes:]]
+    except ValueError as error:
+        kinds = [int] * num_nodes + [float] * (count - num_nodes)
+        wrong = next(i for i, (word, kind) in enumerate(zip(words, kinds, strict=True)) if not is_number(word, kind))
+        what = "a whole number" if wrong < num_nodes else "a number"
+        found = f"column {wrong + 2}, {words[wrong][:40]!r}, is not {what}"
+        raise InputError(source, found, "write plain numbers, with a decimal point") from error
+    is_small = max(map(abs, nodes)) <= np.iinfo(np.int64).max
+    require(is_small, source, "a node number above 2^63", "number the nodes from 0")
+    return _Line(number, tag, nodes, values)
+
+
+def _by_tag(lines: list[_Line]) -> Iterable[tuple[_Tag, NDArray[np.int64], FloatArray]]:
+    """Yields the numbers of the lines of each tag, with their indices among all lines."""
+    for tag in dict.fromkeys(line.tag for line in lines):
+        places = np.array([place for place, line in enumerate(lines) if line.tag == tag])
+        yield _TAGS[tag], places, np.array([lines[place].values for place in places])
+
+
+def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
+    """Returns the poses of vertices or edges, (n, 3) or (n, 4, 4), in the order of the file."""
+    poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
+    for tag, places, values in _by_tag(lines):
+        numbers = values[:, : tag.pose_size]
+        is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(numbers).all(axis=1))
+        lengths = np.linalg.norm(np.clip(numbers[:, 3:], -2, 2), axis=1)
+        is_good = is_finite & ((tag.pose_size != 7) | (np.abs(lengths - 1) <= 0.1))
+        if not is_good.all():
+            row = int(np.argmin(is_good))
+            found = "a quaternion that is not of length 1"
+            if not is_finite[row]:
+                found = f"expected finite numbers, got {numbers[row][~np.isfinite(numbers[row])][0]}"
+            raise InputError(f"{path}: line {lines[places[row]].number}", found, "mend the line")
+        if tag.pose_size == 3:
+            poses[places] = numbers
+        else:
+            angles, quaternions, is_euler = numbers[:, [5, 4, 3]], numbers[:, 3:], tag.pose_size == 6
+            turns = Rotation.from_euler("ZYX", angles) if is_euler else Rotation.from_quat(quaternions)
+            poses[places] = homogeneous(turns.as_matrix(), numbers[:, :3])
+    return poses
+
+
+def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray:
+    """Returns the information matrices in the order of the file."""
+    matrices = np.zeros((len(lines), size, size))
+    for tag, places, values in _by_tag(lines):
+        rows, columns = tag.triangle
+        places, numbers = places[:, None], values[:, tag.pose_size :]
+        matrices[places, rows, columns] = matrices[places, columns, rows] = numbers
+    is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(matrices.reshape(len(lines), size * size)).all(axis=1))
+    is_good = np.zeros(len(lines), bool)
+    is_good[is_finite] = is_semidefinite(matrices[is_finite])
+    if nearest_psd:
+        matrices[is_finite & ~is_good] = nearest_semidefinite(matrices[is_finite & ~is_good])
+        is_good = is_finite
+    if not is_good.all():
+        place = int(np.argmin(is_good))
+        why, advice = "not finite", "give expected finite numbers"
+        if is_finite[place]:
+            least = float(np.linalg.eigvalsh(matrices[place])[0])
+            why = f"not positive semidefinite, its least eigenvalue is {least:.4g}"
+            advice = "mend it, or take the nearest such matrix (nearest_psd=True, --nearest-psd)"
+        found = f"the information of edge {lines[place].nodes[0]} {lines[place].nodes[1]} is {why}"
+        raise InputError(f"{path}: line {lines[place].number}", found, advice)
+    return matrices
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
@@ -86,125 +233,15 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
         OSError: the folder cannot be written.
     """
     kind = "SE2" if graph.poses.ndim == 2 else "SE3:QUAT"
-    triangle = np.triu_indices(graph.tangent_size)
+    rows, columns = np.triu_indices(graph.tangent_size)
     edges = graph.edges
-    values = np.column_stack([_numbers(edges.measurements), edges.information[:, triangle[0], triangle[1]]])
+    values = np.column_stack([_numbers(edges.measurements), edges.information[:, rows, columns]])
     vertices = zip(graph.ids, _numbers(graph.poses), strict=True)
     lines = [_text(f"VERTEX_{kind}", (node,), pose) for node, pose in vertices]
     lines += [f"FIX {node}" for node in graph.ids[graph.is_fixed]]
-    for target, source, row in zip(graph.ids[edges.target], graph.ids[edges.source], values, strict=True):
-        lines.append(_text(f"EDGE_{kind}", (target, source), row))
+    ends = zip(graph.ids[edges.target], graph.ids[edges.source], strict=True)
+    lines += [_text(f"EDGE_{kind}", nodes, row) for nodes, row in zip(ends, values, strict=True)]
     return write_atomically(path, "\n".join(lines) + "\n")
-
-
-def _read_lines(path: str | Path) -> tuple[list[_Line], list[str]]:
-    """Reads vertices and edges in the order of the file, and the nodes after FIX."""
-    lines: list[_Line] = []
-    fixed: list[str] = []
-    for number, text in enumerate(read_lines(path), 1):
-        words = text.split()
-        if not words or words[0].startswith("#") or words[0] in IGNORED:
-            continue
-        tag = words[0]
-        if tag == "FIX":
-            fixed += words[1:]
-            continue
-        source = f"{path}: line {number}"
-        require(tag in TAGS, source, f"'{tag[:40]}' is not read here", advice_of(tag))
-        if lines and TAGS[lines[0].tag].tangent_size != TAGS[tag].tangent_size:
-            found = f"'{tag}' is not read here, line {lines[0].number} is '{lines[0].tag}'"
-            raise InputError(source, found, "give a graph in the plane, or one in space")
-        lines.append(_parse(source, number, words))
-    return lines, fixed
-
-
-def _parse(source: str, number: int, words: list[str]) -> _Line:
-    """Parses a vertex or an edge from its words."""
-    tag = TAGS[words[0]]
-    count = tag.num_nodes + tag.num_values
-    found = f"{len(words) - 1} values after {words[0]}"
-    if len(words) - 1 == tag.num_nodes + tag.pose_size != count:
-        found += ", the information matrix is missing"
-    require(len(words) - 1 == count, source, found, f"give {count} values")
-    kinds = [int] * tag.num_nodes + [float] * tag.num_values
-    numbers: list[float] = []
-    try:
-        numbers += [kind(word) for kind, word in zip(kinds, words[1:], strict=True)]
-    except ValueError as error:
-        wrong = next(i for i, kind in enumerate(kinds, 1) if not _is_number(kind, words[i]))
-        what = "a whole number" if wrong <= tag.num_nodes else "a number"
-        found = f"column {wrong + 1}, {words[wrong][:40]!r}, is not {what}"
-        raise InputError(source, found, "write plain numbers, with a decimal point") from error
-    nodes, values = [int(number) for number in numbers[: tag.num_nodes]], numbers[tag.num_nodes :]
-    is_small = max(map(abs, nodes)) <= np.iinfo(np.int64).max
-    require(is_small, source, "a node number above 2^63", "number the nodes from 0")
-    return _Line(number, words[0], nodes, values)
-
-
-def _is_number(kind: type[int | float], word: str) -> bool:
-    try:
-        kind(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _rows_of(path: str | Path, lines: list[_Line], row_of: dict[int, int], end: int) -> NDArray[np.int64]:
-    """Returns the rows of the first or the second node of each edge."""
-    for line in lines:
-        is_known = line.nodes[end] in row_of
-        require(is_known, f"{path}: line {line.number}", f"node {line.nodes[end]} has no vertex", "add its VERTEX line")
-    return np.array([row_of[line.nodes[end]] for line in lines], np.int64)
-
-
-def _by_tag(lines: list[_Line]) -> Iterable[tuple[str, list[int], FloatArray]]:
-    """Yields the numbers of the lines of each tag, with their indices among all lines."""
-    for tag in dict.fromkeys(line.tag for line in lines):
-        places = [place for place, line in enumerate(lines) if line.tag == tag]
-        yield tag, places, np.array([lines[place].values for place in places]).reshape(len(places), -1)
-
-
-def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
-    """Returns the poses of vertices or edges, in the order of the file."""
-    poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
-    for tag, places, values in _by_tag(lines):
-        numbers = values[:, : TAGS[tag].pose_size]
-        try:
-            poses[places] = poses_of(numbers)
-        except ValueError as error:
-            place = next(place for place, row in zip(places, numbers, strict=True) if not _is_pose(row[None]))
-            raise InputError(f"{path}: line {lines[place].number}", str(error), "mend the line") from error
-    return poses
-
-
-def _is_pose(numbers: FloatArray) -> bool:
-    try:
-        poses_of(numbers)
-    except ValueError:
-        return False
-    return True
-
-
-def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray:
-    """Returns the information matrices in the order of the file."""
-    matrices = np.zeros((len(lines), size, size))
-    for tag, places, values in _by_tag(lines):
-        matrices[places] = information_of(TAGS[tag], values[:, TAGS[tag].pose_size :])
-    is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(matrices.reshape(len(lines), size * size)).all(axis=1))
-    is_good = np.zeros(len(lines), bool)
-    is_good[is_finite] = is_semidefinite(matrices[is_finite])
-    if nearest_psd:
-        matrices[is_finite & ~is_good] = nearest_semidefinite(matrices[is_finite & ~is_good])
-        is_good = is_finite
-    if not is_good.all():
-        place = int(np.argmin(is_good))
-        line, is_number = lines[place], bool(is_finite[place])
-        least = float(np.linalg.eigvalsh(matrices[place])[0]) if is_number else 0.0
-        why = f"not positive semidefinite, its least eigenvalue is {least:.4g}" if is_number else "not finite"
-        found = f"the information of edge {line.nodes[0]} {line.nodes[1]} is {why}"
-        advice = "mend it, or take the nearest such matrix (nearest_psd=True, --nearest-psd)"
-        raise InputError(f"{path}: line {line.number}", found, advice if is_number else "give expected finite numbers")
-    return matrices
 
 
 def _numbers(poses: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,22 @@ from numpy.typing import NDArray
 
 from dpmjax.io.bags import is_bag
 from dpmjax.io.bin_columns import check_size, columns_of_drive
-from dpmjax.io.drives import Drive3D, find_pose_file, read_learned_folder, read_plain_folder, scan_files, stray_note
-from dpmjax.io.files import natural_key
-from dpmjax.io.lidar_datasets import read_kitti_360, read_kitti_carla, read_kitti_odometry, read_kitti_raw, read_mulran
-from dpmjax.io.messages import log_notes
+from dpmjax.io.files import log_notes, natural_key
+from dpmjax.io.lidar_datasets import (
+    Drive3D,
+    find_pose_file,
+    read_kitti_carla,
+    read_kitti_odometry,
+    read_learned_folder,
+    read_mulran,
+    read_plain_folder,
+    read_velodyne_points,
+)
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
 from dpmjax.io.scan_bags import open_lidar_bag
-from dpmjax.io.scan_file import read_point_times, read_points, unit_note
+from dpmjax.io.scan_file import read_point_times, read_timed_cloud, unit_note
+from dpmjax.io.scan_files import scan_files, stray_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
 _FORMATS = (
@@ -27,11 +34,16 @@ _FORMATS = (
     "(Ouster/), a KITTI-CARLA town (generated/frames), a folder of .bin .npy .npz .pcd .ply .las .laz scans, or a bag "
     "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
 )
-_CAPTURES = {
-    ".pcap": "a capture of packets",
-    ".pcapng": "a capture of packets",
-    ".osf": "a capture of an Ouster",
-}
+_CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
+# What a folder of a layout holds, the reader of the layout, and its folder of scans.
+_LAYOUTS: tuple[tuple[str, Callable[[Path], Drive3D], str], ...] = (
+    ("generated/frames", read_kitti_carla, "generated/frames"),
+    ("full_poses_lidar.txt", read_kitti_carla, "frames"),
+    ("Ouster", read_mulran, "Ouster"),
+    ("sensor_data/Ouster", read_mulran, "sensor_data/Ouster"),
+    ("velodyne_points", read_velodyne_points, "velodyne_points/data"),
+    ("velodyne", read_kitti_odometry, "velodyne"),
+)
 
 
 def open_lidar_sequence(
@@ -65,7 +77,7 @@ def open_lidar_sequence(
     path, poses = Path(path), None if poses is None else Path(poses)
     is_good = bin_columns is None or bin_columns >= 3
     require(is_good, path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
-    is_recording = is_bag(path) and (path.is_file() or _kind(path) is None)
+    is_recording = is_bag(path) and not _is_drive(path)
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
     whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
     note = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
@@ -79,20 +91,26 @@ def open_lidar_sequence(
 def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
     """Opens one drive in files."""
     drive = _read(path, poses)
-    require(len(drive.files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    notes: list[Note | None] = [stray_note(drive.files[0].parent), *drive.notes]
+    files = drive.files
+    require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
+    notes: list[Note | None] = [stray_note(files[0].parent), *drive.notes]
     if bin_columns is None:
-        columns = columns_of_drive(drive.files)
-        bin_columns = columns.num_columns
-        notes.append(columns.note)
-    sources, read_scan = tuple(map(str, drive.files)), partial(_read_scan, drive.files, bin_columns)
+        bin_columns, note = columns_of_drive(files)
+        notes.append(note)
+
+    def read_scan(index: int) -> NDArray[np.float32]:
+        points = read_timed_cloud(files[index], bin_columns).points
+        if index == 0 and (note := unit_note(points, files[index])) is not None:
+            log_notes([note])
+        return points
+
     return LidarSequence(
         drive.name,
-        sources,
+        tuple(map(str, files)),
         read_scan,
         drive.T_world_lidar,
         drive.times,
-        lambda index: read_point_times(sources[index]),
+        lambda index: read_point_times(files[index]),
         tuple(note for note in notes if note is not None),
     )
 
@@ -143,15 +161,7 @@ def list_lidar_sequences(path: str | Path) -> list[str]:
         Names for `open_lidar_sequence(path, sequence=name)`, in natural order; none where the path is a drive itself.
     """
     path = Path(path)
-    return [] if not path.is_dir() or _kind(path) is not None else sorted(_drives(path), key=natural_key)
-
-
-def _read_scan(files: list[Path], bin_columns: int, index: int) -> NDArray[np.float32]:
-    """Reads scan `index`; only the first one is checked for a wrong unit."""
-    points = read_points(files[index], bin_columns=bin_columns)
-    if index == 0 and (note := unit_note(points, files[index])) is not None:
-        log_notes([note])
-    return points
+    return [] if not path.is_dir() or _is_drive(path) else sorted(_drives(path), key=natural_key)
 
 
 def _choose(path: Path, sequence: str | None) -> Path:
@@ -159,9 +169,9 @@ def _choose(path: Path, sequence: str | None) -> Path:
     require(path.exists(), path, "no such file or folder", "check the path")
     capture = _CAPTURES.get(path.suffix.lower())
     converter = "convert it to a bag or to .pcd files with ouster-cli (Ouster) or velodyne-decoder (Velodyne)"
-    require(capture is None, path, f"{capture}, which is not read", converter)
+    require(capture is None, path, f"a capture of {capture}, which is not read", converter)
     require(not path.is_file(), path, "a single file", "give the folder that holds all scans of the drive")
-    is_drive = _kind(path) is not None
+    is_drive = _is_drive(path)
     if sequence is None and is_drive:
         return path
     drives = _drives(path)
@@ -184,46 +194,25 @@ def _drives(path: Path) -> dict[str, Path]:
         if (path / below).is_dir():
             return _drives(path / below)
     children = [child for child in sorted(path.iterdir()) if child.is_dir()]
+    found = {child.name: child for child in children if _is_drive(child)}
     deeper = (folder for child in children for folder in sorted(child.iterdir()) if folder.is_dir())
-    found = {child.name: child for child in children if _kind(child) is not None}
-    return found or {f"{folder.parent.name}/{folder.name}": folder for folder in deeper if _kind(folder) is not None}
+    return found or {f"{folder.parent.name}/{folder.name}": folder for folder in deeper if _is_drive(folder)}
 
 
-# Reader of each kind of drive, and its folder of scans.
-_LAYOUTS: dict[str, tuple[Callable[[Path], Drive3D], str]] = {
-    "kitti_carla": (read_kitti_carla, "generated/frames"),
-    "mulran": (read_mulran, "Ouster"),
-    "kitti_360": (read_kitti_360, "velodyne_points/data"),
-    "kitti_raw": (read_kitti_raw, "velodyne_points/data"),
-    "kitti_odometry": (read_kitti_odometry, "velodyne"),
-    "learned": (read_learned_folder, ""),
-    "plain": (read_plain_folder, ""),
-    "plain_data": (lambda path: _read_plain(path, "data", None), "data"),
-}
-
-
-def _read_plain(path: Path, scans: str, poses: Path | None) -> Drive3D:
-    """Lists a plain folder of scans below that of the drive."""
-    return read_plain_folder(path / scans, poses=poses)._replace(name=path.resolve().name)
-
-
-def _kind(path: Path) -> str | None:
-    """Finds the layout of a folder by its files; None for none."""
-    if (path / "generated" / "frames").is_dir() or (path / "full_poses_lidar.txt").is_file():
-        return "kitti_carla"
-    if (path / "Ouster").is_dir() or (path / "sensor_data" / "Ouster").is_dir():
-        return "mulran"
-    if (path / "velodyne_points").is_dir():
-        return "kitti_360" if path.resolve().parent.name == "data_3d_raw" else "kitti_raw"
-    if (path / "velodyne").is_dir():
-        return "kitti_odometry"
-    if files := scan_files(path):
-        return "learned" if files[0].suffix.lower() == ".npz" else "plain"
-    return "plain_data" if scan_files(path / "data") else None
+def _is_drive(path: Path) -> bool:
+    """Returns True for a folder of a known layout, or with scans in it or in data/."""
+    is_known = any((path / marker).exists() for marker, _, _ in _LAYOUTS)
+    return is_known or bool(scan_files(path) or scan_files(path / "data"))
 
 
 def _read(path: Path, poses: Path | None) -> Drive3D:
     """Lists the drive in a folder; a given pose file replaces that of the data set."""
-    kind = _kind(path) or "plain"
-    read, scans = _LAYOUTS[kind]
-    return read(path) if poses is None else _read_plain(path, scans, poses)
+    layout = next((layout for layout in _LAYOUTS if (path / layout[0]).exists()), None)
+    if layout is not None and poses is None:
+        return layout[1](path)
+    files = scan_files(path)
+    if files and files[0].suffix.lower() == ".npz" and layout is None and poses is None:
+        return read_learned_folder(path)
+    beside = "" if files or not scan_files(path / "data") else "data"
+    scans = beside if layout is None else layout[2]
+    return read_plain_folder(path / scans, poses=poses)._replace(name=path.resolve().name)

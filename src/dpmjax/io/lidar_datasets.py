@@ -1,41 +1,135 @@
-"""Drives of data sets in their published layouts: KITTI odometry, KITTI raw, KITTI-360, KITTI-CARLA, MulRan."""
+"""Drives of 3-D scans in files: plain folders, and data sets in their published layouts."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.drives import Drive3D, find_pose_file, read_camera_calibration, read_labelled_numbers, scan_files
+from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
-from dpmjax.io.references import match_poses, match_reference, match_rows, match_times, numbers_of
-from dpmjax.sequences import FloatArray, InputError, require
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses, read_stamped_poses
+from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
+from dpmjax.io.scan_files import POSE_FILES, match_rows, numbers_of, scan_files
+from dpmjax.sequences import FloatArray, InputError, Note, require
 
+# Axes of a camera that looks along x of the lidar: x right, y down, z forward.
+_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
 # MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
 _MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
 _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
+_MULRAN_SLACK_S = 0.5
+
+
+class Drive3D(NamedTuple):
+    """The files of a drive, one a scan in order, with poses and times where there are any.
+
+    Attributes:
+        name: name for titles.
+        files: the scans.
+        T_world_lidar: (n, 4, 4), NaN for scans without a pose; or None.
+        times: (n,) s, or None.
+        notes: decisions about the files, and doubts.
+    """
+
+    name: str
+    files: list[Path]
+    T_world_lidar: FloatArray | None = None
+    times: FloatArray | None = None
+    notes: tuple[Note, ...] = ()
+
+
+def find_pose_file(*homes: Path) -> Path | None:
+    """Returns the first file of reference poses in these folders by the usual names; None where there is none."""
+    return next((home / name for home in homes for name in POSE_FILES if (home / name).is_file()), None)
+
+
+def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
+    """Lists a folder of scans in the order of their numbers, with a pose file and times.txt beside or above them.
+
+    Args:
+        folder: the scans.
+        poses: the pose file; None looks for the usual names in the folder and the one above. Poses that move as those
+            of a camera come into the lidar's frame where a calib.txt with `Tr` lies beside.
+
+    Returns:
+        The drive.
+
+    Raises:
+        InputError: broken files, or poses that match the scans neither by time nor by number.
+    """
+    files = scan_files(folder)
+    homes = [folder, folder.resolve().parent] if folder.name in ("data", "scans", "lidar", "velodyne") else [folder]
+    path = poses or find_pose_file(*homes)
+    times, notes = scan_times(homes, files)
+    drive = Drive3D(folder.resolve().name, files, None, times, notes)
+    if path is None:
+        return drive
+    T, pose_notes = match_reference(read_stamped_poses(path), times, len(files), path)
+    calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
+    if calibration is not None and camera_note(T, path) is not None:
+        T_cam0_lidar = _read_camera_calibration(calibration)
+        T = rigid.inverse(T_cam0_lidar) @ T @ T_cam0_lidar
+    return drive._replace(T_world_lidar=T, notes=(*drive.notes, *pose_notes))
+
+
+def read_learned_folder(folder: Path) -> Drive3D:
+    """Lists a folder of N.npz with lidar_pcd, ego_rotation and ego_translation (DeepPointMap's published data).
+
+    Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
+    """
+    files = scan_files(folder, (".npz",))
+    keys = ("ego_rotation", "ego_translation")
+    poses: list[FloatArray | None] = []
+    for file in files:
+        try:
+            table = load_arrays(file, keys)
+        except InputError:  # The scan is damaged, too, and a warning names it when it is read.
+            poses.append(poses[-1] if poses else None)
+            continue
+        parts = [table.get(key, np.zeros(0)) for key in keys]
+        if [part.size for part in parts] != [9, 3] or any(part.dtype.kind not in "fiu" for part in parts):
+            return read_plain_folder(folder)
+        poses.append(homogeneous(*(part.astype(np.float64).reshape(3, -1).squeeze() for part in parts)))
+    drive = Drive3D(folder.resolve().name, files)
+    known = next((pose for pose in poses if pose is not None), None)
+    if known is None:
+        return drive
+    stacked = np.stack([known if pose is None else pose for pose in poses])
+    return drive._replace(T_world_lidar=check_poses(stacked, folder))
+
+
+def read_lidar_trajectory(path: str | Path) -> FloatArray:
+    """Reads the poses of a drive; those of a camera, which moves along its z axis, are turned into the lidar's axes.
+
+    Args:
+        path: rows of TUM or KITTI, metres.
+
+    Returns:
+        (n, 4, 4) poses, x forward, y left, z up.
+
+    Raises:
+        InputError: no such file, planar poses, or another layout.
+    """
+    path = Path(path)
+    advice = "give poses in space: TUM (stamp tx ty tz qx qy qz qw) or KITTI (12 numbers a row)"
+    require(read_table(path).shape[1] > 3, path, "rows of 3 columns", advice)
+    T = read_poses(path)
+    return T if camera_note(T, path) is None else rigid.inverse(_T_CAM0_LIDAR) @ T @ _T_CAM0_LIDAR
 
 
 def read_kitti_odometry(folder: Path) -> Drive3D:
-    """Lists a sequence of KITTI odometry.
+    """Lists a sequence of KITTI odometry: velodyne/, times.txt, and poses.
 
     Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
-    poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up. Last come files of other usual names,
-    in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the scans.
-
-    Args:
-        folder: the folder that holds velodyne/.
-
-    Returns:
-        The drive; poses in the lidar's frame, world = first lidar frame where the first camera pose is the identity.
-
-    Raises:
-        InputError: camera poses without `Tr` in calib.txt, or broken files.
+    poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up; they need `Tr` in calib.txt. Last
+    come files of other usual names, in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the
+    scans.
     """
     files = scan_files(folder / "velodyne")
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
@@ -46,7 +140,7 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
         return drive
     found = read_stamped_poses(path)
     if path in in_camera:
-        T_cam0_lidar = read_camera_calibration(folder / "calib.txt")
+        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
         found = found._replace(poses=rigid.inverse(T_cam0_lidar) @ found.poses @ T_cam0_lidar)
     if found.stamps is None:
         return drive._replace(T_world_lidar=match_poses(found.poses, files, path))
@@ -54,57 +148,47 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     return drive._replace(T_world_lidar=T, notes=notes)
 
 
-def read_kitti_raw(folder: Path) -> Drive3D:
-    """Lists a drive of KITTI raw: velodyne_points/data, oxts/data, and calib_imu_to_velo.txt in the folder of the day.
-
-    Args:
-        folder: DAY_drive_NNNN_sync.
-
-    Returns:
-        The drive; the world is the first lidar frame.
-
-    Raises:
-        InputError: GPS/IMU records without calibration, or broken files.
-    """
+def read_velodyne_points(folder: Path) -> Drive3D:
+    """Lists a drive of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
     files = scan_files(folder / "velodyne_points" / "data")
-    stamps = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
+    times = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
+    drive = Drive3D(folder.resolve().name, files, times=times)
+    is_kitti_360 = folder.resolve().parent.name == "data_3d_raw"
+    return _with_kitti_360_poses(drive, folder) if is_kitti_360 else _with_oxts_poses(drive, folder)
+
+
+def _with_oxts_poses(drive: Drive3D, folder: Path) -> Drive3D:
+    """Adds the poses of KITTI raw: oxts/data, and calib_imu_to_velo.txt in the folder of the day."""
     home = folder / "oxts" / "data"
     records = sorted(home.glob("*.txt"), key=lambda record: natural_key(record.name))
-    if not records or not files:
-        return Drive3D(folder.resolve().name, files, times=stamps)
+    if not records or not drive.files:
+        return drive
     candidates = [parent / "calib_imu_to_velo.txt" for parent in (folder, folder.resolve().parent)]
     calibration = next((path for path in candidates if path.is_file()), None)
     if calibration is None:
         advice = "put the calibration of the day (calib_imu_to_velo.txt) into the folder above"
         raise InputError(folder, "GPS/IMU records but no calib_imu_to_velo.txt", advice)
-    table = np.vstack([_first_row(record, 6) for record in records])
-    T_world_lidar = _poses_from_oxts(table, home) @ rigid.inverse(_read_imu_calibration(calibration))
+    entries = read_labelled_numbers(calibration)
+    turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
+    is_good = len(turn) == 9 and len(shift) == 3
+    require(is_good, calibration, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
+    T_lidar_imu = check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), calibration)[0]
+    T_world_imu = _poses_from_oxts(np.vstack([_first_row(record, 6) for record in records]), home)
     # A drive may lack scans that have a record: poses are matched by number.
-    poses = match_poses(T_world_lidar, files, home)
-    return Drive3D(folder.resolve().name, files, rigid.inverse(poses[0]) @ poses, stamps)
+    poses = match_poses(T_world_imu @ rigid.inverse(T_lidar_imu), drive.files, home)
+    return drive._replace(T_world_lidar=rigid.inverse(poses[0]) @ poses)
 
 
-def read_kitti_360(folder: Path) -> Drive3D:
-    """Lists a drive of KITTI-360: data_3d_raw/DRIVE/velodyne_points/data, data_poses/DRIVE/poses.txt, calibration/.
+def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
+    """Adds the poses of KITTI-360: data_poses/DRIVE/poses.txt and calibration/ beside data_3d_raw/.
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
     after the last pose are left out.
-
-    Args:
-        folder: the drive's folder in data_3d_raw.
-
-    Returns:
-        The drive; the world is the first lidar frame.
-
-    Raises:
-        InputError: poses without calibration, or broken files.
     """
-    files = scan_files(folder / "velodyne_points" / "data")
-    stamps = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
-    name, root = folder.resolve().name, folder.resolve().parents[1]
-    path = root / "data_poses" / name / "poses.txt"
+    root = folder.resolve().parents[1]
+    path = root / "data_poses" / drive.name / "poses.txt"
     if not path.is_file():
-        return Drive3D(name, files, times=stamps)
+        return drive
     rows = _read_rows(path, "KITTI-360's poses.txt: frame and 12 numbers")
     calibration = root / "calibration" / "calib_cam_to_pose.txt"
     numbers = read_labelled_numbers(calibration).get("image_00", np.zeros(0))
@@ -113,22 +197,15 @@ def read_kitti_360(folder: Path) -> Drive3D:
     calibration = root / "calibration" / "calib_cam_to_velo.txt"
     T_lidar_cam0 = from_rows(_first_row(calibration, 12), calibration)
     T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
-    frames = np.array(_require_numbers(files), np.float64)
-    return _interpolate(Drive3D(name, files, times=stamps), frames, rows[:, 0], T_world_lidar, path)
+    frames = np.array(_require_numbers(drive.files), np.float64)
+    return _interpolate(drive, frames, (rows[:, 0], T_world_lidar), path)
 
 
 def read_kitti_carla(folder: Path) -> Drive3D:
     """Lists a drive of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
 
-    Args:
-        folder: TownNN, or its generated/.
-
-    Returns:
-        The drive. Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the
-        motion of the car during a turn.
-
-    Raises:
-        InputError: broken files, or fewer poses than frames.
+    Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
+    during a turn.
     """
     home = folder / "generated" if (folder / "generated").is_dir() else folder
     files = scan_files(home / "frames", (".ply",))
@@ -146,14 +223,7 @@ def read_kitti_carla(folder: Path) -> Drive3D:
 def read_mulran(folder: Path) -> Drive3D:
     """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
-    Args:
-        folder: the folder that holds Ouster/ or sensor_data/Ouster/.
-
-    Returns:
-        The drive; the world is the first lidar frame. Scans half a second or more outside of the poses are left out.
-
-    Raises:
-        InputError: broken files.
+    The world is the first lidar frame. Scans half a second or more outside of the poses are left out.
     """
     from scipy.spatial.transform import Rotation
 
@@ -170,18 +240,18 @@ def read_mulran(folder: Path) -> Drive3D:
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
     T_car_lidar = homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    T_world_lidar = from_rows(rows[:, 1:], path) @ T_car_lidar
-    return _interpolate(drive, times, pose_times, T_world_lidar, path, slack=0.5)
+    poses = from_rows(rows[:, 1:], path) @ T_car_lidar
+    return _interpolate(drive, times, (pose_times, poses), path, slack=_MULRAN_SLACK_S)
 
 
 def _interpolate(
-    drive: Drive3D, wanted: FloatArray, times: FloatArray, poses: FloatArray, path: Path, *, slack: float = 0.0
+    drive: Drive3D, wanted: FloatArray, stamped: tuple[FloatArray, FloatArray], path: Path, *, slack: float = 0.0
 ) -> Drive3D:
     """Selects the scans within `slack` of the times of the poses, with interpolated poses relative to the first."""
-    times, first = np.unique(times, return_index=True)
+    times, first = np.unique(stamped[0], return_index=True)
     kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
     require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
-    found = interpolate_poses(times, poses[first], wanted[kept])
+    found = interpolate_poses(times, stamped[1][first], wanted[kept])
     stamps = None if drive.times is None else drive.times[kept]
     # In the frame of the first, without the 1e6 m of national grids.
     return Drive3D(drive.name, [drive.files[i] for i in kept], rigid.inverse(found[0]) @ found, stamps)
@@ -209,6 +279,27 @@ def _read_rows(path: Path, layout: str) -> FloatArray:
     return rows
 
 
+def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
+    """Reads the lines `key: numbers` of a calibration file; other lines are ignored."""
+    found = {}
+    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
+        try:
+            found[key.strip()] = np.array(numbers.split(), np.float64)
+        except ValueError:
+            continue
+    return found
+
+
+def _read_camera_calibration(path: Path) -> FloatArray:
+    """Reads `Tr`, the lidar's frame to the left grey camera's, `T_cam0_lidar` (4, 4), out of KITTI's calib.txt."""
+    entries = read_labelled_numbers(path)
+    rows = next((entries[k] for k in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam") if len(entries.get(k, ())) == 12), None)
+    if rows is None:
+        advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+        raise InputError(path, "no line 'Tr:' of 12 numbers", advice)
+    return np.asarray(from_rows(rows, path)[0])
+
+
 def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
     """Reads KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337), s from the first; None if it does not fit."""
     try:
@@ -220,15 +311,6 @@ def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
         return None
     matched = match_rows(stamps, files)
     return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
-
-
-def _read_imu_calibration(path: Path) -> FloatArray:
-    """Reads a matrix (4, 4) from KITTI raw's `R:` and `T:` lines."""
-    entries = read_labelled_numbers(path)
-    turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
-    is_good = len(turn) == 9 and len(shift) == 3
-    require(is_good, path, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
-    return check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), path)[0]
 
 
 def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:

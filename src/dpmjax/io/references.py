@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.io.files import read_table
 from dpmjax.io.poses import StampedPoses, interpolate_poses
-from dpmjax.io.scan_names import stamps_in_names, stem_of
+from dpmjax.io.scan_files import match_rows, stamps_in_names
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, require
 
 # Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.
@@ -22,6 +21,8 @@ _UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
 _LARGEST_STAMP = 1e20
 # A lidar moves along its x axis, a camera along its z axis: least share of the squared distance, and least distance, m.
 _CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
+# Largest height, roll and pitch of relations in the plane, metres and radians.
+_FLAT = 1e-3
 
 
 class Reference(NamedTuple):
@@ -34,35 +35,6 @@ class Reference(NamedTuple):
 
     T_world_lidar: FloatArray
     notes: tuple[Note, ...] = ()
-
-
-def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
-    """Returns the numbers in the names of files.
-
-    Args:
-        files: the scans.
-        largest: largest valid number.
-
-    Returns:
-        One number a file, or None where a name is no number or too large.
-    """
-    names = [stem_of(file) for file in files]
-    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
-    return [int(name) for name in names] if is_good else None
-
-
-def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None:
-    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
-
-    Args:
-        rows: (m, ...) values.
-        files: the n scans.
-
-    Returns:
-        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
-    """
-    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
-    return None if numbers is None else rows[list(numbers)]
 
 
 def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatArray:
@@ -119,19 +91,19 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     Returns:
         (n,) s or None, and a note where times.txt does not fit.
     """
-    path = next((home / "times.txt" for home in homes if (home / "times.txt").is_file()), None)
-    notes: tuple[Note, ...] = ()
-    if path is not None:
-        try:
-            stamps = read_table(path)[:, 0]
-            if len(stamps) == len(files) and _are_times(stamps):
-                return to_seconds(stamps), ()
-            found = f"{len(stamps)} rows, or some that are no times, for {len(files)} scans"
-        except InputError as error:
-            found = error.found
-        notes = (Note(f"{path}: {found}; these times are not used", is_doubt=True),)
     named = stamps_in_names(files)
-    return (None if named is None else to_seconds(named)), notes
+    in_names = None if named is None else to_seconds(named)
+    path = next((home / "times.txt" for home in homes if (home / "times.txt").is_file()), None)
+    if path is None:
+        return in_names, ()
+    try:
+        stamps = read_table(path)[:, 0]
+        if len(stamps) == len(files) and _are_times(stamps):
+            return to_seconds(stamps), ()
+        found = f"{len(stamps)} rows, or some that are no times, for {len(files)} scans"
+    except InputError as error:
+        found = error.found
+    return in_names, (Note(f"{path}: {found}; these times are not used", is_doubt=True),)
 
 
 def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
@@ -176,17 +148,16 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
         T = np.full((num_scans, 4, 4), np.nan)
         T[stamps.astype(np.int64)] = found.poses
         return Reference(T, _note_of(path, "the numbers that are their stamps", T))
-    reason = "the file has no times" if stamps is None else "the scans have no times"
+    reason, is_doubt = "the file has no times" if stamps is None else "the scans have no times", False
     if stamps is not None and times is not None:
         T, tolerance_s = _by_time(to_seconds(stamps), found.poses, times)
         if np.isfinite(T[:, 0, 0]).any():
             return Reference(T, _note_of(path, f"time, tolerance {tolerance_s:.3g} s", T))
-        reason = "no scan has the time of a pose"
+        reason, is_doubt = "no scan has the time of a pose", True
     advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
     require(count == num_scans, path, f"{count} poses for {num_scans} scans, and {reason}", advice)
-    is_doubt = reason == "no scan has the time of a pose"
-    notes = (Note(f"{path}: {reason}; poses are matched by their order", is_doubt),) if is_doubt else ()
-    return Reference(found.poses, notes)
+    note = Note(f"{path}: {reason}; poses are matched by their order", is_doubt=True)
+    return Reference(found.poses, (note,) if is_doubt else ())
 
 
 def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
@@ -248,10 +219,6 @@ def _note_of(path: Path, how: str, T: FloatArray) -> tuple[Note, ...]:
     return (Note(text, is_doubt=num_without > 0),)
 
 
-_ADVICE = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
-_FLAT = 1e-3
-
-
 def read_relations(path: str | Path) -> Relations:
     """Reads relations in the plane.
 
@@ -266,7 +233,8 @@ def read_relations(path: str | Path) -> Relations:
             that leave the plane.
     """
     table = read_table(path)
-    require(table.shape[1] == 8, path, f"{table.shape[-1]} numbers a line, not 8", _ADVICE)
+    advice = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
+    require(table.shape[1] == 8, path, f"{table.shape[-1]} numbers a line, not 8", advice)
     require(bool(np.isfinite(table).all()), path, "NaN or infinite values", "remove the line")
     is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
     require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")

@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
+import io
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.io.array_files import load_arrays, to_float32
 from dpmjax.io.bin_columns import find_columns, read_bin
-from dpmjax.io.clouds import TimedCloud
-from dpmjax.io.drives import SCAN_SUFFIXES
-from dpmjax.io.files import load_arrays, read_bytes, to_float32
-from dpmjax.io.las import read_las
-from dpmjax.io.messages import log_notes
+from dpmjax.io.clouds import TimedCloud, parse_ply
+from dpmjax.io.files import import_for, log_notes, read_bytes, refusing
 from dpmjax.io.pcd import parse_pcd
-from dpmjax.io.ply import parse_ply
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
 
-_NPZ_KEYS = ("lidar_pcd", "points", "xyz", "arr_0")
-_NPZ_TIMES = "times"
+SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
+_NPZ_KEYS, _NPZ_TIMES = ("lidar_pcd", "points", "xyz", "arr_0"), "times"
 # Least range, usual range and largest range of lidars on the ground, m; nearly all points are within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
 _LEAST_USUAL_SHARE = 0.05
 # Points in map coordinates are nearer to their middle than to the origin by this factor.
 _MAP_RATIO = 5.0
+_LAS_ADVICE = "copy the file again, or save it anew as LAS 1.2 or 1.4"
+# LAZ packs a point of 20 bytes or more to 3, and to less only where all points are alike.
+_MOST_POINTS_PER_BYTE = 100
+# The least length of a variable length record.
+_RECORD_BYTES = 54
+# Types of the compressed items of a point with fixed lengths, in bytes; byte items have any length.
+_ITEM_BYTES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
+_BYTE_ITEMS = (0, 14)
 
 
 def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
@@ -44,7 +52,7 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
         InputError: names the file and the fault: missing, truncated, wrong columns, no points, no point in range,
             lengths in millimetres, or coordinates of a map such as UTM.
     """
-    points = read_points(path, bin_columns=bin_columns)
+    points = read_timed_cloud(Path(path), bin_columns).points
     log_notes(scan_notes(path, points, bin_columns=bin_columns))
     return points
 
@@ -69,22 +77,6 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
     return [note for note in (columns, unit_note(points, path)) if note is not None]
 
 
-def read_points(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
-    """Reads a scan as `read_lidar_file`, without warnings.
-
-    Args:
-        path: the file.
-        bin_columns: numbers a point has in a `.bin` file; None infers it from the values.
-
-    Returns:
-        (n, 3) float32, m.
-
-    Raises:
-        InputError: see `read_lidar_file`.
-    """
-    return read_timed_cloud(Path(path), bin_columns).points
-
-
 def read_point_times(path: str | Path) -> FloatArray | None:
     """Reads the times of the points of a scan.
 
@@ -93,8 +85,8 @@ def read_point_times(path: str | Path) -> FloatArray | None:
             a `.las` or `.laz` with GPS times, or a `.npz` with an array `times`.
 
     Returns:
-        (n,) times of the points of `read_points`, in the unit and from the origin of the file; None where it has none,
-        and for all other kinds of files.
+        (n,) times of the points of `read_lidar_file`, in the unit and from the origin of the file; None where it has
+        none, and for all other kinds of files.
 
     Raises:
         InputError: see `read_lidar_file`.
@@ -117,16 +109,16 @@ def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
         InputError: see `read_lidar_file`.
     """
     suffix = path.suffix.lower()
-    if suffix == ".bin":
-        return check_scan(TimedCloud(read_bin(path, bin_columns), None), path)
-    if suffix in (".pcd", ".ply"):
-        content, source = read_bytes(path), str(path)
-        return check_scan(parse_pcd(content, source) if suffix == ".pcd" else parse_ply(content, source), path)
-    if suffix in (".las", ".laz"):
-        return check_scan(read_las(path), path)
     found = f"an unknown kind of scan, {suffix or 'without ending'}"
     require(suffix in SCAN_SUFFIXES, path, found, f"give one of {' '.join(SCAN_SUFFIXES)}")
-    return check_scan(_read_arrays(path), path)
+    if suffix == ".bin":
+        cloud = TimedCloud(read_bin(path, bin_columns), None)
+    elif suffix in (".npy", ".npz"):
+        cloud = _read_arrays(path)
+    else:
+        parse = {".pcd": parse_pcd, ".ply": parse_ply}.get(suffix, _parse_las)
+        cloud = parse(read_bytes(path), str(path))
+    return check_scan(cloud, path)
 
 
 def _read_arrays(path: Path) -> TimedCloud:
@@ -147,6 +139,54 @@ def _read_arrays(path: Path) -> TimedCloud:
         require(fits, path, found, "give one time a point")
         times = np.asarray(column, np.float64).ravel()
     return TimedCloud(to_float32(points[:, :3]), times)
+
+
+def _parse_las(content: bytes, source: str) -> TimedCloud:
+    """Reads the points of a LAS or LAZ file by laspy (extra `las`), with GPS times where the point format has them."""
+    laspy = import_for(source, "laspy", "las")
+    require(content[:4] == b"LASF", source, "no LAS header", _LAS_ADVICE)
+    options = {"laz_backend": (laspy.LazBackend.Lazrs,), "read_evlrs": False}
+    try:
+        # Damaged headers raise many kinds of errors.
+        with refusing(source, "not a readable LAS file ({kind}: {error})", _LAS_ADVICE, (Exception,)):
+            header_size, start, num_records = struct.unpack_from("<HII", content, 94)
+            if not header_size + num_records * _RECORD_BYTES <= start <= len(content):
+                found = f"{num_records} records before the points, which begin at byte {start} of {len(content)}"
+                raise ValueError(found)
+            with np.errstate(all="ignore"), laspy.open(io.BytesIO(content), **options) as reader:
+                _require_whole(reader.header, content)
+                cloud = reader.read()
+                points = to_float32(np.stack([cloud.x, cloud.y, cloud.z], axis=1))
+                has_times = "gps_time" in cloud.point_format.dimension_names
+                return TimedCloud(points, np.asarray(cloud.gps_time, np.float64) if has_times else None)
+    except BaseException as error:
+        # A panic of the decompressor, which is written in Rust, is no Exception.
+        if type(error).__name__ == "PanicException":
+            raise InputError(source, f"not a readable LAS file ({error})", _LAS_ADVICE) from error
+        raise
+
+
+def _require_whole(header: Any, content: bytes) -> None:
+    """Raises a ValueError where a file is shorter than its header says, or its compression is damaged."""
+    count, size = int(header.point_count), len(content)
+    start, width = int(header.offset_to_point_data), int(header.point_format.size)
+    is_packed = header.are_points_compressed
+    if not (count <= _MOST_POINTS_PER_BYTE * size if is_packed else start + count * width <= size):
+        raise ValueError(f"truncated: {count} points, {size} bytes are there")
+    if not is_packed:
+        return
+    # The decompressor reserves memory by the number in the table of chunks, and ends the process where it fails.
+    (place,) = struct.unpack_from("<q", content, start)
+    (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
+    version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
+    if version != 0 or num_chunks > size:
+        raise ValueError("no table of its compressed chunks")
+    record = header.vlrs.get("LasZipVlr")[0].record_data
+    (num_items,) = struct.unpack_from("<H", record, 32)
+    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(num_items)]
+    is_known = all(wide == _ITEM_BYTES.get(kind, wide if kind in _BYTE_ITEMS else None) for kind, wide in items)
+    if not items or not is_known or sum(wide for _, wide in items) != width:
+        raise ValueError(f"points of {width} bytes in compressed items {items}")
 
 
 def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:

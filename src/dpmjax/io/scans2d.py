@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.io.array_files import load_arrays, to_float32
 from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.files import load_arrays, read_bytes, to_float32
-from dpmjax.io.messages import log_notes
+from dpmjax.io.files import log_notes, read_bytes
 from dpmjax.io.poses import check_poses
 from dpmjax.io.scan_bags import read_scan_bag
 from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
@@ -24,8 +24,9 @@ Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
 _FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, a bag of ROS, or .npy / .npz arrays"
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
+# Endings of the kinds of files; a folder of scans is of the first kind.
 _ENDINGS = {"folder": (".tar", ".tar.gz", ".tgz"), "arrays": (".npy", ".npz")}
-_ENDINGS |= {"carmen": (".log", ".clf", ".log.gz", ".clf.gz")}
+_ENDINGS |= {"CARMEN log": (".log", ".clf", ".log.gz", ".clf.gz")}
 # Median ranges outside of these are a mistaken unit: millimetres, or pixels / 512.
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
@@ -72,46 +73,40 @@ def read_sequence(
     is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
     require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
-    whole = _read_any(path, unit, max_range, topic)
+    whole = _read(path, unit, max_range, topic)
     whole = _without_maxima(whole, path) if max_range is None else _limit(whole, max_range)
     sequence = whole.take(slice(start, stop, stride))
     found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
     require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
     _check_beams(sequence, path, start, stride)
-    doubt = _check_unit(sequence, path)
+    sequence = replace(sequence, notes=(*sequence.notes, *_check_unit(sequence, path)))
     if whole.odometry_poses is None and whole.unit == "m":
         _log.info("%s: no raw odometry", path)
-    sequence = replace(sequence, notes=(*sequence.notes, *doubt))
     log_notes(sequence.notes)
     return sequence
 
 
-def _read_any(path: Path, unit: Unit | None, max_range: float | None, topic: str | None) -> ScanSequence:
+def _read(path: Path, unit: Unit | None, max_range: float | None, topic: str | None) -> ScanSequence:
     require(path.exists(), path, "no such file or folder", "check the path")
     kind = _detect(path)
     require(topic is None or kind == "bag", path, "no bag of ROS", "leave the topic out")
-    if kind == "bag":
-        require(unit != "px", path, "a bag is in metres, not px", "leave the unit out")
-        return read_scan_bag(path, topic)
     if kind == "folder":
         return read_deepmapping_folder(path, unit=unit)
     if kind == "arrays":
         return read_arrays(path, unit=unit)
-    require(unit != "px", path, "a CARMEN log is in metres, not px", "leave the unit out")
-    return read_carmen_log(path, max_range=max_range)
+    require(unit != "px", path, f"a {kind} is in metres, not px", "leave the unit out")
+    return read_scan_bag(path, topic) if kind == "bag" else read_carmen_log(path, max_range=max_range)
 
 
 def _detect(path: Path) -> str:
-    """Returns "folder", "arrays", "bag" or "carmen", by the ending of the path, else by its first bytes."""
+    """Returns "folder", "arrays", "bag" or "CARMEN log", by the ending of the path, else by its first bytes."""
     has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
     if is_bag(path) and not has_scans:
         return "bag"
-    if path.is_dir():
-        require(has_scans, path, "a folder without .pcd files", f"give {_FORMATS}")
-        return "folder"
+    require(has_scans or not path.is_dir(), path, "a folder without .pcd files", f"give {_FORMATS}")
     name = path.name.lower()
     for kind, endings in _ENDINGS.items():
-        if name.endswith(endings):
+        if has_scans or name.endswith(endings):
             return kind
     require(not name.endswith(".pcd"), path, "a single scan", "give the folder that holds all of its .pcd files")
     head = read_bytes(path)[:65536]
@@ -121,7 +116,7 @@ def _detect(path: Path) -> str:
         return "arrays"
     found = "no known format" if head else "an empty file"
     require(b"FLASER" in head or b"ROBOTLASER1" in head, path, found, f"give {_FORMATS}")
-    return "carmen"
+    return "CARMEN log"
 
 
 def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
@@ -141,10 +136,8 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     is_code = num_maxima >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
     if not is_code or (sequence.mask & ~is_maximum).any(axis=1).mean() < _LEAST_OTHERS:
         return sequence
-    text = (
-        f"{path}: {100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
-    )
-    return replace(_limit(sequence, limit), notes=(*sequence.notes, Note(text)))
+    found = f"{100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
+    return replace(_limit(sequence, limit), notes=(*sequence.notes, Note(f"{path}: {found}")))
 
 
 def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) -> None:
@@ -202,7 +195,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
             other than for invalid beams.
     """
     table = load_arrays(path)
-    points, mask, notes = (*_points(table, path), ()) if "points" in table else _from_ranges(table, path)
+    (points, mask), notes = (_points(table, path), ()) if "points" in table else _from_ranges(table, path)
     given = table.get("mask", mask)
     is_good = given.shape == mask.shape and given.dtype.kind in "biu"
     require(is_good, path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
@@ -216,10 +209,19 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     times = table.get("times", np.zeros(len(points)))
     is_good = _is_numeric(times, (len(points),)) and bool(np.isfinite(times).all())
     require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
-    poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
-    stamps = times.astype(np.float64) if "times" in table else None
-    is_organised, unit = has_angular_order(stored, mask), unit or _unit(table, path)
-    return ScanSequence(Path(path).stem, stored, mask, unit, is_organised, poses, odometry, stamps, notes)
+    stated = str(table.get("unit", "m"))
+    require(stated in ("px", "m"), path, f"unit is {stated!r}", "say 'px' or 'm'")
+    return ScanSequence(
+        Path(path).stem,
+        stored,
+        mask,
+        unit or ("px" if stated == "px" else "m"),
+        has_angular_order(stored, mask),
+        _planar(table, "poses", len(points), path),
+        _planar(table, "odometry", len(points), path),
+        times.astype(np.float64) if "times" in table else None,
+        notes,
+    )
 
 
 def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:
@@ -234,31 +236,25 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     return planar, (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2)
 
 
-def _from_ranges(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray, tuple[Note, ...]]:
+def _from_ranges(table: Table, path: str | Path) -> tuple[tuple[FloatArray, BoolArray], tuple[Note, ...]]:
     found = f"keys are {', '.join(table) or 'none'}"
     require("ranges" in table and "angles" in table, path, found, f"give {_KEYS}")
     ranges, angles = table["ranges"], table["angles"]
-    fits = (
-        ranges.ndim == 2 and _is_numeric(ranges, ranges.shape) and _is_numeric(angles, ranges.shape, ranges.shape[1:])
-    )
+    is_good = ranges.ndim == 2 and _is_numeric(ranges, ranges.shape)
+    is_good &= _is_numeric(angles, ranges.shape, ranges.shape[1:])
     found = f"ranges are {ranges.shape}, angles {angles.shape}"
-    require(fits, path, found, "give (n, b) and (b,) or (n, b)")
+    require(is_good, path, found, "give (n, b) and (b,) or (n, b)")
     distance, theta = ranges.astype(np.float64), angles.astype(np.float64)
     found = "angles hold NaN, infinite or huge values"
     require((np.abs(theta) < 1e6).all(), path, found, "give a direction to every beam, in radians")
-    notes = []
+    notes: tuple[Note, ...] = ()
     if theta.size and np.ptp(theta, axis=-1).max() > _LARGEST_SPAN:
         theta = np.radians(theta)
-        notes.append(Note(f"{path}: the angles span more than one turn in radians; taken as degrees", is_doubt=True))
+        text = f"{path}: the angles span more than one turn in radians; taken as degrees"
+        notes = (Note(text, is_doubt=True),)
     mask = np.isfinite(distance) & (distance > 0)
     distance = np.where(mask, distance, 0.0)
-    return distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask, tuple(notes)
-
-
-def _unit(table: Table, path: str | Path) -> Unit:
-    unit = str(table.get("unit", "m"))
-    require(unit in ("px", "m"), path, f"unit is {unit!r}", "say 'px' or 'm'")
-    return "px" if unit == "px" else "m"
+    return (distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask), notes
 
 
 def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> FloatArray | None:

@@ -16,12 +16,10 @@ from dpmjax.types import AnyArray
 def checked_positions(estimated: AnyArray, reference: AnyArray, mask: AnyArray | None) -> tuple[Any, Any, Any]:
     """Returns positions, and a weight for each pair: 1, or 0 where it is masked."""
     xp = namespace_of(estimated, reference, mask)
-    estimated, reference = (
-        as_floats(name, value, xp) for name, value in (("estimated", estimated), ("reference", reference))
-    )
+    estimated, reference = as_floats("estimated", estimated, xp), as_floats("reference", reference, xp)
     if estimated.ndim != 2 or estimated.shape[0] < 1 or estimated.shape[1] not in (2, 3):
         raise ValueError(f"estimated: expected positions of shape (n, 2) or (n, 3), n >= 1, got {estimated.shape}")
-    require_same_shape("reference", reference, estimated)
+    _require_same_shape("reference", reference, estimated)
     is_valid = xp.ones(len(estimated), bool) if mask is None else xp.asarray(mask)
     if is_valid.shape != estimated.shape[:1] or is_valid.dtype != bool:
         raise ValueError(f"mask: expected bool of shape {estimated.shape[:1]}, got {is_valid.dtype} {is_valid.shape}")
@@ -42,6 +40,14 @@ def checked_poses(name: str, value: AnyArray, xp: ModuleType = np) -> Any:
     return array
 
 
+def checked_pose_pair(xp: ModuleType = np, **poses: AnyArray) -> tuple[Any, Any]:
+    """Returns estimated and reference poses as `checked_poses` does, and checks that they have one shape."""
+    (first, estimated), (second, reference) = poses.items()
+    estimated, reference = checked_poses(first, estimated, xp), checked_poses(second, reference, xp)
+    _require_same_shape(second, reference, estimated)
+    return estimated, reference
+
+
 def as_floats(name: str, value: AnyArray, xp: ModuleType) -> Any:
     """Returns an array of NumPy as float64, an array of JAX in its dtype."""
     return np.asarray(value, np.float64) if xp is np else as_float(name, value)
@@ -59,7 +65,7 @@ def is_traced(array: Any) -> bool:
     return isinstance(array, jax.core.Tracer)
 
 
-def require_same_shape(name: str, array: AnyArray, other: AnyArray) -> None:
+def _require_same_shape(name: str, array: AnyArray, other: AnyArray) -> None:
     """Raises a ValueError where two arrays have different shapes."""
     if array.shape != other.shape:
         raise ValueError(f"{name}: expected shape {other.shape} like the estimated, got {array.shape}")

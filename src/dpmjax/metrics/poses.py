@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
 from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
-from dpmjax.metrics.inputs import as_floats, checked_poses, checked_positions, is_traced, require_same_shape
+from dpmjax.metrics.inputs import as_floats, checked_pose_pair, checked_positions, is_traced
 from dpmjax.types import AnyArray
 
 
@@ -94,8 +94,7 @@ def align_poses(
         ValueError: the shapes differ, or a number is not finite.
     """
     xp = namespace_of(T_estimated, T_reference)
-    poses = [checked_poses("T_estimated", T_estimated, xp), checked_poses("T_reference", T_reference, xp)]
-    require_same_shape("T_reference", poses[1], poses[0])
+    poses = checked_pose_pair(xp, T_estimated=T_estimated, T_reference=T_reference)
     arms = lever * xp.concatenate([-xp.eye(3), xp.eye(3)])
     ends = [_transform(T, xp.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses]
     return align_rigid(*ends)
@@ -145,21 +144,15 @@ def relative_pose_error(
             [1, n - 1].
     """
     xp = namespace_of(estimated, reference)
-    estimated, reference = checked_poses("estimated", estimated, xp), checked_poses("reference", reference, xp)
-    require_same_shape("reference", reference, estimated)
-    num_poses = len(estimated)
-    if not 1 <= delta < num_poses:
-        raise ValueError(f"delta: expected 1 <= delta < {num_poses}, the number of poses, got {delta}")
-    moved_estimated = matmul(rigid.inverse(estimated[:-delta]), estimated[delta:])
-    moved_reference = matmul(rigid.inverse(reference[:-delta]), reference[delta:])
-    error = matmul(rigid.inverse(moved_reference), moved_estimated)
-    angles = rotation_angle(error[:, :-1, :-1])
+    estimated, reference = checked_pose_pair(xp, estimated=estimated, reference=reference)
+    if not 1 <= delta < len(estimated):
+        raise ValueError(f"delta: expected 1 <= delta < {len(estimated)}, the number of poses, got {delta}")
+    moved, true = (matmul(rigid.inverse(T[:-delta]), T[delta:]) for T in (estimated, reference))
+    error = matmul(rigid.inverse(true), moved)
     squared_lengths = (error[:, :-1, -1] ** 2).sum(axis=1)
-    return RelativePoseError(
-        translation_rmse=_number(safe_sqrt(squared_lengths.mean())),
-        rotation_rmse=_number(safe_sqrt((angles**2).mean())),
-        num_pairs=len(error),
-    )
+    squared_angles = rotation_angle(error[:, :-1, :-1]) ** 2
+    translation, rotation = (_number(safe_sqrt(squares.mean())) for squares in (squared_lengths, squared_angles))
+    return RelativePoseError(translation, rotation, len(error))
 
 
 def point_distance(
@@ -183,8 +176,7 @@ def point_distance(
         ValueError: the shapes do not match, a number is not finite, or no point is valid.
     """
     xp = namespace_of(points, mask, T_estimated, T_reference)
-    estimated, reference = checked_poses("T_estimated", T_estimated, xp), checked_poses("T_reference", T_reference, xp)
-    require_same_shape("T_reference", reference, estimated)
+    estimated, reference = checked_pose_pair(xp, T_estimated=T_estimated, T_reference=T_reference)
     points, mask = as_floats("points", points, xp), xp.asarray(mask)
     dim = estimated.shape[1] - 1
     if points.ndim != 3 or points.shape[0] != len(estimated) or points.shape[2] != dim:

@@ -82,16 +82,11 @@ class PoseGraph:
                 information matrix is not symmetric and positive semidefinite.
         """
         poses = np.asarray(poses, np.float64)
-        source, target = (np.asarray(index, np.int64) for index in (edges.source, edges.target))
-        measurements, information = (np.asarray(x, np.float64) for x in (edges.measurements, edges.information))
-        graph = cls(
-            poses,
-            Edges(source, target, measurements, information),
-            np.zeros(len(poses), bool) if is_fixed is None else np.asarray(is_fixed, bool),
-            np.arange(len(poses)) if ids is None else np.asarray(ids, np.int64),
-        )
-        _check_nodes(graph)
-        _check_edges(graph)
+        source, target = (np.asarray(rows, np.int64) for rows in edges[:2])
+        edges = Edges(source, target, *(np.asarray(values, np.float64) for values in edges[2:]))
+        fixed = np.zeros(len(poses), bool) if is_fixed is None else np.asarray(is_fixed, bool)
+        graph = cls(poses, edges, fixed, np.arange(len(poses)) if ids is None else np.asarray(ids, np.int64))
+        _check(graph)
         return graph
 
     @property
@@ -115,43 +110,31 @@ class PoseGraph:
         return held
 
 
-def _require(is_right: bool, name: str, expected: str, got: Any) -> None:
+def _require(is_right: bool | np.bool_, name: str, expected: str, got: Any) -> None:
     if not is_right:
         raise ValueError(f"{name}: expected {expected}, got {got}")
 
 
-def _require_finite(name: str, array: Floats) -> None:
-    is_finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-    if not is_finite.all():
-        raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in row {np.argmin(is_finite)}")
-
-
-def _check_nodes(graph: PoseGraph) -> None:
-    shape, size = graph.poses.shape, len(graph.poses)
-    _require(shape[1:] in _TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", shape)
-    for name in ("is_fixed", "ids"):
-        _require(getattr(graph, name).shape == (size,), name, f"shape ({size},)", getattr(graph, name).shape)
+def _check(graph: PoseGraph) -> None:
+    edges, size, count = graph.edges, len(graph.poses), len(graph.edges.source)
+    pose = graph.poses.shape[1:]
+    _require(pose in _TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", graph.poses.shape)
+    tangent = (graph.tangent_size, graph.tangent_size)
+    arrays = {"poses": graph.poses, "is_fixed": graph.is_fixed, "ids": graph.ids, **edges._asdict()}
+    leading = {"poses": size, "is_fixed": size, "ids": size}
+    inner = {"poses": pose, "measurements": pose, "information": tangent}
+    for name, array in arrays.items():
+        shape = (leading.get(name, count), *inner.get(name, ()))
+        _require(array.shape == shape, name, f"shape {shape}", array.shape)
+        bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+        _require(not len(bad), name, "finite numbers", f"NaN or infinity in row {next(iter(bad), None)}")
     _require(len(np.unique(graph.ids)) == size, "ids", "every id once", "an id twice")
-    _require_finite("poses", graph.poses)
-
-
-def _check_edges(graph: PoseGraph) -> None:
-    edges, size, tangent = graph.edges, len(graph.poses), graph.tangent_size
-    count = len(edges.source)
-    shapes = {"source": (count,), "target": (count,), "measurements": (count, *graph.poses.shape[1:])}
-    for name, shape in (shapes | {"information": (count, tangent, tangent)}).items():
-        _require(getattr(edges, name).shape == shape, name, f"shape {shape}", getattr(edges, name).shape)
-    for name in ("source", "target"):
-        rows = getattr(edges, name)
+    for name, rows in (("source", edges.source), ("target", edges.target)):
         is_node = (rows >= 0) & (rows < size)
-        _require(bool(is_node.all()), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
-    is_loop = edges.source == edges.target
-    _require(
-        not is_loop.any(), "source", "another node than the target", f"the same in edges {np.flatnonzero(is_loop)[:3]}"
-    )
-    for name in ("measurements", "information"):
-        _require_finite(name, getattr(edges, name))
-    is_good = bool(is_semidefinite(edges.information).all())
+        _require(is_node.all(), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
+    loops = np.flatnonzero(edges.source == edges.target)
+    _require(not len(loops), "source", "another node than the target", f"the same in edges {loops[:3]}")
+    is_good = is_semidefinite(edges.information).all()
     _require(is_good, "information", "symmetric, positive semidefinite matrices", "others")
 
 

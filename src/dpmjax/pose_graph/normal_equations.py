@@ -11,7 +11,7 @@ translation first, in the tangent of the source frame, as in GTSAM.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,31 +55,30 @@ def linearise(poses: Floats, step: Floats, edges: Edges) -> Linearisation:
         The edges at the moved poses.
     """
     num_nodes, num_edges = len(poses), len(edges.source)
-    to_nodes, to_edges = _round_up(num_nodes) - num_nodes, _round_up(num_edges) - num_edges
-    identity = np.zeros((1, 3)) if poses.ndim == 2 else np.eye(4)[None]
-    padded = Edges(
-        np.append(edges.source, np.zeros(to_edges, np.int64)),
-        np.append(edges.target, np.zeros(to_edges, np.int64)),
-        np.concatenate([edges.measurements, np.repeat(identity, to_edges, axis=0)]),
-        np.concatenate([edges.information, np.zeros((to_edges, *edges.information.shape[1:]))]),
-    )
-    poses = np.concatenate([poses, np.repeat(identity, to_nodes, axis=0)])
-    step = np.concatenate([step, np.zeros((to_nodes, step.shape[1]))])
+    identity, zero = np.zeros(3) if poses.ndim == 2 else np.eye(4), np.zeros(edges.information.shape[1:])
+    fills = (np.int64(0), np.int64(0), identity, zero)
+    padded = Edges(*(_padded(values, fill) for values, fill in zip(edges, fills, strict=True)))
     with jax.enable_x64(True):
-        moved, *of_edges = (np.asarray(x) for x in _linearise(poses, step, padded))
+        arrays = _linearise(_padded(poses, identity), _padded(step, np.zeros(step.shape[1])), padded)
+        moved, *of_edges = (np.asarray(x) for x in arrays)
     return Linearisation(moved[:num_nodes], *(x[:num_edges] for x in of_edges))
 
 
-def _round_up(count: int) -> int:
-    return 1 << max(count - 1, 15).bit_length()
+def _padded(values: NDArray[Any], fill: Any) -> NDArray[Any]:
+    """Appends rows up to a power of two, at least 16."""
+    missing = (1 << max(len(values) - 1, 15).bit_length()) - len(values)
+    return np.concatenate([values, np.broadcast_to(fill, (missing, *values.shape[1:]))])
 
 
 @jax.jit
 def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, Array, Array]:
-    poses = _retract(poses, step)
+    is_planar = poses.ndim == 2
+    poses = se2.compose(poses, step) if is_planar else rigid.compose(poses, se3.exp(step))
     relative = _relative(poses[edges.target], poses[edges.source])
-    residual, of_source = _residuals(relative, jnp.asarray(edges.measurements))
-    adjoint = se2.adjoint(se2.inverse(relative)) if poses.ndim == 2 else se3.adjoint(rigid.inverse(relative))
+    difference = _relative(jnp.asarray(edges.measurements), relative)
+    algebra = se2 if is_planar else se3
+    residual, of_source = algebra.log(difference), algebra.log_jacobian(difference)
+    adjoint = algebra.adjoint(se2.inverse(relative) if is_planar else rigid.inverse(relative))
     with jax.default_matmul_precision("highest"):
         jacobian = jnp.stack([-of_source @ adjoint, of_source], axis=1)
         weighted = jnp.einsum("eij,esjk->esik", edges.information, jacobian)
@@ -89,23 +88,9 @@ def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, A
     return poses, chi2, blocks, gradient
 
 
-def _retract(poses: Float[Array, "n *s"], step: Float[Array, "n d"]) -> Float[Array, "n *s"]:
-    if poses.ndim == 2:
-        return se2.compose(poses, step)
-    return rigid.compose(poses, se3.exp(step))
-
-
 def _relative(target: Float[Array, "e *s"], source: Float[Array, "e *s"]) -> Float[Array, "e *s"]:
-    if source.ndim == 2:
-        return se2.relative(target, source)
-    return rigid.compose(rigid.inverse(target), source)
-
-
-def _residuals(relative: Array, measured: Array) -> tuple[Float[Array, "e d"], Float[Array, "e d d"]]:
-    """Returns residuals, and their derivatives by steps of the source poses."""
-    algebra = se2 if relative.ndim == 2 else se3
-    difference = _relative(measured, relative)
-    return algebra.log(difference), algebra.log_jacobian(difference)
+    """Returns the poses of the sources in the frames of the targets."""
+    return se2.relative(target, source) if source.ndim == 2 else rigid.compose(rigid.inverse(target), source)
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,15 +121,9 @@ def optimize_pose_graph(
     while iterations < config.max_iterations and not state.is_converged and state.damping < _MOST_DAMPING:
         state = _iterate(state, graph, pattern, width, config)
         iterations += 1
-    weights = _weights(state.at.chi2, width)
-    return OptimizedPoseGraph(
-        graph=replace(graph, poses=state.at.poses),
-        chi2=float((weights * state.at.chi2).sum()),
-        chi2_initial=chi2_initial,
-        iterations=iterations,
-        weights=weights,
-        is_converged=state.is_converged,
-    )
+    weights, moved = _weights(state.at.chi2, width), replace(graph, poses=state.at.poses)
+    chi2 = float((weights * state.at.chi2).sum())
+    return OptimizedPoseGraph(moved, chi2, chi2_initial, iterations, weights, state.is_converged)
 
 
 def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig) -> _State:

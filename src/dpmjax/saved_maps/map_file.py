@@ -14,7 +14,8 @@ from typing import get_args
 
 import numpy as np
 
-from dpmjax.io.files import load_arrays, refusing, write_atomically
+from dpmjax.io.array_files import load_arrays
+from dpmjax.io.files import refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import ArrayReader, Arrays, pack_graph, pack_scans, unpack_graph, unpack_scans
 from dpmjax.saved_maps.map_coding import Precision
 from dpmjax.sequences import InputError, require

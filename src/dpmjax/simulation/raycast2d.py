@@ -68,12 +68,15 @@ def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> 
     Raises:
         ValueError: an origin is not finite, outside of the image or inside an obstacle.
     """
+    from scipy.ndimage import distance_transform_cdt
+
     start = np.asarray(origins, np.float64).reshape(-1, 2)
     theta = np.asarray(angles, np.float64).reshape(-1)
     if len(start) != len(theta):
         raise ValueError(f"origins and angles must be of one length, got {len(start)} and {len(theta)}")
     _check_origins(is_obstacle, start)
-    distance = _free_distance(is_obstacle)
+    # Chessboard distances to the nearest solid pixel, with a solid frame round the image.
+    distance = distance_transform_cdt(~np.pad(is_obstacle, 1, constant_values=True), metric="chessboard")
     direction = np.stack([np.cos(theta), np.sin(theta)], axis=1)
 
     cell = np.floor(start).astype(np.int64)
@@ -180,14 +183,6 @@ def _check_origins(is_obstacle: BoolArray, origins: FloatArray) -> None:
     is_blocked = is_obstacle[cell[:, 1], cell[:, 0]]
     if is_blocked.any():
         raise ValueError(f"origins must lie in free space, got {origins[is_blocked][0]} inside an obstacle")
-
-
-def _free_distance(is_obstacle: BoolArray) -> NDArray[np.int32]:
-    """Computes chessboard distances (h + 2, w + 2) to the nearest solid pixel, with a solid frame round the image."""
-    from scipy.ndimage import distance_transform_cdt
-
-    framed = np.pad(is_obstacle, 1, constant_values=True)
-    return distance_transform_cdt(~framed, metric="chessboard")
 
 
 def _leap(

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpmjax.checks import require_one_of, require_positive_fields
 from dpmjax.sequences import LidarSequence
-from dpmjax.simulation.indoors.building import KINDS as INDOOR_KINDS
-from dpmjax.simulation.indoors.building import Building, BuildingConfig, make_building
-from dpmjax.simulation.indoors.walking import WalkConfig, walk
-from dpmjax.simulation.town.driving import DriveConfig, drive, scan_along
+from dpmjax.simulation.building import KINDS as INDOOR_KINDS
+from dpmjax.simulation.building import BuildingConfig, make_building
+from dpmjax.simulation.motion import DriveConfig, WalkConfig, drive, scan_along, walk
 from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
-from dpmjax.simulation.town.make import Town, TownConfig, make_town
+from dpmjax.simulation.town.make import TownConfig, make_town
 from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, SOLID_STATE, VLP16, LidarSensor
 
 _SCENE_STREAM = 8170
@@ -165,30 +166,25 @@ def simulate_scene(scene: Scene) -> LidarSequence:
     Returns:
         The sequence, with exact poses and times.
     """
-    world: Building | Town
     if isinstance(scene.place, BuildingConfig):
-        world = make_building(scene.seed, scene.place)
-        way = walk(world, cast(WalkConfig, scene.motion), seed=scene.seed)
+        building = make_building(scene.seed, scene.place)
+        name, bodies = building.name, building.primitives
+        way = walk(building, cast(WalkConfig, scene.motion), seed=scene.seed)
     else:
-        world = make_town(scene.seed, scene.place)
-        way = drive(world, cast(DriveConfig, scene.motion), seed=scene.seed)
-    sensors = [scene.sensor] if scene.other_sensor is None else [scene.sensor, scene.other_sensor]
-    name = f"{world.name}-{'+'.join(sensor.name for sensor in sensors)}"
-    sequences = [
-        scan_along(name, world.primitives, way, seed=scene.seed, sensor=sensor, is_moving=scene.is_moving)
-        for sensor in sensors
-    ]
-    return _scaled(_taking_turns(sequences), scene.scale)
+        town = make_town(scene.seed, scene.place)
+        name, bodies = town.name, town.primitives
+        way = drive(town, cast(DriveConfig, scene.motion), seed=scene.seed)
+    sensors = [sensor for sensor in (scene.sensor, scene.other_sensor) if sensor is not None]
+    name = f"{name}-{'+'.join(sensor.name for sensor in sensors)}"
+    scan = partial(scan_along, name, bodies, way, seed=scene.seed, is_moving=scene.is_moving)
+    sequences = [scan(sensor=sensor) for sensor in sensors]
+    poses = way.T_world_lidar.copy()
+    poses[:, :3, 3] *= scene.scale
 
+    def read_scan(index: int) -> NDArray[np.float32]:
+        return np.float32(scene.scale) * sequences[index % len(sequences)].read_scan(index)
 
-def _taking_turns(sequences: list[LidarSequence]) -> LidarSequence:
-    return replace(sequences[0], read_scan=lambda index: sequences[index % len(sequences)].read_scan(index))
-
-
-def _scaled(sequence: LidarSequence, scale: float) -> LidarSequence:
-    poses = np.array(sequence.T_world_lidar)
-    poses[:, :3, 3] *= scale
-    return replace(sequence, read_scan=lambda index: np.float32(scale) * sequence.read_scan(index), T_world_lidar=poses)
+    return replace(sequences[0], read_scan=read_scan, T_world_lidar=poses)
 
 
 def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[LidarSequence]:

@@ -48,9 +48,8 @@ def make_world(world: int | str) -> World:
     name = f"{list(_KINDS)[world % 3]}-{world}" if isinstance(world, int) else world
     found = re.fullmatch(rf"({'|'.join(_KINDS)})(?:-(\d+))?", name)
     if found is None:
-        raise ValueError(
-            f"world: expected a number or one of {', '.join(_KINDS)}, with a seed as in grove-7; got {world!r}"
-        )
+        kinds = ", ".join(_KINDS)
+        raise ValueError(f"world: expected a number or one of {kinds}, with a seed as in grove-7; got {world!r}")
     kind, index = found[1], int(found[2] or 0)
     rng = np.random.default_rng([2024, index])
     grid = np.zeros((SIZE_PX, SIZE_PX), bool)
@@ -114,11 +113,9 @@ def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int
     wishes = low + other * rng.uniform(0.12, 0.88, 2 if other > 600 else 1) - _DOOR_PX / 2
     doors = np.clip(wishes, low + 20, low + other - 20 - _DOOR_PX).tolist()
     _paint_span(grid, along, cut, (low, low + other), doors)
-    if along:
-        halves = [(x, y, cut - x, height), (cut, y, x + width - cut, height)]
-    else:
-        halves = [(x, y, width, cut - y), (x, cut, width, y + height - cut)]
-    for half in halves:
+    first = (x, y, cut - x, height) if along else (x, y, width, cut - y)
+    second = (cut, y, x + width - cut, height) if along else (x, cut, width, y + height - cut)
+    for half in (first, second):
         _divide(grid, rng, half, depth + 1)
     for door in doors:
         _clear_door(grid, along, cut, door)

@@ -1,22 +1,25 @@
-"""Comparisons: errors and success of methods (DeepMapping figure 6), forms of the toy (figure 14), matches of scans."""
+"""Comparisons: errors and success of methods (DeepMapping figure 6), forms of the toy (figure 14), pairs of scans."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import ACCENT, INK, MUTED, annotate_corner, new_figure, style_axes
+from dpmjax.viz import figures
+from dpmjax.viz.figures import ACCENT, INK, MUTED
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SOURCE, GREEN, DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
+TARGET = "#d98c3f"
 GRIDS_IN_A_LINE, LETTERS_IN_A_LINE = 5, 24
+# Points farther out than this share of them are outside of the picture of a pair.
+SHOWN_SHARE = 0.99
 
 
 def error_boxes_figure(
@@ -31,7 +34,8 @@ def error_boxes_figure(
     Returns:
         The figure.
     """
-    figure = new_figure(1.6 + 0.75 * max(len(methods) for methods in panels.values()) * len(panels), 4.4)
+    num_methods = max(len(methods) for methods in panels.values())
+    figure = figures.new_figure(1.6 + 0.75 * num_methods * len(panels), 4.4, layout="tight")
     axes = np.atleast_1d(figure.subplots(1, len(panels)))
     for number, (ax, (measure, methods)) in enumerate(zip(axes, panels.items(), strict=True)):
         values = [np.maximum(np.asarray(errors, float), 1e-4) for errors in methods.values()]
@@ -45,7 +49,6 @@ def error_boxes_figure(
         ax.grid(axis="y", alpha=0.25)
         if threshold is not None and number == 0:
             ax.axhline(threshold, color=ACCENT, linewidth=0.8, linestyle="--")
-    figure.tight_layout()
     return figure
 
 
@@ -69,12 +72,11 @@ def success_grids_figure(
     ((column_label, column_names),) = columns.items()
     for method, rates in grids.items():
         if rates.shape != (len(row_names), len(column_names)):
-            raise ValueError(
-                f"{method}: expected {len(row_names)} rows and {len(column_names)} columns, got {rates.shape}"
-            )
+            expected = f"{len(row_names)} rows and {len(column_names)} columns"
+            raise ValueError(f"{method}: expected {expected}, got {rates.shape}")
     num_lines = -(-len(grids) // GRIDS_IN_A_LINE)
     num_in_line = -(-len(grids) // num_lines)
-    figure = new_figure(1.2 + 2.1 * num_in_line, num_lines * (1.3 + 0.42 * len(row_names)))
+    figure = figures.new_figure(1.2 + 2.1 * num_in_line, num_lines * (1.3 + 0.42 * len(row_names)), layout="tight")
     axes = figure.subplots(num_lines, num_in_line, squeeze=False)
     for ax in axes.flat[len(grids) :]:
         ax.remove()
@@ -84,14 +86,13 @@ def success_grids_figure(
             if np.isfinite(rate):
                 ink = INK if rate > 0.5 else "white"
                 ax.text(j, i, f"{100 * rate:.0f}", ha="center", va="center", fontsize=8, color=ink)
-        ax.set_title(textwrap.fill(method, LETTERS_IN_A_LINE), fontsize=9, color=INK)
+        figures.set_title(ax, textwrap.fill(method, LETTERS_IN_A_LINE), 9)
         ax.set_xticks(range(len(column_names)), list(column_names), fontsize=8)
         ax.set_yticks([])
         ax.set_xlabel(column_label, fontsize=8)
     for ax in axes[:, 0]:
         ax.set_yticks(range(len(row_names)), list(row_names), fontsize=8)
         ax.set_ylabel(row_label, fontsize=8)
-    figure.tight_layout()
     return figure
 
 
@@ -113,19 +114,19 @@ def toy_figure(
     """
     x, loss = map(np.asarray, curve)
     network_end = tuple(float(np.asarray(values)[-1]) for values in visited)
-    figure = new_figure(8.0, 4.6)
+    figure = figures.new_figure(8.0, 4.6, layout="tight")
     axes = figure.add_subplot()
+    ends: dict[str, Any] = {"mec": "white", "ls": "none", "zorder": 6}
     axes.plot(x, loss, color=INK, lw=1.2, label="L(x)", zorder=2)
     axes.plot(*map(np.asarray, converted), "--", color=SOURCE, lw=1.4, label="L(f(z)), fitted f")
     axes.plot(*map(np.asarray, visited), "*", color=GREEN, ms=7, mew=0, alpha=0.5, label="x visited by the network")
-    axes.plot(*direct_end, "o", color=DIRECT, ms=9, mec="white", label="direct descent ends", zorder=5)
-    axes.plot(network_end_z, network_end[1], "P", color=ACCENT, ms=10, mec="white", label="z* of the network", zorder=6)
-    axes.plot(*network_end, "o", color=ACCENT, ms=9, mec="white", label="x* = f(z*)", zorder=6)
-    style_axes(axes, "x, or z for the dashed line", "L")
+    axes.plot(*direct_end, marker="o", color=DIRECT, ms=9, label="direct descent ends", **ends)
+    axes.plot(network_end_z, network_end[1], marker="P", color=ACCENT, ms=10, label="z* of the network", **ends)
+    axes.plot(*network_end, marker="o", color=ACCENT, ms=9, label="x* = f(z*)", **ends)
+    figures.style_axes(axes, "x, or z for the dashed line", "L")
     axes.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
     axes.set_xlim(float(x.min()), float(x.max()))
     axes.set_ylim(top=1.5 * float(loss.max()))
-    figure.tight_layout()
     return figure
 
 
@@ -149,18 +150,17 @@ def endings_figure(
     if not ends or set(ends) != set(shares):
         raise ValueError(f"expected shares of the same methods as ends; got {sorted(ends)} and {sorted(shares)}")
     shown = np.asarray(x, np.float64)
-    figure = new_figure(8.0, 1.8 + 0.95 * len(ends))
+    figure = figures.new_figure(8.0, 1.8 + 0.95 * len(ends), layout="tight")
     top, *rows = figure.subplots(1 + len(ends), 1, sharex=True, height_ratios=(1.8, *([1.0] * len(ends))))
     top.plot(shown, np.asarray(loss), color=INK, lw=1.2)
-    style_axes(top, y_label="L(x)")
+    figures.style_axes(top, y_label="L(x)")
     edges = np.linspace(shown.min(), shown.max(), 241)
     for axes, (name, values) in zip(rows, ends.items(), strict=True):
         finite = values[np.isfinite(values)]
         axes.hist(np.clip(finite, edges[0], edges[-1]), edges, color=ACCENT if "network" in name else DIRECT)
         axes.set_yscale("symlog", linthresh=1.0)
-        annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
-        style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "")
-    figure.tight_layout()
+        figures.annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
+        figures.style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "")
     return figure
 
 
@@ -193,25 +193,58 @@ def matches_figure(scans: MatchedScans, T_target_source: ArrayLike, *, title: st
     Returns:
         The figure.
     """
-    a, b, T = (np.asarray(x, np.float64) for x in (scans.source, scans.target, T_target_source))
-    pa, pb = np.asarray(scans.source_matched, np.float64), np.asarray(scans.target_matched, np.float64)
-    figure = new_figure(12.0, 4.6)
+    a, b, T, pa, pb = (np.asarray(x, np.float64) for x in (*scans[:2], T_target_source, *scans[2:4]))
+    figure = figures.new_figure(12.0, 4.6, layout="tight")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
-    _dots(left, a[:, :2], SOURCE)
-    _dots(left, b[:, :2] + shift, MUTED)
-    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(scans.is_right, bool), strict=True):
-        left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
-    left.set_title(title, fontsize=10, color=INK)
-    _dots(right, b[:, :2], MUTED)
-    _dots(right, a[:, :2] @ T[:2, :2].T + a[:, 2:] @ T[:2, 2:3].T + T[:2, 3], SOURCE)
-    right.set_title("source laid onto target", fontsize=10, color=INK)
-    for axes in (left, right):
+    laid = (a @ T[:3, :3].T + T[:3, 3])[:, :2]
+    dots = ((left, a[:, :2], SOURCE), (left, b[:, :2] + shift, MUTED), (right, b[:, :2], MUTED), (right, laid, SOURCE))
+    for axes, points, color in dots:
+        axes.plot(*points.T, ",", color=color, alpha=0.6)
         axes.set_aspect("equal")
         axes.set_axis_off()
-    figure.tight_layout()
+    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(scans.is_right, bool), strict=True):
+        left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
+    figures.set_title(left, title)
+    figures.set_title(right, "source laid onto target")
     return figure
 
 
-def _dots(axes: Axes, points: NDArray[np.float64], color: str) -> None:
-    axes.plot(points[:, 0], points[:, 1], ",", color=color, alpha=0.6)
+class RegisteredPair(NamedTuple):
+    """Two scans and the motions between them.
+
+    Attributes:
+        title: title of the row.
+        source: (n, 3) points, metres.
+        target: (m, 3) points, metres.
+        motions: (4, 4) `T_target_source` by the title of its panel, from left to right.
+    """
+
+    title: str
+    source: NDArray[np.float32]
+    target: NDArray[np.float32]
+    motions: Mapping[str, NDArray[np.float64]]
+
+
+def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
+    """Draws pairs of scans from above, the source under each of the motions.
+
+    Args:
+        pairs: one row each; at least one, each with the same number of motions.
+
+    Returns:
+        The figure.
+    """
+    figure = figures.new_figure(9.0, 4.2 * len(pairs), layout="tight")
+    grid = figure.subplots(len(pairs), len(pairs[0].motions), squeeze=False)
+    for row, pair in zip(grid, pairs, strict=True):
+        for axes, (label, T) in zip(row, pair.motions.items(), strict=True):
+            moved = pair.source @ T[:3, :3].T + T[:3, 3]
+            for points, color in ((pair.target, TARGET), (moved, SOURCE)):
+                axes.plot(points[:, 0], points[:, 1], ".", color=color, ms=1.2, alpha=0.5, mew=0)
+            axes.plot([0, T[0, 3]], [0, T[1, 3]], "o-", color=ACCENT, ms=4, lw=1)
+            both = np.concatenate([pair.target, moved])[:, :2]
+            corners = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
+            figures.frame_map(axes, figures.plane_limits(corners, 0.05))
+            figures.set_title(axes, f"{pair.title}\n{label}", 9)
+    return figure

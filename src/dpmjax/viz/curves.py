@@ -1,4 +1,4 @@
-"""Curves: a fit over its run time, a training over its steps, time and memory against the number of scans."""
+"""Curves: a fit over its run time, a training over its steps, the reliability of a confidence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED, format_length, new_figure, style_axes
+from dpmjax.viz import figures
+from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +22,7 @@ LOSS_COLOR = "#30638e"
 RATIO_FOR_LOG_AXIS = 10.0
 _FEW_DECADES = 2
 SMOOTHED_PART = 0.03
+NUM_BINS = 10
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def history_figure(history: History, unit: str) -> Figure:
         raise ValueError(f"expected one or more records and columns of one length; got lengths {lengths}")
 
     has_ate = ate is not None and bool(np.isfinite(ate).any())
-    figure = new_figure(8.0, 5.2 if has_ate else 3.0)
+    figure = figures.new_figure(8.0, 5.2 if has_ate else 3.0)
     rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
     phases = _phases(history.phase, seconds)
     for axes in rows:
@@ -86,7 +88,7 @@ def history_figure(history: History, unit: str) -> Figure:
         _finish_value_axis(rows[1], ate, f"ATE ({unit})")
         last = seconds[is_known][-1], ate[is_known][-1]
         style: Any = {"va": "center", "fontsize": 9, "color": ACCENT, "annotation_clip": False}
-        rows[1].annotate(format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
+        rows[1].annotate(figures.format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
     _name_phases(rows[0], phases)
     rows[-1].set_xlabel("run time (s)", color=INK)
     first, last = seconds[0], seconds[-1]
@@ -162,7 +164,7 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
     values = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
     if len(x) == 0 or not values or any(len(curve) != len(x) for curve in values.values()):
         raise ValueError(f"expected one or more steps and curves as long; got {len(x)} steps, {len(values)} curves")
-    figure = new_figure(8.0, 1.0 + 1.5 * len(values))
+    figure = figures.new_figure(8.0, 1.0 + 1.5 * len(values), layout="tight")
     rows = figure.subplots(len(values), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, curve) in zip(rows, values.items(), strict=True):
         is_known = np.isfinite(curve)
@@ -171,8 +173,7 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
         axes.plot(x[is_known], curve[is_known], color=LOSS_COLOR, lw=1, **style)
         if many:
             axes.plot(x[is_known], _smoothed(curve[is_known]), color=LOSS_COLOR, lw=1.6)
-        style_axes(axes, "step" if axes is rows[-1] else "", name)
-    figure.tight_layout()
+        figures.style_axes(axes, "step" if axes is rows[-1] else "", name)
     return figure
 
 
@@ -181,3 +182,38 @@ def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
     width = max(3, int(SMOOTHED_PART * len(values)))
     ones = np.ones(width)
     return np.convolve(values, ones, "same") / np.convolve(np.ones_like(values), ones, "same")
+
+
+def reliability_figure(
+    confidence: ArrayLike,
+    is_right: ArrayLike,
+    *,
+    title: str,
+    labels: tuple[str, str] = ("confidence", "share of right registrations"),
+) -> Figure:
+    """Draws a reliability diagram of probabilities in ten bins; calibrated ones lie on the line.
+
+    Args:
+        confidence: (n,) in [0, 1].
+        is_right: (n,) True for correct registrations.
+        title: title of the picture.
+        labels: labels of both axes.
+
+    Returns:
+        The figure.
+    """
+    confidence, right = np.asarray(confidence, float), np.asarray(is_right, bool)
+    bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
+    figure = figures.new_figure(4.6, 4.6, layout="tight")
+    axes = figure.subplots()
+    figures.style_axes(axes, *labels)
+    axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--")
+    counts = np.bincount(bins, minlength=NUM_BINS)
+    used = counts > 0
+    x, y = (np.bincount(bins, values, NUM_BINS)[used] / counts[used] for values in (confidence, right))
+    axes.plot(x, y, "o-", color=ACCENT, lw=1.4, ms=4)
+    for count, left, up in zip(counts[used], x, y, strict=True):
+        axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
+    brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
+    figures.set_title(axes, f"{title}\n{len(right)} pairs, Brier score {brier:.3f}")
+    return figure

@@ -1,27 +1,19 @@
-"""Pictures of a SLAM run from above: trajectories with their loops, and the map by height."""
+"""Pictures of a SLAM run from above: trajectories with their loops, and the map by height; and its live viewer."""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from dpmjax.viz.figures import (
-    ACCENT,
-    INK,
-    MUTED,
-    Limits,
-    add_axes,
-    draw_loops,
-    frame_map,
-    new_figure,
-    pixels_of,
-    plane_limits,
-    size_in,
-    style_axes,
-)
+from dpmjax.viz import figures
+from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,6 +25,9 @@ HEIGHTS_M = (-2.5, 5.5)
 """Heights above the lidar that the colours of maps span."""
 
 _ROOF_M = 1.0
+# Points and colours of the live viewer.
+_RADIUS_M = 0.04
+_TRAJECTORY, _LOOP = (31, 78, 140), (42, 157, 92)
 
 
 class Track(NamedTuple):
@@ -72,27 +67,24 @@ def trajectory_figure(
     if not tracks:
         raise ValueError("tracks: expected at least one")
     shown = [track.positions for track in tracks] + ([] if reference is None else [reference])
-    limits = plane_limits(np.concatenate(shown)[:, :2], 0.06)
-    (width_in, height_in), has_errors = size_in(limits), any(track.errors_m is not None for track in tracks)
+    limits = figures.plane_limits(np.concatenate(shown)[:, :2], 0.06)
+    (width_in, height_in), has_errors = figures.size_in(limits), any(track.errors_m is not None for track in tracks)
     total_in = (width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
-    figure = new_figure(*total_in)
-    axes = add_axes(figure, (0.15, 0.65, width_in, height_in))
+    figure = figures.new_figure(*total_in)
+    axes = figures.add_axes(figure, (0.15, 0.65, width_in, height_in))
     if reference is not None:
         axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
     for track in tracks:
         axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
     if len(loops):
-        draw_loops(axes, loops, f"{len(loops)} loops", LOOP)
+        figures.draw_loops(axes, loops, f"{len(loops)} loops", LOOP)
     axes.plot(*tracks[-1].positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
-    frame_map(axes, limits, "m")
-    axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
-    axes.legend(
-        loc="upper left", bbox_to_anchor=(-0.01, -0.01), ncols=3, frameon=False, fontsize=8, labelcolor=MUTED,
-        borderaxespad=0.2,
-    )  # fmt: skip
+    figures.frame_map(axes, limits, "m")
+    figures.set_title(axes, title, 11, loc="left", fontweight="bold")
+    figures.add_legend(axes, columns=3, borderaxespad=0.2)
     if has_errors:
         panel_in = min(height_in, 3.0)
-        _draw_errors(add_axes(figure, (width_in + 0.75, 0.65 + height_in - panel_in, 3.1, panel_in)), tracks)
+        _draw_errors(figures.add_axes(figure, (width_in + 0.75, 0.65 + height_in - panel_in, 3.1, panel_in)), tracks)
     return figure
 
 
@@ -119,21 +111,16 @@ def height_map_figure(
         points, heights_m = points[heights_m < _ROOF_M], heights_m[heights_m < _ROOF_M]
     # Few far points must not determine the limits.
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
-    limits = plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
-    width_in, height_in = size_in(limits)
-    figure = new_figure(width_in + 1.05, height_in + 0.5)
-    axes = add_axes(figure, (0.12, 0.12, width_in, height_in))
-    axes.imshow(
-        _raster(points, heights_m, limits, int(160 * width_in), int(160 * height_in)),
-        origin="lower",
-        extent=limits,
-        interpolation="nearest",
-    )
+    limits = figures.plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
+    width_in, height_in = figures.size_in(limits)
+    figure = figures.new_figure(width_in + 1.05, height_in + 0.5)
+    axes = figures.add_axes(figure, (0.12, 0.12, width_in, height_in))
+    figures.show_raster(axes, _raster(points, heights_m, limits, (int(160 * height_in), int(160 * width_in))), limits)
     axes.plot(*path[:, :2].T, color=ACCENT, lw=1.0, zorder=4)
-    frame_map(axes, limits, "m")
-    axes.set_title(title, fontsize=11, color=INK, loc="left", fontweight="bold")
+    figures.frame_map(axes, limits, "m")
+    figures.set_title(axes, title, 11, loc="left", fontweight="bold")
     bar_in = min(height_in, 3.0)
-    bar = add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
+    bar = figures.add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
     shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _colormap()), cax=bar, extend="both")
     shown.set_label("height above the lidar, m", fontsize=8, color=MUTED)
     bar.tick_params(labelsize=7, colors=MUTED)
@@ -174,16 +161,14 @@ def _is_roofed(
 
 
 def _raster(
-    points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], limits: Limits, columns: int, rows: int
+    points: Float[np.ndarray, "n 3"], heights_m: Float[np.ndarray, " n"], limits: Limits, shape: tuple[int, int]
 ) -> UInt8[np.ndarray, "r c 3"]:
     """Makes the picture: the highest point of each pixel; pixels without points are white."""
-    pixel, is_inside = pixels_of(points, limits, columns, rows)
-    highest = np.full(rows * columns, -np.inf)
+    pixel, is_inside = figures.pixels_of(points, limits, shape)
+    highest = np.full(shape[0] * shape[1], -np.inf)
     np.maximum.at(highest, pixel, heights_m[is_inside])
-    picture = np.full((rows * columns, 3), 255, np.uint8)
-    is_seen = np.isfinite(highest)
-    picture[is_seen] = height_colors(highest[is_seen])
-    return picture.reshape(rows, columns, 3)
+    picture = np.where(np.isfinite(highest)[:, None], height_colors(highest), np.uint8(255))
+    return picture.reshape(*shape, 3)
 
 
 def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
@@ -191,7 +176,7 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
         if track.errors_m is not None:
             way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(track.positions, axis=0), axis=1))])
             axes.plot(way, track.errors_m, **_style(track, tracks))
-    style_axes(axes, "distance driven, m")
+    figures.style_axes(axes, "distance driven, m")
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
     axes.set_title("distance to the aligned reference, m", fontsize=8.5, color=MUTED, loc="left")
@@ -200,3 +185,87 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
 def _style(track: Track, tracks: Sequence[Track]) -> dict[str, Any]:
     """Returns the line style of a track; the last track is the result."""
     return {"color": OURS, "lw": 1.5} if track is tracks[-1] else {"color": ODOMETRY, "lw": 1.1, "ls": (0, (4, 2))}
+
+
+class LiveViewer:
+    """Shows scans, keyframes, trajectory and loops while they are found.
+
+    Keyframes are children of their poses: a loop that moves the map moves the picture.
+
+    Args:
+        name: name of the recording.
+        path: file that is written without a screen, for viewers of the same version only.
+
+    Raises:
+        ValueError: rerun is not installed.
+    """
+
+    def __init__(self, name: str, path: Path) -> None:
+        self._rerun = _import_rerun()
+        self._recording = self._rerun.RecordingStream(f"dpmjax {name}")
+        self._T_world_keyframe = np.zeros((0, 4, 4))
+        if _has_screen():
+            self._rerun.spawn(recording=self._recording)
+        else:
+            self._rerun.save(path, recording=self._recording)
+
+    def show_scan(self, number: int, points: Float[np.ndarray, "n 3"], T_world_scan: Float[np.ndarray, "4 4"]) -> None:
+        """Shows the newest scan.
+
+        Args:
+            number: number of the scan.
+            points: metres, in the frame of the lidar.
+            T_world_scan: pose of the scan.
+        """
+        self._rerun.set_time("scan", sequence=number, recording=self._recording)
+        self._log_pose("world/lidar", T_world_scan)
+        self._log_points("world/lidar/points", points)
+
+    def show_map(
+        self,
+        T_world_keyframe: Float[np.ndarray, "k 4 4"],
+        newest: Float[np.ndarray, "n 3"],
+        loops: Float[np.ndarray, "m 2 3"],
+    ) -> None:
+        """Shows the map after a new keyframe.
+
+        Args:
+            T_world_keyframe: poses of all keyframes.
+            newest: points of the last keyframe, metres, in the frame of the lidar.
+            loops: positions of both ends of each accepted loop.
+        """
+        before, self._T_world_keyframe = self._T_world_keyframe, T_world_keyframe
+        for row, T in enumerate(T_world_keyframe):
+            if row >= len(before) or not np.array_equal(before[row], T):
+                self._log_pose(f"world/keyframes/{row}", T)
+        if len(T_world_keyframe):
+            self._log_points(f"world/keyframes/{len(T_world_keyframe) - 1}/points", newest)
+        lines = self._rerun.LineStrips3D
+        self._log("world/trajectory", lines([T_world_keyframe[:, :3, 3]], colors=[_TRAJECTORY]))
+        self._log("world/loops", lines(loops, colors=[_LOOP]))
+
+    def close(self) -> None:
+        """Writes the remaining data."""
+        self._recording.flush()
+
+    def _log_pose(self, entity: str, T: Float[np.ndarray, "4 4"]) -> None:
+        self._log(entity, self._rerun.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+
+    def _log_points(self, entity: str, points: Float[np.ndarray, "n 3"]) -> None:
+        self._log(entity, self._rerun.Points3D(points, colors=height_colors(points[:, 2]), radii=[_RADIUS_M]))
+
+    def _log(self, entity: str, shown: object) -> None:
+        self._rerun.log(entity, shown, recording=self._recording)
+
+
+def _has_screen() -> bool:
+    """Returns True where a window can be opened; False on a Linux machine without a display."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _import_rerun() -> ModuleType:
+    try:
+        import rerun
+    except ImportError as error:
+        raise ValueError("the live viewer needs rerun: pip install 'dpmjax[viewer]', or run without it") from error
+    return rerun

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int64
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 INK = "#1b1f24"
 MUTED = "#6a737d"
@@ -39,11 +40,11 @@ class Limits(NamedTuple):
         return self.y_max - self.y_min
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """Returns a white figure that belongs to no window and to no global state."""
+def new_figure(width_in: float, height_in: float, layout: Literal["tight"] | None = None) -> Figure:
+    """Returns a white figure that belongs to no window and to no global state; "tight" makes room for labels."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_in, height_in), facecolor="white")
+    return Figure(figsize=(width_in, height_in), facecolor="white", layout=layout)
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:
@@ -68,6 +69,22 @@ def style_axes(axes: Axes, x_label: str = "", y_label: str = "") -> None:
         spine.set_color(FRAME)
 
 
+def set_title(axes: Axes, text: str, size: float = 10.0, **style: Any) -> None:
+    """Writes the title of axes."""
+    axes.set_title(text, fontsize=size, color=INK, **style)
+
+
+def add_legend(target: Axes | Figure, *entries: Any, columns: int, **place: Any) -> None:
+    """Adds a small legend without a frame, in a number of columns, below the axes unless `place` says otherwise."""
+    place = {"loc": "upper left", "bbox_to_anchor": (-0.01, -0.01), **place}
+    target.legend(*entries, ncols=columns, frameon=False, fontsize=8, labelcolor=MUTED, **place)
+
+
+def show_raster(axes: Axes, picture: np.ndarray, limits: Limits, **style: Any) -> AxesImage:
+    """Draws a raster, its first row at the smallest y, with sharp pixels."""
+    return axes.imshow(picture, origin="lower", extent=limits, interpolation="nearest", **style)
+
+
 def annotate_corner(axes: Axes, text: str, offset: tuple[float, float], **style: Any) -> None:
     """Writes text at the upper left corner of the axes, shifted right and up by points."""
     style = {"fontsize": 8.5, "color": MUTED, **style}
@@ -77,10 +94,7 @@ def annotate_corner(axes: Axes, text: str, offset: tuple[float, float], **style:
 def frame_map(axes: Axes, limits: Limits, unit: str | None = None) -> None:
     """Sets equal axes, limits and a thin frame without ticks for a map panel; adds a scale bar if there is a unit."""
     axes.set_aspect("equal", adjustable="box")
-    axes.set_xlim(limits.x_min, limits.x_max)
-    axes.set_ylim(limits.y_min, limits.y_max)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xlim=limits[:2], ylim=limits[2:], xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color(FRAME)
         spine.set_linewidth(0.8)
@@ -91,22 +105,12 @@ def frame_map(axes: Axes, limits: Limits, unit: str | None = None) -> None:
 def _add_scale_bar(axes: Axes, limits: Limits, unit: str) -> None:
     """Draws a bar of a round length, about a fifth of the width, in the lower left corner."""
     length = round_length(limits.width / 5.0)
-    x = limits.x_min + 0.04 * limits.width
-    y = limits.y_min + 0.04 * limits.height
-    axes.plot([x, x + length], [y, y], color="white", linewidth=4.5, solid_capstyle="butt", zorder=8)
-    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.0, solid_capstyle="butt", zorder=9)
-    axes.annotate(
-        f"{length:g} {unit}",
-        (x + length / 2.0, y),
-        xytext=(0, 4),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        fontsize=8,
-        color=INK,
-        bbox={"boxstyle": "square,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
-        zorder=9,
-    )
+    x, y = limits.x_min + 0.04 * limits.width, limits.y_min + 0.04 * limits.height
+    for color, width in (("white", 4.5), (INK, 2.0)):
+        axes.plot([x, x + length], [y, y], color=color, linewidth=width, solid_capstyle="butt", zorder=8)
+    box = {"boxstyle": "square,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
+    style: Any = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 8, "color": INK}
+    axes.annotate(f"{length:g} {unit}", (x + length / 2.0, y), xytext=(0, 4), bbox=box, zorder=9, **style)
 
 
 def round_length(length: float) -> float:
@@ -177,9 +181,10 @@ def draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"], label: str, color:
 
 
 def pixels_of(
-    points: Float[np.ndarray, "n d"], limits: Limits, columns: int, rows: int
+    points: Float[np.ndarray, "n d"], limits: Limits, shape: tuple[int, int]
 ) -> tuple[Int64[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
-    """Returns the pixels of the points inside the limits in a flat raster, row by row, and True for points inside."""
+    """Returns the pixels of the points inside the limits in a flat raster of this shape, and True for points inside."""
+    rows, columns = shape
     place = (points[:, :2] - [limits.x_min, limits.y_min]) / [limits.width / columns, limits.height / rows]
     column, row = np.floor(place).astype(np.int64).T
     is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)

@@ -10,17 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.viz.figures import (
-    INK,
-    MUTED,
-    Limits,
-    add_axes,
-    annotate_corner,
-    draw_trajectory,
-    format_length,
-    frame_map,
-    new_figure,
-)
+from dpmjax.viz import figures
+from dpmjax.viz.figures import INK, MUTED, Limits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,12 +106,12 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
 
     height_in = PANEL_WIDTH_IN * limits.height / limits.width
     width_in = len(panels) * PANEL_WIDTH_IN + (len(panels) + 1) * GAP_IN
-    figure = new_figure(width_in, height_in + HEADER_IN + FOOTER_IN)
+    figure = figures.new_figure(width_in, height_in + HEADER_IN + FOOTER_IN)
     colormap = time_colormap()
     for column, panel in enumerate(aligned):
         left_in = GAP_IN + column * (PANEL_WIDTH_IN + GAP_IN)
-        _draw_panel(add_axes(figure, (left_in, FOOTER_IN, PANEL_WIDTH_IN, height_in)), panel, unit, colormap)
-        frame_map(figure.axes[-1], limits, None if column else unit)
+        _draw_panel(figures.add_axes(figure, (left_in, FOOTER_IN, PANEL_WIDTH_IN, height_in)), panel, unit, colormap)
+        figures.frame_map(figure.axes[-1], limits, None if column else unit)
     _add_time_bar(figure, len(anchor.poses), colormap)
     return figure
 
@@ -185,20 +176,20 @@ def _draw_panel(axes: Axes, panel: Panel, unit: str, colormap: Colormap) -> None
     size = np.clip(50_000.0 / max(1, len(order)), 0.45, 4.0)
     colors = colormap(scans[order] / max(1, len(panel.poses) - 1))
     axes.scatter(points[order, 0], points[order, 1], size, colors, linewidths=0, rasterized=True, zorder=2)
-    draw_trajectory(axes, panel.trajectory_world, "black")
+    figures.draw_trajectory(axes, panel.trajectory_world, "black")
     known = {"ATE": panel.ate, "point distance": panel.point_distance}
-    numbers = [f"{name} {format_length(value, unit)}" for name, value in known.items() if value is not None]
+    numbers = [f"{name} {figures.format_length(value, unit)}" for name, value in known.items() if value is not None]
     # A long title is drawn smaller, so that it does not run into the next panel.
     title_size = min(12.5, 480.0 / max(1, len(panel.title)))
-    annotate_corner(axes, panel.title, (1, 21), fontsize=title_size, fontweight="bold", color=INK)
-    annotate_corner(axes, "   ".join(numbers), (1, 7), fontsize=9.5)
+    figures.annotate_corner(axes, panel.title, (1, 21), fontsize=title_size, fontweight="bold", color=INK)
+    figures.annotate_corner(axes, "   ".join(numbers), (1, 7), fontsize=9.5)
 
 
 def _add_time_bar(figure: Figure, num_scans: int, colormap: Colormap) -> None:
     """Adds a thin colour bar of the scans under the panels."""
     width_in = figure.get_figwidth()
     length_in = min(3.0, 0.5 * width_in)
-    axes = add_axes(figure, (0.5 * (width_in - length_in), 0.24, length_in, 0.09))
+    axes = figures.add_axes(figure, (0.5 * (width_in - length_in), 0.24, length_in, 0.09))
     axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=colormap)
     axes.set_axis_off()
     style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center", "fontsize": 8.5}

@@ -1,4 +1,4 @@
-"""Pictures from above: the map of M-Net, errors of re-localisation, and clouds of depth images."""
+"""Pictures from above: the map of M-Net, errors of re-localisation, clouds of depth images, scans found in a map."""
 
 from __future__ import annotations
 
@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz.figures import (
-    ACCENT,
-    INK,
-    Limits,
-    add_axes,
-    annotate_corner,
-    draw_trajectory,
-    frame_map,
-    new_figure,
-    plane_limits,
-)
+from dpmjax.viz import figures
+from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 from dpmjax.viz.maps import time_colormap
 
 if TYPE_CHECKING:
@@ -29,6 +20,8 @@ LONGER_SIDE_IN = 6.4
 GAP_IN = 0.12
 OBSTACLE = "#e4e6e9"
 TRAJECTORY = "#16c7d9"
+RIGHT = "#2a9d5c"
+HEAD_SHARE = 0.02
 
 
 def occupancy_figure(
@@ -68,16 +61,15 @@ def occupancy_figure(
 
     scale_in = LONGER_SIDE_IN / max(limits.width, limits.height)
     width_in, height_in = limits.width * scale_in, limits.height * scale_in
-    figure = new_figure(width_in + 2.0 * GAP_IN, height_in + 2.0 * GAP_IN)
-    axes = add_axes(figure, (GAP_IN, GAP_IN, width_in, height_in))
+    figure = figures.new_figure(width_in + 2.0 * GAP_IN, height_in + 2.0 * GAP_IN)
+    axes = figures.add_axes(figure, (GAP_IN, GAP_IN, width_in, height_in))
     brightness = np.where(explored, 1.0 - np.clip(probability, 0.0, 1.0), UNEXPLORED_GREY)
     axes.set_facecolor(str(UNEXPLORED_GREY))
-    image = axes.imshow(brightness, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
-    image.set_interpolation("nearest")
+    image = figures.show_raster(axes, brightness, extent, cmap="gray", vmin=0.0, vmax=1.0)
     image.set_transform(Affine2D(T) + axes.transData)
     if trajectory_world is not None:
-        draw_trajectory(axes, np.asarray(trajectory_world, np.float64) @ T[:2, :2].T + T[:2, 2], ACCENT)
-    frame_map(axes, limits, unit)
+        figures.draw_trajectory(axes, np.asarray(trajectory_world, np.float64) @ T[:2, :2].T + T[:2, 2], ACCENT)
+    figures.frame_map(axes, limits, unit)
     return figure
 
 
@@ -124,16 +116,14 @@ def error_maps_figure(
 
     limits = Limits(*map(float, extent))
     colormap = matplotlib.colormaps["inferno"].with_extremes(bad=OBSTACLE)
-    figure = new_figure(4.6 * len(maps) + 0.9, 5.0)
+    figure = figures.new_figure(4.6 * len(maps) + 0.9, 5.0)
     axes_row = figure.subplots(1, len(maps), squeeze=False)[0]
     for axes, panel in zip(axes_row, maps, strict=True):
-        image = axes.imshow(
-            panel.error, cmap=colormap, vmin=0.0, vmax=worst, origin="lower", extent=limits, interpolation="nearest"
-        )
+        image = figures.show_raster(axes, panel.error, limits, cmap=colormap, vmin=0.0, vmax=worst)
         axes.plot(*np.asarray(trajectory_world).T, ".", color=TRAJECTORY, ms=1.8)
-        axes.set_title(f"{panel.title}\n", fontsize=11, color=INK, loc="left", fontweight="bold")
-        annotate_corner(axes, panel.subtitle, (0, 6))
-        frame_map(axes, limits, unit if panel is maps[0] else None)
+        figures.set_title(axes, f"{panel.title}\n", 11, loc="left", fontweight="bold")
+        figures.annotate_corner(axes, panel.subtitle, (0, 6))
+        figures.frame_map(axes, limits, unit if panel is maps[0] else None)
     # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
     right = 1.0 - 0.9 / figure.get_figwidth()
     figure.tight_layout(rect=(0.0, 0.0, right, 1.0))
@@ -161,17 +151,15 @@ def from_above_figure(
     """
     if not panels:
         raise ValueError("panels: expected at least one")
-    clouds, sensors = [], []
     cloud, valid = np.asarray(points, np.float64), np.asarray(mask, bool)
+    poses = [np.asarray(panel[1], np.float64) for panel in panels]
     # The first camera is level in every panel, so the panels are aligned by the first poses.
-    anchor = np.asarray(panels[-1][1], np.float64)[0]
-    for _, poses in panels:
-        T = anchor @ np.linalg.inv(np.asarray(poses, np.float64)[0]) @ np.asarray(poses, np.float64)
-        clouds.append(np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3])
-        sensors.append(T[:, :3, 3])
+    aligned = [poses[-1][0] @ np.linalg.inv(T[0]) @ T for T in poses]
+    clouds = [np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3] for T in aligned]
+    sensors = [T[:, :3, 3] for T in aligned]
     low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
-    limits = plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.12)
-    figure = new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5)
+    limits = figures.plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.12)
+    figure = figures.new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5, layout="tight")
     colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
     axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
     # Few points would hardly be seen.
@@ -181,7 +169,49 @@ def from_above_figure(
             shown = world[image][valid[image] & (world[image][..., 1] > below_m)]
             axes.plot(shown[:, 0], shown[:, 2], ".", ms=size, mew=0, color=color)
         axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
-        frame_map(axes, limits, "m" if axes is axes_row[0] else None)
-        axes.set_title(title, fontsize=10, color=INK, loc="left")
-    figure.tight_layout()
+        figures.frame_map(axes, limits, "m" if axes is axes_row[0] else None)
+        figures.set_title(axes, title, loc="left")
+    return figure
+
+
+def localization_figure(
+    points_map: ArrayLike,
+    T_map_keyframe: ArrayLike,
+    T_map_scan: ArrayLike,
+    *,
+    is_wrong: ArrayLike | None = None,
+    title: str,
+) -> Figure:
+    """Draws a map from above, the keyframes' positions, and the poses of the scans that were found as arrows.
+
+    Args:
+        points_map: (n, 3) points of the map, metres.
+        T_map_keyframe: (k, 4, 4) at least one.
+        T_map_scan: (s, 4, 4) of the scans that were found.
+        is_wrong: (s,) scans that a reference puts elsewhere; None without a reference.
+        title: title of the picture.
+
+    Returns:
+        The figure.
+    """
+    points, path = np.asarray(points_map, float).reshape(-1, 3), np.asarray(T_map_keyframe, float)[:, :3, 3]
+    T = np.asarray(T_map_scan, float).reshape(-1, 4, 4)
+    wrong = np.zeros(len(T), bool) if is_wrong is None else np.asarray(is_wrong, bool)
+    # Few far points must not determine the limits.
+    shown = np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]])
+    limits = figures.plane_limits(np.percentile(shown, [0.5, 99.5], axis=0), 0.06)
+    width_in, height_in = figures.size_in(limits)
+    figure = figures.new_figure(width_in + 0.3, height_in + 0.8, layout="tight")
+    axes = figure.subplots()
+    axes.scatter(points[:, 0], points[:, 1], s=0.4, color=MUTED, alpha=0.35, linewidths=0, rasterized=True)
+    axes.plot(path[:, 0], path[:, 1], ".", color=INK, ms=3, label=f"{len(path)} keyframes", zorder=4)
+    head = HEAD_SHARE * max(limits.width, limits.height)
+    for mask, color, label in ((~wrong, RIGHT, "found"), (wrong, ACCENT, "found elsewhere than the reference")):
+        if mask.any():
+            (x, y), (dx, dy) = T[mask, :2, 3].T, T[mask, :2, 0].T
+            axes.quiver(x, y, dx, dy, color=color, scale=1 / head, scale_units="xy", width=0.004, zorder=6)
+            axes.plot(x, y, "o", color=color, ms=3.5, label=f"{mask.sum()} {label}", zorder=5)
+    figures.frame_map(axes, limits, "m")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
+    figures.set_title(axes, title)
     return figure

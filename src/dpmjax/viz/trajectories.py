@@ -10,19 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
-from dpmjax.viz.figures import (
-    INK,
-    MUTED,
-    Limits,
-    add_axes,
-    draw_loops,
-    frame_map,
-    new_figure,
-    pixels_of,
-    plane_limits,
-    size_in,
-    style_axes,
-)
+from dpmjax.viz import figures
+from dpmjax.viz.figures import INK, MUTED, Limits
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -73,8 +62,8 @@ def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, s
             axes.plot(*panel.reference[:, :2].T, color="#b9c0c8", lw=3.6, solid_capstyle="round", label="reference")
         for method in [method for method in colors if method in panel.tracks]:
             axes.plot(*panel.tracks[method][:, :2].T, color=colors[method], lw=1.0, label=method)
-        frame_map(axes, plane_limits(_shown(panel), _MARGIN), "m")
-        axes.set_title(name, fontsize=8.5, color=INK)
+        figures.frame_map(axes, figures.plane_limits(_shown(panel), _MARGIN), "m")
+        figures.set_title(axes, name, 8.5)
     shown = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in grid]
     entries = {label: handle for handles in shown for handle, label in handles}
     _add_legend(figure, entries)
@@ -85,7 +74,7 @@ def _panels(num: int, height_in: float, *, is_y_shared: bool = False) -> tuple[F
     """Makes a figure of several panels, with space for a legend below them."""
     columns = min(num, _COLUMNS)
     num_rows = math.ceil(num / columns)
-    figure = new_figure(_PANEL_IN * columns, height_in * num_rows + _LEGEND_IN)
+    figure = figures.new_figure(_PANEL_IN * columns, height_in * num_rows + _LEGEND_IN)
     grid = figure.subplots(num_rows, columns, squeeze=False, sharey=is_y_shared).ravel().tolist()
     for axes in grid[num:]:
         axes.set_axis_off()
@@ -96,10 +85,8 @@ def _add_legend(figure: Figure, entries: Mapping[str, Artist]) -> None:
     """Adds one legend for all panels, below them."""
     figure.tight_layout(rect=(0, _LEGEND_IN / figure.get_figheight(), 1, 1))
     num_columns = max(int(figure.get_figwidth() / _ENTRY_IN), 1)
-    figure.legend(
-        entries.values(), entries.keys(), loc="lower center", ncols=num_columns, frameon=False, fontsize=8,
-        labelcolor=MUTED,
-    )  # fmt: skip
+    place = {"loc": "lower center", "bbox_to_anchor": None}
+    figures.add_legend(figure, entries.values(), entries.keys(), columns=num_columns, **place)
 
 
 def _shown(panel: TrackPanel) -> NDArray[np.float64]:
@@ -137,8 +124,8 @@ def growth_figure(
             (entries[name],) = axes.plot(metres, sizes / 1e6, "-o", ms=2.5, lw=1.3, color=colors[name])
         axes.set_yscale("log")
         axes.set_xlim(left=0)
-        axes.set_title(drive, fontsize=8.5, color=INK)
-        style_axes(axes, "distance driven, m", "map, MB" if axes is grid[0] else "")
+        figures.set_title(axes, drive, 8.5)
+        figures.style_axes(axes, "distance driven, m", "map, MB" if axes is grid[0] else "")
     _add_legend(figure, entries)
     return figure
 
@@ -197,13 +184,13 @@ def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
         The figure.
     """
     limits = [_limits_of(panel) for panel in panels]
-    sizes = [size_in(each) for each in limits]
+    sizes = [figures.size_in(each) for each in limits]
     width_in = sum(size[0] + GAP_IN for size in sizes) + GAP_IN
     height_in = max(size[1] for size in sizes)
-    figure = new_figure(width_in, height_in + TITLE_IN + LEGEND_IN)
+    figure = figures.new_figure(width_in, height_in + TITLE_IN + LEGEND_IN)
     left_in = GAP_IN
     for panel, size, each in zip(panels, sizes, limits, strict=True):
-        axes = add_axes(figure, (left_in, LEGEND_IN + height_in - size[1], *size))
+        axes = figures.add_axes(figure, (left_in, LEGEND_IN + height_in - size[1], *size))
         _draw_panel(axes, panel, each, size)
         left_in += size[0] + GAP_IN
     place = (GAP_IN / width_in, 1 - 0.1 / (height_in + TITLE_IN + LEGEND_IN))
@@ -212,12 +199,7 @@ def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
 
 
 def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float, float]) -> None:
-    axes.imshow(
-        _raster(panel, limits, int(DOTS_PER_IN * size[0]), int(DOTS_PER_IN * size[1])),
-        origin="lower",
-        extent=limits,
-        interpolation="nearest",
-    )
+    figures.show_raster(axes, _raster(panel, limits, (int(DOTS_PER_IN * size[1]), int(DOTS_PER_IN * size[0]))), limits)
     references = [agent.reference for agent in panel.agents if agent.reference is not None]
     for number, reference in enumerate(references):
         label = None if number else "reference"
@@ -228,13 +210,10 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
         axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
     if len(panel.loops):
         label = f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them"
-        draw_loops(axes, panel.loops, label, INK)
-    frame_map(axes, limits, "m")
+        figures.draw_loops(axes, panel.loops, label, INK)
+    figures.frame_map(axes, limits, "m")
     axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")
-    columns = max(int(size[0] / 1.6), 1)
-    axes.legend(
-        loc="upper left", bbox_to_anchor=(-0.02, -0.01), ncols=columns, frameon=False, fontsize=8, labelcolor=MUTED
-    )
+    figures.add_legend(axes, columns=max(int(size[0] / 1.6), 1), bbox_to_anchor=(-0.02, -0.01))
 
 
 def _limits_of(panel: AgentPanel) -> Limits:
@@ -243,21 +222,22 @@ def _limits_of(panel: AgentPanel) -> Limits:
     points = np.concatenate([agent.points[:, :2] for agent in panel.agents])
     if len(points):
         shown.append(np.quantile(points, [0.01, 0.99], axis=0))
-    return plane_limits(np.concatenate(shown), 0.03)
+    return figures.plane_limits(np.concatenate(shown), 0.03)
 
 
-def _raster(panel: AgentPanel, limits: Limits, columns: int, rows: int) -> UInt8[np.ndarray, "r c 3"]:
+def _raster(panel: AgentPanel, limits: Limits, shape: tuple[int, int]) -> UInt8[np.ndarray, "r c 3"]:
     """Makes the picture: each pixel has the colour of the agents with points there, stronger for more points."""
     from matplotlib.colors import to_rgb
 
-    color, total = np.zeros((rows * columns, 3)), np.zeros(rows * columns)
+    size = shape[0] * shape[1]
+    color, total = np.zeros((size, 3)), np.zeros(size)
     for agent in panel.agents:
         points = agent.points[agent.heights_m > MIN_HEIGHT_M, :2]
-        count = np.bincount(pixels_of(points, limits, columns, rows)[0], minlength=rows * columns)
+        count = np.bincount(figures.pixels_of(points, limits, shape)[0], minlength=size)
         color += count[:, None] * np.array(to_rgb(agent.color))
         total += count
     is_seen = total > 0
     strong = np.quantile(total[is_seen], 0.9) if is_seen.any() else 1.0
     alpha = np.where(is_seen, 0.35 + 0.6 * np.clip(total / max(strong, 1.0), 0, 1), 0.0)[:, None]
     mixed = alpha * color / np.maximum(total, 1)[:, None] + 1 - alpha
-    return np.asarray(np.round(255 * mixed), np.uint8).reshape(rows, columns, 3)
+    return np.asarray(np.round(255 * mixed), np.uint8).reshape(*shape, 3)

@@ -94,11 +94,10 @@ def import_torch_checkpoint(path: str | Path) -> Model:
     content = read_torch_file(path)
     if not isinstance(content, dict) or not {"encoder", "decoder"} <= content.keys():
         raise ValueError(f"{path}: not a checkpoint of DeepPointMap: expected a dictionary of encoder and decoder")
-    tensors = {
-        "encoder": _renamed(content["encoder"], ENCODER_NAMES, f"{path}: encoder"),
-        "decoder": _renamed(content["decoder"], DECODER_NAMES, f"{path}: decoder"),
-    }
-    arrays = {f"{part}.{name}": array for part, named in tensors.items() for name, array in named.items()}
+    arrays: Tensors = {}
+    for part, names in (("encoder", ENCODER_NAMES), ("decoder", DECODER_NAMES)):
+        named = _renamed(content[part], names, f"{path}: {part}")
+        arrays |= {f"{part}.{name}": array for name, array in named.items()}
     try:
         config = _derived_config(arrays, *_sampling(path.with_name("config.json")))
     except KeyError as error:
@@ -111,22 +110,17 @@ def import_torch_checkpoint(path: str | Path) -> Model:
 def _renamed(tensors: Any, names: dict[str, str], where: str) -> Tensors:
     if not isinstance(tensors, dict):
         raise ValueError(f"{where}: expected a dictionary of tensors, got {type(tensors).__name__}")
-    return dict(_converted(str(name), np.asarray(tensor), names, where) for name, tensor in tensors.items())
-
-
-def _converted(name: str, tensor: np.ndarray, names: dict[str, str], where: str) -> tuple[str, np.ndarray]:
-    for pattern, ours in names.items():
-        match = re.fullmatch(rf"(?:module\.)?{pattern}(weight|bias)", name)
+    renamed = {}
+    for name, value in tensors.items():
+        matches = ((re.fullmatch(rf"(?:module\.)?{theirs}(weight|bias)", str(name)), names[theirs]) for theirs in names)
+        match, ours = next((found for found in matches if found[0]), (None, ""))
         if match is None:
-            continue
-        prefix = match.expand(ours)
-        if match[match.re.groups] == "bias":
-            return f"{prefix}bias", tensor
-        if tensor.ndim < 2:
-            return f"{prefix}scale", tensor
+            raise ValueError(f"{where}: unknown tensor {name}: another network")
+        tensor = np.asarray(value)
+        kind = "bias" if match[match.re.groups] == "bias" else "scale" if tensor.ndim < 2 else "kernel"
         # A convolution with a kernel of one is a matrix (output, input, 1, ..); ours map rows.
-        return f"{prefix}kernel", tensor.reshape(tensor.shape[:2]).T
-    raise ValueError(f"{where}: unknown tensor {name}: another network")
+        renamed[f"{match.expand(ours)}{kind}"] = tensor.reshape(tensor.shape[:2]).T if kind == "kernel" else tensor
+    return renamed
 
 
 def _sampling(path: Path) -> tuple[tuple[PyramidStage, ...], float]:
@@ -135,21 +129,15 @@ def _sampling(path: Path) -> tuple[tuple[PyramidStage, ...], float]:
         return PyramidConfig().stages, ModelConfig().scale_m
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
-        encoder = settings["encoder"]
-        lists = (encoder["npoint"], encoder["radius_list"], encoder["nsample_list"])
-        stages = tuple(
-            PyramidStage(num_points, tuple(map(float, radii)), _only(num_neighbours))
-            for num_points, radii, num_neighbours in zip(*lists, strict=True)
-        )
-        return stages, float(settings.get("coordinate_scale", ModelConfig().scale_m))
+        lists = (settings["encoder"][key] for key in ("npoint", "radius_list", "nsample_list"))
+        stages = []
+        for num_points, radii, numbers in zip(*lists, strict=True):
+            if len(set(numbers)) != 1:
+                raise ValueError(f"nsample_list: expected one number for all blocks of a stage, got {numbers}")
+            stages.append(PyramidStage(num_points, tuple(map(float, radii)), numbers[0]))
+        return tuple(stages), float(settings.get("coordinate_scale", ModelConfig().scale_m))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not a configuration of DeepPointMap ({error})") from error
-
-
-def _only(numbers: list[int]) -> int:
-    if len(set(numbers)) != 1:
-        raise ValueError(f"nsample_list: expected one number for all blocks of a stage, got {numbers}")
-    return numbers[0]
 
 
 def _derived_config(arrays: Tensors, stages: tuple[PyramidStage, ...], scale_m: float) -> ModelConfig:
@@ -166,10 +154,8 @@ def _derived_config(arrays: Tensors, stages: tuple[PyramidStage, ...], scale_m: 
         expansion=expand.shape[1] // expand.shape[0],
         output_channels=arrays[f"encoder.propagation_{num_steps - 1}.linear_1.kernel"].shape[1],
     )
-    input_channels, model_channels = arrays["decoder.projection.kernel"].shape
-    decoder = DecoderConfig(
-        input_channels=input_channels, model_channels=model_channels, num_layers=count(r"decoder\.layer_\d+")
-    )
+    inputs, width = arrays["decoder.projection.kernel"].shape
+    decoder = DecoderConfig(input_channels=inputs, model_channels=width, num_layers=count(r"decoder\.layer_\d+"))
     return ModelConfig(PyramidConfig(stages, num_steps), encoder, decoder, scale_m)
 
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, zoom
 
-from dpmjax.sequences import FloatArray
+from dpmjax.sequences import BoolArray, FloatArray
 from dpmjax.simulation.town import objects
 from dpmjax.simulation.town.kinds import Kind, Quarter
-from dpmjax.simulation.town.objects import Collection, Place, Size
+from dpmjax.simulation.town.objects import Collection, Place, Size, plant_bushes, plant_trees
+from dpmjax.simulation.town.primitives import CELL_M
 from dpmjax.simulation.town.streets import Streets, arc_lengths, at_way, tangents
 from dpmjax.simulation.town.terrain import PAVEMENT_M, Plots
-from dpmjax.simulation.town.vegetation import plant_bushes, plant_land, plant_trees
 
 _FREE_M = 4.2  # Least distance of parked cars from the middle of a street.
 _BORDERS = ("hedge", "wall", "fence")
+_FARTHEST_M = 65.0  # Largest distance of plants from the nearest kerb.
+_PATCH_M = 14.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ def furnish(rng: np.random.Generator, streets: Streets, plots: Plots, kind: Kind
     for step in steps:
         for side in sides:
             step(into, rng, side)
-    plant_land(into, rng, plots, kind)
+    _plant_land(into, rng, plots, kind)
     return into
 
 
@@ -227,3 +230,41 @@ def _second_row(into: Collection, rng: np.random.Generator, side: _Side) -> None
             if side.plots.claim(tree, (1.5, 1.5), 3.0):
                 _put_tree(into, rng, tree, side)
         way += width + rng.uniform(3, 15)
+
+
+def _plant_land(into: Collection, rng: np.random.Generator, plots: Plots, kind: Kind) -> None:
+    """Adds plants on the free land outside of streets and plots, in patches.
+
+    Args:
+        into: where to.
+        rng: source of all choices.
+        plots: free ground.
+        kind: kind of place, with densities of plants.
+    """
+    is_wooded = _patches(rng, plots.terrain.heights.shape, kind.woodland)
+    for density, clear in ((kind.trees_per_ha, 2.5), (kind.bushes_per_ha, 1.6)):
+        places = _scatter(rng, plots, density, is_wooded)
+        places = places[plots.are_free(places, clear)]
+        if clear == 2.5:
+            plant_trees(into, rng, _on_ground(plots, places), kind.tree_height, conifers=kind.conifers)
+        else:
+            plant_bushes(into, rng, _on_ground(plots, places))
+
+
+def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> BoolArray:
+    coarse = rng.normal(size=tuple(-(-size // 8) for size in shape))
+    field = gaussian_filter(coarse, _PATCH_M / (8 * CELL_M))
+    return zoom(field <= np.quantile(field, share), 8, order=0)[: shape[0], : shape[1]]
+
+
+def _scatter(rng: np.random.Generator, plots: Plots, per_ha: float, is_wooded: BoolArray) -> FloatArray:
+    """Draws positions (n, 2) in woods near streets."""
+    terrain = plots.terrain
+    size = CELL_M * (np.array(terrain.heights.shape)[::-1] - 1)
+    places = rng.uniform(0, 1, (rng.poisson(per_ha * size.prod() / 1e4), 2)) * size
+    column, row = np.round(places / CELL_M).astype(int).T
+    return terrain.origin + places[is_wooded[row, column] & (terrain.street_distance[row, column] < _FARTHEST_M)]
+
+
+def _on_ground(plots: Plots, places: FloatArray) -> FloatArray:
+    return np.column_stack([places, plots.terrain.height_at(places)]) if len(places) else np.zeros((0, 3))

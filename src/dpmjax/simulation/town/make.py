@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.checks import require_fields, require_one_of, require_positive_fields
-from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.furnish import furnish
 from dpmjax.simulation.town.kinds import KINDS, Kind
@@ -20,6 +19,8 @@ from dpmjax.simulation.town.terrain import Plots, Terrain, make_terrain, with_eq
 _SENSOR_HEIGHT_M = 1.73
 _WALKERS_PER_KM = 15.0  # For each kilometre of lane.
 _TOWN_STREAM = 8150
+# Least and largest half length, half width and half height.
+_CAR_M, _TRUCK_M = ((1.9, 2.5), (0.82, 0.95), (0.7, 0.9)), ((3.2, 6.5), (1.15, 1.27), (1.3, 1.8))
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,10 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     if trajectory is None:
         streets = make_streets(rng, config.route, config.route_length_m, config.block_m, kind.half_width)
     else:
-        positions = _positions(trajectory)
+        poses = np.asarray(trajectory, np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+            raise ValueError(f"trajectory must be finite (n, 4, 4) poses, got {poses.shape}")
+        positions = poses[:, :3, 3]
         streets = streets_along(positions[:, :2], rng)
         support = with_equal_passes(positions) - [0.0, 0.0, _SENSOR_HEIGHT_M]
     terrain = make_terrain(rng, streets, support, kind)
@@ -96,13 +100,6 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     ground = primitives.Ground(*(jnp.asarray(x, jnp.float32) for x in (terrain.heights, terrain.origin, CELL_M)))
     whole = TownPrimitives(*standing.packed(), ground, _make_traffic(rng, streets, terrain, kind))
     return Town(f"{config.kind}-{seed}", streets, terrain, whole)
-
-
-def _positions(trajectory: ArrayLike) -> FloatArray:
-    poses = np.asarray(trajectory, np.float64)
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-        raise ValueError(f"trajectory must be finite (n, 4, 4) poses, got {poses.shape}")
-    return poses[:, :3, 3]
 
 
 def _make_traffic(rng: np.random.Generator, streets: Streets, terrain: Terrain, kind: Kind) -> RoadUsers:
@@ -129,9 +126,8 @@ def _users(
     """Draws rows of the road users of a lane: lane, path length, speed, distance to the left, half sizes."""
 
     def vehicle() -> tuple[float, float, float]:
-        if rng.random() < kind.trucks:
-            return (rng.uniform(3.2, 6.5), rng.uniform(1.15, 1.27), rng.uniform(1.3, 1.8))
-        return (rng.uniform(1.9, 2.5), rng.uniform(0.82, 0.95), rng.uniform(0.7, 0.9))
+        length, width, height = _TRUCK_M if rng.random() < kind.trucks else _CAR_M
+        return rng.uniform(*length), rng.uniform(*width), rng.uniform(*height)
 
     users: list[tuple[float, ...]] = [
         (lane, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *vehicle())

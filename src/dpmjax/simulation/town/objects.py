@@ -1,4 +1,4 @@
-"""Objects of a town as rows of primitives: houses, cars, hedges, poles, people, car parks, bridges.
+"""Objects of a town as rows of primitives: houses, cars, hedges, poles, people, car parks, bridges, trees, bushes.
 
 Each builder takes a place on the ground with a heading (the street's direction; the street lies to the object's right)
 and appends rows to a `Collection`.
@@ -10,9 +10,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dpmjax.sequences import FloatArray
+from dpmjax.simulation.town.kinds import Span
 from dpmjax.simulation.town.primitives import POLE, SOFT, SOLID, Bodies, pack_bodies
 
 _SUNK_M = 1.0  # Houses and walls reach below the ground, which may slope.
+_NUM_TUFTS = 5
+_BASE = 0.15  # Most of a conifer's crown begins at this part of its height.
 Size = tuple[float, float]
 
 
@@ -256,3 +260,52 @@ def put_bridge(into: Collection, rng: np.random.Generator, place: Place, half_wi
         put_box(into, place.move(0.0, side * (half_width + 1.8)), (0.8 * wide, 1.0), (-_SUNK_M, clear))
         bank = place.move(0.0, side * (0.5 * span + 1.5))
         put_box(into, bank, (wide, 3.0), (-_SUNK_M, clear + thick))
+
+
+def plant_trees(
+    into: Collection, rng: np.random.Generator, feet: FloatArray, height: Span, *, conifers: float = 0.0
+) -> None:
+    """Adds trees of random shape: a trunk, and a crown of tufts.
+
+    Args:
+        into: where to.
+        rng: source of their shapes.
+        feet: (n, 3) places on the ground.
+        height: lowest and highest of the trees, m.
+        conifers: share of trees with a narrow crown from near the ground.
+    """
+    count = len(feet)
+    tall, is_conifer = rng.uniform(*height, count), rng.random(count) < conifers
+    radius = np.where(is_conifer, 0.13, rng.uniform(0.16, 0.3, count)) * tall
+    base = np.where(is_conifer, _BASE, rng.uniform(0.15, 0.4, count)) * tall
+    thick = rng.uniform(0.012, 0.022, count) * tall
+    zero = np.zeros(count)
+    trunk = 0.5 * (base + tall)
+    middle = feet + np.column_stack([zero, zero, 0.5 * trunk - 0.2])
+    into.cylinders.extend(map(tuple, np.column_stack([middle, thick, thick, 0.5 * trunk + 0.2, zero, zero, zero])))
+    for index in range(_NUM_TUFTS):
+        part = (index + rng.uniform(0.2, 0.8, count)) / _NUM_TUFTS
+        level = base + part * (tall - base)
+        # A conifer narrows upwards; another crown is widest in its middle.
+        wide = np.where(is_conifer, 1.1 - part, 0.35 + 0.65 * np.sin(np.pi * part)) * radius
+        angle, out = rng.uniform(0, 2 * np.pi, count), np.where(is_conifer, 0.1, rng.uniform(0.2, 0.9, count)) * wide
+        at = feet + np.column_stack([out * np.cos(angle), out * np.sin(angle), level])
+        size, high = wide * rng.uniform(0.5, 0.9, count), (tall - base) / _NUM_TUFTS * rng.uniform(0.6, 1.1, count)
+        softness = rng.uniform(0.7, 2.2, count)
+        into.spheroids.extend(map(tuple, np.column_stack([at, size, size, high, zero, softness, zero])))
+
+
+def plant_bushes(into: Collection, rng: np.random.Generator, feet: FloatArray) -> None:
+    """Adds bushes, undergrowth and tall grass: one tuft each.
+
+    Args:
+        into: where to.
+        rng: source of their shapes.
+        feet: (n, 3) places on the ground.
+    """
+    count = len(feet)
+    radius, zero = rng.uniform(0.4, 1.7, count), np.zeros(count)
+    high = rng.uniform(0.25, 0.9, count) * radius
+    at = feet + np.column_stack([zero, zero, 0.6 * high])
+    softness = rng.uniform(0.15, 0.7, count)
+    into.spheroids.extend(map(tuple, np.column_stack([at, radius, radius, high, zero, softness, zero])))

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from dpmjax.checks import require_shape
 from dpmjax.geometry import se3
-from dpmjax.simulation.town.cast import Hits, Rays, cast_turn
-from dpmjax.simulation.town.culling import NearWorld, near_world
+from dpmjax.simulation.town.cast import Hits, NearWorld, Rays, cast_turn, near_world
 from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
 from dpmjax.types import AnyArray, PointCloud
 

@@ -68,11 +68,10 @@ def make_terrain(
     columns, rows = (int(-(-count // _TILE) * _TILE) for count in cells)
     distance = _street_distance(streets, low, (rows, columns))
     x, y = np.meshgrid(low[0] + CELL_M * np.arange(columns), low[1] + CELL_M * np.arange(rows))
-    land = (
-        _rolling(rng, x, y, rng.uniform(*kind.steepness))
-        if support is None
-        else _through(support, low, (rows, columns))
-    )
+    if support is None:
+        land = _rolling(rng, x, y, rng.uniform(*kind.steepness))
+    else:
+        land = _through(support, low, (rows, columns))
     return Terrain(low, land + _cross_section(distance) + kind.roughness * _roughness(rng, distance), distance)
 
 

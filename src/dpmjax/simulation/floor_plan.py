@@ -150,9 +150,7 @@ def _flights(rng: np.random.Generator) -> Plan:
 
 
 def _long_corridor(rng: np.random.Generator, *, is_tunnel: bool, stretch: float) -> Plan:
-    width, height = (
-        (rng.uniform(4, 8), rng.uniform(3.5, 6)) if is_tunnel else (rng.uniform(1.8, 4), rng.uniform(2.4, 3.4))
-    )
+    width, height = (rng.uniform(*span) for span in (((4, 8), (3.5, 6)) if is_tunnel else ((1.8, 4), (2.4, 3.4))))
     length = stretch * rng.uniform(40, 120)
     rooms, doors = [Room((0.0, -0.5 * width), (length, 0.5 * width), height)], []
     for x in np.arange(4, length - 10, length / 3)[: rng.integers(4)] + rng.uniform(0, 6):

@@ -11,11 +11,9 @@ import numpy as np
 
 from dpmjax.checks import require_one_of, require_positive_fields
 from dpmjax.sequences import FloatArray
-from dpmjax.simulation.indoors.plan import Door, Plan, Room, make_plan, make_route
-from dpmjax.simulation.town import primitives
-from dpmjax.simulation.town.objects import Collection, Place, put_box, put_car, put_person, put_pole
+from dpmjax.simulation.floor_plan import Door, Plan, Room, make_plan, make_route
+from dpmjax.simulation.town.objects import Collection, Place, plant_bushes, put_box, put_car, put_person, put_pole
 from dpmjax.simulation.town.primitives import CELL_M, Ground, RoadUsers, TownPrimitives
-from dpmjax.simulation.town.vegetation import plant_bushes
 
 _Put = Callable[[Collection, np.random.Generator, Place], None]
 KINDS = ("office", "hall", "flat", "corridor", "tunnel", "garage", "stairs")
@@ -104,10 +102,8 @@ def _floor(plan: Plan) -> Ground:
 
 
 def _nobody() -> RoadUsers:
-    empty = np.zeros((0, 3))
-    rows, flags = primitives.padded(empty, 64), primitives.mask_of(0, 64)
-    zero = rows[:, 0]
-    return RoadUsers(jnp.zeros((2, 64, 3)), jnp.ones(2), zero.astype(jnp.int32), zero, zero, zero, rows, flags)
+    none, lanes = jnp.zeros(64), jnp.zeros(64, jnp.int32)
+    return RoadUsers(jnp.zeros((2, 64, 3)), jnp.ones(2), lanes, none, none, none, jnp.zeros((64, 3)), none > 0)
 
 
 def _place(x: float, y: float, heading: float = 0.0) -> Place:
@@ -118,11 +114,8 @@ def _walls(into: Collection, rng: np.random.Generator, room: Room, doors: list[D
     """Adds four walls inside of the room's border, with openings for doors; outer walls may have windows."""
     for axis in (0, 1):
         for at, inwards in ((room.low[axis], 1), (room.high[axis], -1)):
-            cuts = sorted(
-                (d.place[1 - axis], d.width, d.height)
-                for d in doors
-                if d.axis == axis and abs(d.place[axis] - at) < 0.01
-            )
+            here = [door for door in doors if door.axis == axis and abs(door.place[axis] - at) < 0.01]
+            cuts = sorted((door.place[1 - axis], door.width, door.height) for door in here)
             depth = 0.08 if not cuts and rng.random() < 0.5 else 0.0
             start, across = room.low[1 - axis], at + 0.5 * inwards * _THICKNESS_M
             for middle, width, height in cuts:
@@ -148,12 +141,8 @@ def _ceiling(into: Collection, rng: np.random.Generator, room: Room) -> None:
     deep, step = rng.uniform(0.06, 0.12) * room.height, rng.uniform(2.0, 6.0)
     if rng.random() < 0.7:
         for x in np.arange(room.low[0] + rng.uniform(0.5, step), room.high[0] - 0.3, step):
-            put_box(
-                into,
-                _place(x, middle[1]),
-                (rng.uniform(0.1, 0.4), 0.98 * room.size[1]),
-                (room.height - deep, room.height),
-            )
+            size = (rng.uniform(0.1, 0.4), 0.98 * room.size[1])
+            put_box(into, _place(x, middle[1]), size, (room.height - deep, room.height))
     if rng.random() < 0.5:
         at = _place(middle[0], rng.uniform(room.low[1] + 0.5, room.high[1] - 0.5))
         put_box(into, at, (0.97 * room.size[0], 0.4), (room.height - 2.2 * deep, room.height - 1.2 * deep))
@@ -166,11 +155,12 @@ def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: Flo
     jitter = float(rng.choice([0.0, 0.25])) * step
     for y in (room.low[1] + 0.5 * deep + _THICKNESS_M, room.high[1] - 0.5 * deep - _THICKNESS_M):
         for x in np.arange(room.low[0] + rng.uniform(0.5, step), room.high[0] - 1, step):
-            place = _place(x + rng.normal(0, jitter), y) if rng.random() < 0.85 else None
-            if place is not None:
-                beside = np.abs(route - [place.x, place.y]) - [0.5 * wide, 0.5 * deep]
-                if np.max(beside, axis=1).min() > _PILLAR_CLEARANCE_M:
-                    put_box(into, place, (wide, deep), (0.0, high))
+            if rng.random() >= 0.85:
+                continue
+            place = _place(x + rng.normal(0, jitter), y)
+            beside = np.abs(route - [place.x, place.y]) - [0.5 * wide, 0.5 * deep]
+            if np.max(beside, axis=1).min() > _PILLAR_CLEARANCE_M:
+                put_box(into, place, (wide, deep), (0.0, high))
     for _ in range(rng.poisson(0.04 * room.size[0])):
         y = float(rng.choice([room.low[1] + 0.45, room.high[1] - 0.45]))
         spot = np.array([rng.uniform(room.low[0], room.high[0]), y])
@@ -214,9 +204,9 @@ def _furniture(into: Collection, rng: np.random.Generator, room: Room, route: Fl
     """Adds furniture along the walls and in the room, off the route."""
     area, inside = room.size[0] * room.size[1], np.minimum(1.0, 0.4 * np.array(room.size))
     beside: list[_Put] = [_put_cabinet, _put_cabinet, _put_desk, _put_plant]
-    within: list[_Put] = (
-        [_put_rack, _put_machine, _put_column, _put_plant, _put_stairs] if is_hall else [_put_desk, _put_machine]
-    )
+    within: list[_Put] = [_put_desk, _put_machine]
+    if is_hall:
+        within = [_put_rack, _put_machine, _put_column, _put_plant, _put_stairs]
     for _ in range(rng.poisson(0.7 * sum(room.size))):
         axis, end = int(rng.integers(2)), int(rng.integers(2))
         spot = rng.uniform(room.low, room.high)
@@ -301,6 +291,5 @@ def _put_stairs(into: Collection, rng: np.random.Generator, place: Place) -> Non
     for step in range(count):
         put_box(into, place.move(0.28 * step, 0.0), (0.28, wide), (0.0, 0.18 * (step + 1)))
         if step % 4 == 0:
-            put_box(
-                into, place.move(0.28 * step, 0.5 * wide), (1.1, 0.05), (0.18 * step, 0.18 * step + 1.0), softness=0.2
-            )
+            rail = place.move(0.28 * step, 0.5 * wide)
+            put_box(into, rail, (1.1, 0.05), (0.18 * step, 0.18 * step + 1.0), softness=0.2)

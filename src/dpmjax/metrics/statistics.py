@@ -1,14 +1,19 @@
-"""Shares and probabilities: intervals and comparisons of shares, area under the curve, Brier score."""
+"""Statistics: intervals and comparisons of shares, quality of probabilities, the Cramér-Rao bound of positions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from dpmjax.types import AnyArray
+
+# Beams whose range changes faster than this jump between obstacles.
+_STEEPEST = 10.0
 
 
 class Proportion(NamedTuple):
@@ -41,20 +46,16 @@ def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -
     Raises:
         ValueError: the numbers are not 0 <= num_right <= num_all, or the confidence is not between 0 and 1.
     """
+    from scipy import stats
+
     if not 0 <= num_right <= num_all:
         raise ValueError(f"num_right: expected 0 to num_all = {num_all}, got {num_right}")
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence: expected a number between 0 and 1, got {confidence}")
     if num_all == 0:
         return Proportion(np.nan, 0.0, 1.0)
-    share = num_right / num_all
-    z2 = float(special.ndtri(0.5 + 0.5 * confidence)) ** 2
-    centre = (num_right + 0.5 * z2) / (num_all + z2)
-    half = np.sqrt(z2 * (num_all * share * (1.0 - share) + 0.25 * z2)) / (num_all + z2)
-    # The ends are exact where none or all are right; rounding must not move them.
-    low = 0.0 if num_right == 0 else float(centre - half)
-    high = 1.0 if num_right == num_all else float(centre + half)
-    return Proportion(share, low, high)
+    low, high = stats.binomtest(num_right, num_all).proportion_ci(confidence, method="wilson")
+    return Proportion(num_right / num_all, float(low), float(high))
 
 
 def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray, " n"]) -> float:
@@ -131,3 +132,40 @@ def expected_calibration_error(
     bins = np.minimum((probabilities * num_bins).astype(int), num_bins - 1)
     gaps = np.bincount(bins, probabilities - labels, num_bins)
     return float(np.abs(gaps).sum() / len(labels))
+
+
+def position_bound(
+    cast_ranges: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    poses: ArrayLike,
+    *,
+    range_noise: float,
+    step: float = 0.5,
+) -> Float[np.ndarray, " n"]:
+    """The least error of position that an unbiased estimate from one scan can have, with the world known exactly.
+
+    The information of a scan is J^T J / noise^2, where J is the derivative of its ranges by x, y and heading (Kay 1993,
+    eq. 3.31). An estimate that must find the world too cannot do better. The root mean square over the scans of a
+    trajectory bounds its absolute trajectory error, up to the alignment of the trajectories (three of 3 n unknowns).
+
+    Args:
+        cast_ranges: ranges (m, b) of noise-free scans from poses (m, 3) in the world.
+        poses: (n, 3) x, y in the unit of the ranges, heading in radians.
+        range_noise: standard deviation of the noise of one range.
+        step: half step of the numeric derivative of ranges; in a world of pixels, half a pixel.
+
+    Returns:
+        (n,) root of the summed variances of x and y; infinite where the scan leaves a direction open.
+    """
+    at = np.asarray(poses, np.float64).reshape(-1, 3)
+    steps = np.diag([step, step, 1e-3])
+    jacobian = np.stack([(cast_ranges(at + d) - cast_ranges(at - d)) / (2.0 * d.sum()) for d in steps], axis=-1)
+    # A turn moves the end of a beam by its length.
+    ranges = cast_ranges(at)
+    steepness = np.abs(jacobian) / np.stack([np.ones_like(ranges), np.ones_like(ranges), ranges], axis=-1)
+    used = jacobian * (steepness < _STEEPEST).all(axis=-1, keepdims=True)
+    information = np.einsum("nbi,nbj->nij", used, used) / range_noise**2
+    bound = np.full(len(at), np.inf)
+    is_held = np.linalg.eigvalsh(information)[:, 0] > 1e-9 / range_noise**2
+    covariance = np.linalg.inv(information[is_held])
+    bound[is_held] = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+    return bound

@@ -1,0 +1,153 @@
+"""Scan files of a folder: which files are scans, their order, and the numbers and times in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dpmjax.io.files import natural_key
+from dpmjax.io.scan_file import SCAN_SUFFIXES
+from dpmjax.sequences import FloatArray, Note
+
+POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
+              "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+"""Usual names of files of reference poses in the lidar's frame."""
+_NUMBER = re.compile(r"\d+(?:\.\d+)?|\.\d+")
+# A number of that many digits is a time stamp: seconds since 1970, or a smaller unit.
+_STAMP_DIGITS = 10
+_LEAST_NUMBERED = 3
+
+
+def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
+    """Lists the scans of a folder in the order of their numbers: the files of the most frequent ending.
+
+    Args:
+        folder: searched folder, without its subfolders.
+        suffixes: endings of scans.
+
+    Returns:
+        The files, without those that `stray_note` names; none where there is no such folder.
+    """
+    most = _files_of_one_ending(folder, suffixes)
+    strays = strays_among(most)
+    return sort_scans([file for file in most if file not in strays])
+
+
+def stray_note(folder: Path) -> Note | None:
+    """Lists the files of a folder that have the ending of scans but are no scans, such as map.pcd.
+
+    Args:
+        folder: folder of the scans.
+
+    Returns:
+        The note, or None.
+    """
+    strays = strays_among(_files_of_one_ending(folder, SCAN_SUFFIXES))
+    if not strays:
+        return None
+    text = f"{folder}: {strays[0].name} is no scan, as its name has no number; {len(strays)} such left out"
+    return Note(text, is_doubt=True)
+
+
+def _files_of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Returns the files of the most frequent ending, unsorted."""
+    if not folder.is_dir():
+        return []
+    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in POSE_FILES]
+    return max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
+
+
+def _stem_of(file: Path) -> str:
+    """Returns the name without its endings, of which `.pcd.bin` has two."""
+    return file.name[: -len(".pcd.bin")] if file.name.lower().endswith(".pcd.bin") else file.stem
+
+
+def sort_scans(files: Sequence[Path]) -> list[Path]:
+    """Sorts scans by the numbers in their names: 2 before 10, and 0.05 before 0.1 where the numbers are decimals.
+
+    A number with a point is a decimal where the digits after the point differ in count and none of the longer ones ends
+    in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10.
+
+    Args:
+        files: files in any order.
+
+    Returns:
+        The files in order.
+    """
+    stems = [_stem_of(file) for file in files]
+    fractions = [piece.partition(".")[2] for stem in stems for piece in _NUMBER.findall(stem) if "." in piece]
+    is_decimal = len({len(fraction) for fraction in fractions}) > 1 and not any(
+        len(fraction) > 1 and fraction.endswith("0") for fraction in fractions
+    )
+    return sorted(files, key=lambda file: _decimal_key(_stem_of(file)) if is_decimal else natural_key(file.name))
+
+
+def _decimal_key(stem: str) -> tuple[tuple[int, float, str], ...]:
+    """Returns a sort key under which numbers, with their fractions, compare as numbers and come before text."""
+    pieces = [piece for piece in re.split(f"({_NUMBER.pattern})", stem) if piece]
+    return tuple((0, float(p), p) if _NUMBER.fullmatch(p) else (1, 0.0, p) for p in pieces)
+
+
+def strays_among(files: Sequence[Path]) -> list[Path]:
+    """Finds files without a number among three numbered ones at least, such as `map.pcd` among 0001.pcd, 0002.pcd.
+
+    Args:
+        files: files of one ending.
+
+    Returns:
+        The files that are no scans; empty where half of the files or more have no number.
+    """
+    plain = [file for file in files if not re.search(r"\d", _stem_of(file))]
+    num_numbered = len(files) - len(plain)
+    return plain if num_numbered >= max(_LEAST_NUMBERED, len(plain) + 1) else []
+
+
+def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
+    """Reads the time stamps that are the last numbers in the names: decimals, or numbers of ten digits or more.
+
+    Args:
+        files: the scans in order.
+
+    Returns:
+        (n,) in any unit; None where a name has none, or they do not increase.
+    """
+    found = [_NUMBER.findall(_stem_of(file)) for file in files]
+    last = [numbers[-1] if numbers else "" for numbers in found]
+    if not last or not all("." in number or _STAMP_DIGITS <= len(number) < 20 for number in last):
+        return None
+    stamps = np.array([float(number) for number in last])
+    return stamps if bool((np.diff(stamps) > 0).all()) else None
+
+
+def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
+    """Returns the numbers in the names of files.
+
+    Args:
+        files: the scans.
+        largest: largest valid number.
+
+    Returns:
+        One number a file, or None where a name is no number or too large.
+    """
+    names = [_stem_of(file) for file in files]
+    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
+    return [int(name) for name in names] if is_good else None
+
+
+def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None:
+    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
+
+    Args:
+        rows: (m, ...) values.
+        files: the n scans.
+
+    Returns:
+        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
+    """
+    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
+    return None if numbers is None else rows[list(numbers)]
