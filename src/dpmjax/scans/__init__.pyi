@@ -1,6 +1,4 @@
 from .augment import AugmentConfig as AugmentConfig
-from .augment import BoxConfig as BoxConfig
-from .augment import SectorConfig as SectorConfig
 from .augment import augment_scan as augment_scan
 from .deskew import deskew as deskew
 from .deskew import offsets_by_azimuth as offsets_by_azimuth
