@@ -28,7 +28,7 @@ from dpmjax.deeppointmap.overlap_prediction import overlap_probability
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
-from dpmjax.scans.plane_information import WeakDirection
+from dpmjax.scans.weak_directions import WeakDirection
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, Registration, Verification
 
 NUM_THREADS = 2

@@ -26,6 +26,9 @@ from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, orth
 KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
 TRIANGLE = np.triu_indices(6)
 MAX_ROTATION_ERROR = 1e-4
+NUMBERS = {"scan": np.int64, "segment": np.int32, "path_m": np.float64, "extent_m": np.float64}
+"""Numbers of a keyframe, and their types in the file."""
+
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -62,25 +65,6 @@ class ArrayReader:
             raise ValueError(f"{name}: expected shape ({expected}), got {array.shape} {array.dtype}")
         return array
 
-    def take_rows(self, name: str, num_keyframes: int) -> list[slice]:
-        """Returns the rows of each keyframe in ragged arrays.
-
-        Args:
-            name: name of the array of their numbers.
-            num_keyframes: number of keyframes.
-
-        Returns:
-            One slice a keyframe.
-
-        Raises:
-            ValueError: if a number is negative.
-        """
-        counts = self.take(name, num_keyframes, kind="iu").astype(np.int64)
-        if counts.min(initial=0) < 0 or counts.max(initial=0) > 1 << 32:
-            raise ValueError(f"{name}: expected numbers of rows, got {counts.min()} to {counts.max()}")
-        ends = np.cumsum(counts)
-        return [slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True)]
-
 
 def pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of poses and edges.
@@ -93,17 +77,14 @@ def pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
         The arrays by name.
     """
     dtype = np.float64 if precision == "float32" else np.float32
-    keyframes, edges = slam_map.keyframes, slam_map.edges
+    edges = slam_map.edges
 
-    def poses(of_all: Iterable[NDArray[Any]]) -> NDArray[Any]:
-        return np.array([T[:3] for T in of_all], dtype).reshape(-1, 3, 4)
+    def poses(T: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        return np.array([pose[:3] for pose in T], dtype).reshape(-1, 3, 4)
 
     return {
-        "scan": np.array([keyframe.scan for keyframe in keyframes], np.int64),
-        "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
-        "path_m": np.array([keyframe.path_m for keyframe in keyframes], np.float64),
-        "extent_m": np.array([keyframe.extent_m for keyframe in keyframes], np.float64),
-        "T_odometry_keyframe": poses(keyframe.T_odometry_keyframe for keyframe in keyframes),
+        **{name: slam_map.column(name).astype(kind) for name, kind in NUMBERS.items()},
+        "T_odometry_keyframe": poses(slam_map.column("T_odometry_keyframe")),
         "T_world_keyframe": poses(slam_map.T_world_keyframe),
         "vectors": slam_map.vectors.astype(np.float32 if precision == "float32" else np.float16),
         "edge_rows": np.array([edge[:2] for edge in edges], np.int32).reshape(-1, 2),
@@ -128,28 +109,27 @@ def unpack_graph(reader: ArrayReader, scans: Sequence[CompactScan], origin: MapO
         ValueError: if arrays are missing or do not fit together.
     """
     k = len(scans)
-    numbers = [reader.take(name, k, kind=kind) for name, kind in (("scan", "i"), ("path_m", "f"), ("segment", "i"))]
-    extents = reader.take("extent_m", k)
-    if extents.min() <= 0 or numbers[0].min() < 0:
+    numbers = {name: reader.take(name, k, kind=np.dtype(kind).kind) for name, kind in NUMBERS.items()}
+    if numbers["extent_m"].min() <= 0 or numbers["scan"].min() < 0:
         raise ValueError("extent_m and scan: expected numbers above 0")
     T_odometry, T_world = (_poses(reader, name, k) for name in ("T_odometry_keyframe", "T_world_keyframe"))
-    described = zip(*(array.tolist() for array in numbers), extents.tolist(), T_odometry, scans, strict=True)
-    keyframes = (Keyframe(scan, T, path_m, seg, extent, found) for scan, path_m, seg, extent, T, found in described)
     rows = reader.take("edge_rows", None, 2, kind="i")
     kinds = reader.take("edge_kind", len(rows), kind="u")
-    triangles = reader.take("edge_information", len(rows), 21).astype(np.float64)
     if rows.min(initial=0) < 0 or rows.max(initial=-1) >= k or kinds.max(initial=0) >= len(KINDS):
         raise ValueError(f"edge_rows and edge_kind: expected rows of {k} keyframes and {len(KINDS)} kinds")
     information = np.zeros((len(rows), 6, 6))
-    for one, other in (TRIANGLE, TRIANGLE[::-1]):
-        information[:, one, other] = triangles
-    T_edges = _poses(reader, "edge_T", len(rows))
-    edges = (
-        MapEdge(int(source), int(target), T, matrix, KINDS[kind])
-        for (source, target), T, matrix, kind in zip(rows, T_edges, information, kinds.tolist(), strict=True)
+    information[:, *TRIANGLE] = information[:, *TRIANGLE[::-1]] = reader.take("edge_information", len(rows), 21)
+    columns = zip(*(array.tolist() for array in numbers.values()), T_odometry, scans, strict=True)
+    edges = zip(*rows.T.tolist(), _poses(reader, "edge_T", len(rows)), information, kinds, strict=True)
+    return KeyframeMap(
+        tuple(
+            Keyframe(scan, T, path_m, segment, extent_m, kept) for scan, segment, path_m, extent_m, T, kept in columns
+        ),
+        T_world,
+        reader.take("vectors", k, None).astype(np.float32),
+        tuple(MapEdge(source, target, T, matrix, KINDS[kind]) for source, target, T, matrix, kind in edges),
+        origin,
     )
-    vectors = reader.take("vectors", k, None).astype(np.float32)
-    return KeyframeMap(tuple(keyframes), T_world, vectors, tuple(edges), origin)
 
 
 def _poses(reader: ArrayReader, name: str, count: int) -> NDArray[np.float64]:
@@ -178,12 +158,13 @@ def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     if precision == "int8":
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
     elements = [_of_length(scan.elements, num_elements) for scan in scans]
-    arrays = {"directions": np.stack([scan.directions for scan in scans])}
-    arrays |= _pack_images([scan.image for scan in scans])
+    arrays = {"directions": np.stack([scan.directions for scan in scans]), **_pack_images(scans)}
     if precision == "int8":
         features = np.concatenate([scan.features * scan.feature_steps[:, None] for scan in scans])
-        arrays |= _prefixed("feature", encode_features(features)) | _prefixed("element", encode_elements(elements))
-        return arrays
+        codes_of = {"feature": encode_features(features)._asdict(), "element": encode_elements(elements)._asdict()}
+        return arrays | {
+            f"{name}_{field}": np.asarray(value) for name, codes in codes_of.items() for field, value in codes.items()
+        }
     arrays |= {name: np.stack([getattr(scan, name) for scan in scans]) for name in ("features", "feature_steps")}
     return arrays | {
         f"element_{name}": np.stack([getattr(one, name) for one in elements]) for name in CompactElements._fields
@@ -209,8 +190,6 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
     if k == 0 or len(mask) != k or m > n:
         raise ValueError(f"element_mask: expected rows of {k} keyframes with {m} descriptors or more, got {mask.shape}")
     if precision == "int8":
-        features = decode_features(_feature_codes(reader, k * m)).reshape(k, m, -1)
-        rounded = [round_features(one) for one in features]
         codes = ElementCodes(
             reader.take("element_positions", k, 3, n, kind="i"),
             reader.take("element_normals", k, 2, n, kind="i"),
@@ -218,16 +197,22 @@ def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]
             mask,
         )
         elements = decode_elements(codes)
+        features = decode_features(_feature_codes(reader, k * m)).reshape(k, m, -1)
+        rounded = [round_features(one) for one in features]
     else:
+        columns = zip(
+            reader.take("element_unit_m", k).tolist(),
+            reader.take("element_positions", k, n, 3, kind="i"),
+            reader.take("element_normals", k, n, 3, kind="i"),
+            reader.take("element_planarity", k, n, kind="u"),
+            mask,
+            strict=True,
+        )
+        elements = [CompactElements(*parts) for parts in columns]
         steps = reader.take("feature_steps", k, m)
         rounded = list(zip(reader.take("features", k, m, None, kind="i"), steps, strict=True))
-        units_m, positions = reader.take("element_unit_m", k), reader.take("element_positions", k, n, 3, kind="i")
-        normals = reader.take("element_normals", k, n, 3, kind="i")
-        planarity = reader.take("element_planarity", k, n, kind="u")
-        columns = zip(units_m.tolist(), positions, normals, planarity, mask, strict=True)
-        elements = [CompactElements(*parts) for parts in columns]
     parts_of_scans = zip(elements, rounded, directions, _unpack_images(reader, k), strict=True)
-    return [CompactScan(one, *codes_of, angles, image) for one, codes_of, angles, image in parts_of_scans]
+    return [CompactScan(one, *features_of, angles, image) for one, features_of, angles, image in parts_of_scans]
 
 
 def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
@@ -238,10 +223,6 @@ def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
     return CompactElements(elements.unit_m, *padded)
 
 
-def _prefixed(name: str, codes: FeatureCodes | ElementCodes) -> Arrays:
-    return {f"{name}_{field}": np.asarray(value) for field, value in codes._asdict().items()}
-
-
 def _feature_codes(reader: ArrayReader, num_descriptors: int) -> FeatureCodes:
     codes = reader.take("feature_codes", None, num_descriptors, kind="i")
     mean = reader.take("feature_mean", None)
@@ -249,7 +230,8 @@ def _feature_codes(reader: ArrayReader, num_descriptors: int) -> FeatureCodes:
     return FeatureCodes(mean, basis, float(reader.take("feature_step")), codes)
 
 
-def _pack_images(images: Sequence[CompactImage]) -> Arrays:
+def _pack_images(scans: Sequence[CompactScan]) -> Arrays:
+    images = [scan.image for scan in scans]
     return {
         "image_count": np.array([len(image.nearest) for image in images], np.int32),
         "image_num_rows": np.array([image.num_rows for image in images], np.int32),
@@ -260,14 +242,12 @@ def _pack_images(images: Sequence[CompactImage]) -> Arrays:
 
 
 def _unpack_images(reader: ArrayReader, k: int) -> list[CompactImage]:
-    rows = reader.take_rows("image_count", k)
-    num_rows, first_rows = (reader.take(f"image_{name}", k, kind="i").tolist() for name in ("num_rows", "first_row"))
-    nearest = reader.take("image_nearest", rows[-1].stop, None, kind="u")
+    counts, num_rows, first_rows = (
+        reader.take(f"image_{name}", k, kind="iu").astype(np.int64) for name in ("count", "num_rows", "first_row")
+    )
+    if (np.minimum(counts, first_rows) < 0).any() or (first_rows + counts > num_rows).any() or num_rows.max() > 1 << 16:
+        raise ValueError("image_count and image_first_row: expected rows within the image")
+    nearest = reader.take("image_nearest", int(counts.sum()), None, kind="u")
     farthest = reader.take("image_farthest", *nearest.shape, kind="u")
-    for part, num, first in zip(rows, num_rows, first_rows, strict=True):
-        if not 0 <= first <= first + part.stop - part.start <= num <= 1 << 16:
-            raise ValueError("image_first_row: expected rows within the image")
-    return [
-        CompactImage(num, first, nearest[part], farthest[part])
-        for num, first, part in zip(num_rows, first_rows, rows, strict=True)
-    ]
+    parts = (np.split(codes, np.cumsum(counts)[:-1]) for codes in (nearest, farthest))
+    return [CompactImage(*image) for image in zip(num_rows.tolist(), first_rows.tolist(), *parts, strict=True)]

@@ -1,13 +1,13 @@
 from .augment import AugmentConfig as AugmentConfig
 from .augment import augment_scan as augment_scan
-from .deskew import deskew as deskew
-from .deskew import offsets_by_azimuth as offsets_by_azimuth
-from .deskew import offsets_by_times as offsets_by_times
+from .corrections import deskew as deskew
+from .corrections import offsets_by_azimuth as offsets_by_azimuth
+from .corrections import offsets_by_times as offsets_by_times
+from .corrections import raise_beams as raise_beams
 from .element_alignment import ELEMENT_ALIGNMENT as ELEMENT_ALIGNMENT
 from .element_alignment import ElementAlignment as ElementAlignment
 from .element_alignment import align_elements as align_elements
 from .element_alignment import align_elements_on_host as align_elements_on_host
-from .elevation import raise_beams as raise_beams
 from .preprocess import PreprocessConfig as PreprocessConfig
 from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host
