@@ -14,7 +14,6 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.scans.corrections import deskew
-from dpmjax.slam import local_map as local_maps
 from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
     Keyframe,
@@ -28,7 +27,16 @@ from dpmjax.slam.keyframes import (
     turn_rad,
     with_origin,
 )
-from dpmjax.slam.local_map import RECENT_SHARE, LocalMap, PlacedElements, placed_scan
+from dpmjax.slam.local_map import (
+    RECENT_SHARE,
+    LocalMap,
+    PlacedElements,
+    joined_surface,
+    local_map_of,
+    nearest_keyframe,
+    placed_scan,
+    with_scan,
+)
 from dpmjax.types import AnyArray
 
 KEYFRAME_RAD = 0.6
@@ -196,7 +204,7 @@ def place_scan(
         report = report._replace(status="first", reason=reason, T_keyframe_scan=np.eye(4), score=1.0)
         located = Located(report, diagonal_information(UNKNOWN_M, np.pi))
         return _make_keyframe(methods, state, slam_map, thinned, located)
-    local_map = state.local_map or local_maps.local_map_of(slam_map, state.recent, methods.config.odometry)
+    local_map = state.local_map or local_map_of(slam_map, state.recent, methods.config.odometry)
     state = state._replace(local_map=local_map)
     located = _locate(methods, state, local_map, thinned, report)
     if located.report.status == "restarted" or _is_keyframe(methods, located.report, thinned):
@@ -207,9 +215,9 @@ def place_scan(
         # Around a lidar that stands still, people move: the map of before fits less and less.
         is_changed = bool(state.scores) and report.score < GOOD_SHARE * state.usual_score
         spacing_m = 0.0 if is_changed else RECENT_SHARE * thinned.extent_m
-        recent = local_maps.with_scan(state.recent, placed, spacing_m, methods.config.odometry)
+        recent = with_scan(state.recent, placed, spacing_m, methods.config.odometry)
         if recent is not state.recent:
-            surface = local_maps.joined_surface((*local_map.keyframes, *recent))
+            surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
     return after, slam_map, report
 
@@ -279,7 +287,7 @@ def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sc
         if tracked.score >= good_score:
             return _Attempt(tracked, tracked)
     compact = methods.matcher.encode(scan)
-    row = local_maps.nearest_keyframe(local_map, predicted[:3, 3])
+    row = nearest_keyframe(local_map, predicted[:3, 3])
     proposal = methods.matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
     starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
     best = matched = geometry.search(local_map, scan, starts)
@@ -336,7 +344,7 @@ def _make_keyframe(
     spacing_m = RECENT_SHARE * scan.extent_m
     after = _advanced(state, report)._replace(
         is_begun=True,
-        recent=local_maps.with_scan(moved, placed, spacing_m, methods.config.odometry),
+        recent=with_scan(moved, placed, spacing_m, methods.config.odometry),
         local_map=None,
         T_keyframe_last=np.eye(4),
     )
