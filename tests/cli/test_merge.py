@@ -15,7 +15,7 @@ from dpmjax.cli.program import main
 from dpmjax.cli.result_files import load_json
 from dpmjax.slam import JoinedMaps, MergedMaps
 from dpmjax.slam.keyframes import MapEdge
-from dpmjax.slam.reports import Loop
+from dpmjax.slam.loops import Loop
 from tests.deeppointmap import toy
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
 
 from dpmjax import io, simulation
 from dpmjax.geometry.sampling import typical_range
@@ -22,7 +23,6 @@ from dpmjax.registration_rgbd import (
     initialize_depth,
     projective_consistency,
 )
-from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
 from dpmjax.registration_rgbd.depth_images import PixelSample
 from dpmjax.registration_rgbd.initialization import _best_that_differ, _explained, _window
 from dpmjax.registration_rgbd.motion_search import (

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import rigid
-from dpmjax.scans import AugmentConfig, BoxConfig, SectorConfig, augment_scan
+from dpmjax.scans import AugmentConfig, augment, augment_scan
 from dpmjax.scans.augment import (
+    BOX_GAP_M,
     JITTER_CLIP_SIGMAS,
     is_behind_box,
     is_behind_boxes,
@@ -109,11 +110,12 @@ def test_jitter_is_clipped() -> None:
     assert 0 < nearest.max() <= 0.1 * JITTER_CLIP_SIGMAS * np.sqrt(3) + 1e-5
 
 
-def test_sectors_hide_a_wedge_from_some_range_on() -> None:
+def test_sectors_hide_a_wedge_from_some_range_on(monkeypatch) -> None:
     angle, radius = np.meshgrid(np.linspace(-np.pi, np.pi, 720, endpoint=False), [1.0, 4.9, 5.1, 40.0])
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=-1).astype(np.float32)
-    config = SectorConfig(max_count=1, width_deg=(60.0, 60.0), min_range_m=(5.0, 5.0))
-    hide = jax.jit(lambda key: is_behind_sectors(points.reshape(-1, 3), config, key=key))
+    for name, value in (("MAX_SECTORS", 1), ("SECTOR_WIDTH_DEG", (60.0, 60.0)), ("SECTOR_MIN_RANGE_M", (5.0, 5.0))):
+        monkeypatch.setattr(augment, name, value)
+    hide = jax.jit(lambda key: is_behind_sectors(points.reshape(-1, 3), key=key))
     for key in KEYS[:5]:
         hidden = np.asarray(hide(key)).reshape(radius.shape)
         assert not hidden[:2].any()
@@ -149,10 +151,9 @@ def test_box_shadow_is_that_of_dense_samples_on_the_beam(seed: int) -> None:
 
 def test_boxes_never_hide_what_is_nearer_than_their_gap() -> None:
     directions = np.random.default_rng(0).normal(size=(500, 3))
-    near = (2.9 * directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
-    far = 20 * near
-    config = BoxConfig(gap_m=(3.0, 6.0))
-    hide = jax.jit(jax.vmap(lambda key, points: is_behind_boxes(points, config, key=key), (0, None)))
+    near = (0.97 * BOX_GAP_M[0] * directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    far = 60 * near
+    hide = jax.jit(jax.vmap(lambda key, points: is_behind_boxes(points, key=key), (0, None)))
     assert not np.any(hide(jnp.stack(KEYS), near))
     assert np.any(hide(jnp.stack(KEYS), far))
 
@@ -187,13 +188,10 @@ def test_wrong_numbers_are_named() -> None:
         ("box_probability", -1.0),
         ("max_tilt_rad", -0.1),
         ("tilt_power", 0.5),
+        ("sparse_points", (3.0, 1.0)),
     ):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             AugmentConfig(**{name: value})
-    with pytest.raises(ValueError, match="^width_deg: expected"):
-        SectorConfig(width_deg=(3.0, 1.0))
-    with pytest.raises(ValueError, match="^max_count: expected"):
-        BoxConfig(max_count=0)
 
 
 def test_sparse_scans_keep_as_many_points_as_is_drawn() -> None:

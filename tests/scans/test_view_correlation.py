@@ -56,5 +56,5 @@ def test_what_has_no_upright_surface_gives_no_motion() -> None:
 
 
 def test_settings_out_of_range_are_named() -> None:
-    with pytest.raises(ValueError, match="cell_m"):
-        ViewCorrelationConfig(cell_m=0)
+    with pytest.raises(ValueError, match="num_motions"):
+        ViewCorrelationConfig(num_motions=-1)

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import rigid
+from dpmjax.scans.compact import compact_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe
 from dpmjax.slam.local_map import (
-    RECENT_SHARE,
     PlacedElements,
     joined_surface,
     local_map_of,
     nearest_keyframe,
+    placed_keyframe,
     placed_scan,
     with_scan,
 )
@@ -25,8 +26,7 @@ from tests.slam.truth import compact_of, laps, number_of, pose
 
 CONFIG = OdometryConfig(num_keyframes=5, num_recent=3)
 TRUTH = laps(1, side_m=20.0, step_m=2.0)
-EXTENT_M = 10.0
-SPACING_M = RECENT_SHARE * EXTENT_M
+SPACING_M = 0.8
 
 
 def chain(T_world_keyframe: np.ndarray, missing_edge: int | None = None) -> KeyframeMap:
@@ -38,14 +38,9 @@ def chain(T_world_keyframe: np.ndarray, missing_edge: int | None = None) -> Keyf
     return slam_map
 
 
-def elements_at(x: float, planarity: float = 1.0) -> SurfaceElements:
-    """Two elements, of which the second is not there."""
-    return SurfaceElements(
-        np.float32([[x, 0, 0], [7, 7, 7]]),
-        np.float32([[0, 0, 1]] * 2),
-        np.float32([planarity] * 2),
-        np.array([True, False]),
-    )
+def placed_at(T: np.ndarray, x: float) -> PlacedElements:
+    """A scan of one element, whose first coordinate is x."""
+    return PlacedElements(T, np.float32([[x, 0, 0]]), np.float32([[0, 0, 1]]), np.float32([1]))
 
 
 def numbers(slam_map: KeyframeMap, config: OdometryConfig = CONFIG) -> list[int]:
@@ -86,53 +81,48 @@ def test_a_local_map_moves_with_the_frame_of_the_map() -> None:
 
 
 def test_a_scan_that_adds_nothing_does_not_join() -> None:
-    recent = (PlacedElements(np.eye(4), elements_at(5.0)),)
+    recent = (placed_at(np.eye(4), 5.0),)
     for T in (pose(0, 0, 0), pose(0.99 * SPACING_M, 0, 0), pose(0, 0, 0.16)):
-        assert with_scan(recent, PlacedElements(T, elements_at(5.0)), EXTENT_M, CONFIG) is recent
+        assert with_scan(recent, placed_at(T, 5.0), SPACING_M, CONFIG) is recent
     for T in (pose(1.01 * SPACING_M, 0, 0), pose(0, 0, 0.18)):
-        placed = PlacedElements(T, elements_at(5.0))
-        joined = with_scan(recent, placed, EXTENT_M, CONFIG)
+        placed = placed_at(T, 5.0)
+        joined = with_scan(recent, placed, SPACING_M, CONFIG)
         assert joined == (*recent, placed)
         # The distance is that from the last scan that has joined.
-        assert with_scan(joined, placed, EXTENT_M, CONFIG) is joined
-        assert len(with_scan(joined, recent[0], EXTENT_M, CONFIG)) == 3
-    assert with_scan((), recent[0], EXTENT_M, CONFIG) == recent
+        assert with_scan(joined, placed, SPACING_M, CONFIG) is joined
+        assert len(with_scan(joined, recent[0], SPACING_M, CONFIG)) == 3
+    assert with_scan((), recent[0], SPACING_M, CONFIG) == recent
     # People move around a lidar that stands still.
-    here = PlacedElements(np.eye(4), elements_at(6.0))
-    assert with_scan(recent, here, EXTENT_M, CONFIG, is_changed=True) == (*recent, here)
+    here = placed_at(np.eye(4), 6.0)
+    assert with_scan(recent, here, 0.0, CONFIG) == (*recent, here)
 
 
 def test_the_oldest_of_too_many_scans_leaves() -> None:
     recent: tuple[PlacedElements, ...] = ()
     for step in range(1, 6):
-        recent = with_scan(recent, PlacedElements(pose(step, 0, 0), elements_at(5.0 + step)), EXTENT_M, CONFIG)
+        recent = with_scan(recent, placed_at(pose(step, 0, 0), 5.0 + step), SPACING_M, CONFIG)
     assert [placed.T_map_scan[0, 3] for placed in recent] == [3, 4, 5]
     surface = local_map_of(chain(TRUTH[:3]), recent, CONFIG).surface
     np.testing.assert_allclose(sorted(surface.points[-3:, 0]), [8 + 3, 9 + 4, 10 + 5], atol=1e-5)
     assert len(surface.points) == 3 + 3
-    assert with_scan((), recent[0], EXTENT_M, replace(CONFIG, num_recent=0)) == ()
+    assert sorted(surface.samples) == list(range(6))
+    assert with_scan((), recent[0], SPACING_M, replace(CONFIG, num_recent=0)) == ()
 
 
 def test_a_placed_scan_has_the_flat_elements() -> None:
-    rough = SurfaceElements(np.eye(3), np.eye(3), np.array([1.0, 0.05, 0.5]), np.ones(3, bool))
-    placed = placed_scan(surface_of_elements(rough), pose(1, 0, 0))
-    np.testing.assert_array_equal(placed.elements.positions, np.eye(3)[[0, 2]])
-    np.testing.assert_array_equal(placed.elements.planarity, np.float32([1.0, 0.5]))
-    assert placed.elements.positions.dtype == placed.elements.normals.dtype == np.float32
+    rough = SurfaceElements(np.eye(4)[:, :3], np.eye(4)[:, :3], np.array([1.0, 0.05, 0.5, 1.0]), np.arange(4) < 3)
+    expanded = compact_of(0)._replace(elements=compact_elements(rough))
+    for placed in (placed_scan(surface_of_elements(rough), pose(1, 0, 0)), placed_keyframe(expanded, pose(1, 0, 0))):
+        np.testing.assert_allclose(placed.positions, np.eye(3)[[0, 2]], atol=1e-4)
+        np.testing.assert_allclose(placed.planarity, [1.0, 0.5], atol=1 / 255)
+        assert placed.positions.dtype == placed.normals.dtype == placed.planarity.dtype == np.float32
 
 
 def test_elements_of_a_turned_scan_are_turned() -> None:
-    wall = replace(elements_at(5.0), normals=np.float32([[1, 0, 0]] * 2))
-    joined = joined_surface([PlacedElements(pose(1.0, 2.0, np.pi / 2), wall)])
-    np.testing.assert_allclose(joined.points[-1], [1.0, 7.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(joined.normals[-1], [0.0, 1.0, 0.0], atol=1e-6)
-
-
-def test_elements_without_a_plane_stay_out() -> None:
-    recent = (PlacedElements(pose(3, 0, 0), elements_at(5.0, planarity=0.05)),)
-    without, joined = (local_map_of(chain(TRUTH[:3]), some, CONFIG).surface for some in ((), recent))
-    np.testing.assert_array_equal(joined.points, without.points)
-    assert sorted(joined.samples) == list(range(3))
+    wall = placed_at(pose(1.0, 2.0, np.pi / 2), 5.0)._replace(normals=np.float32([[1, 0, 0]]))
+    joined = joined_surface([wall])
+    np.testing.assert_allclose(joined.points, [[1.0, 7.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(joined.normals, [[0.0, 1.0, 0.0]], atol=1e-6)
 
 
 @pytest.mark.parametrize("row", range(5))

@@ -7,16 +7,15 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.surface_alignment import PlanePairs
+from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
 from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, nearest_pairs
+from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, most_similar, nearest_pairs
 from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
-from dpmjax.slam.loop_consistency import are_consistent
+from dpmjax.slam.loops import Loop, LoopState, are_consistent
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.reports import Loop, LoopState
-from dpmjax.slam.retrieval import most_similar, pooled_vector
+from dpmjax.slam.matcher import pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 
@@ -41,7 +40,7 @@ def map_of(T_world_keyframe: np.ndarray, *, sigma_m: float = 0.0, segments=None,
 def loop_between(truth: np.ndarray, source: int, target: int, error=None, status="accepted") -> Loop:
     T = rigid.inverse(truth[target]) @ truth[source]
     T = T if error is None else T @ error
-    return Loop(source, target, "distance", status, 1.0, 0.9, 0.2, T)
+    return Loop(source, target, "distance", status, 1.0, 0.9, 0.2, T, diagonal_information(0.2, 0.02))
 
 
 def test_a_vector_finds_itself() -> None:
@@ -80,9 +79,7 @@ def test_candidates_are_old_and_near() -> None:
     truth = laps(2, side_m=40.0, step_m=2.0)
     slam_map = map_of(truth)
     row = len(truth) - 1
-    near = [
-        candidate.row for candidate in find_loop_candidates(slam_map, row, CONFIG) if candidate.found_by == "distance"
-    ]
+    near = [loop.target for loop in find_loop_candidates(slam_map, row, CONFIG) if loop.found_by == "distance"]
     assert row - len(truth) // 2 in near
     for candidate in near:
         assert slam_map.keyframes[row].path_m - slam_map.keyframes[candidate].path_m > 40.0
@@ -153,7 +150,7 @@ def test_a_wrong_loop_is_taken_back() -> None:
     loops = [loop_between(truth, half + row, row) for row in range(0, 40, 8)]
     wrong = [loop_between(truth, 70, 20), loop_between(truth, 71, 21)]
     wrong = [loop._replace(T_target_source=pose(1.0, 1.0, 0.3)) for loop in wrong]
-    after, state = optimize_map(slam_map, LoopState((*loops, *wrong)), CONFIG)
+    after, state = optimize_map(slam_map, LoopState((*loops, *wrong)))
     assert [loop.status for loop in state.loops] == ["accepted"] * 5 + ["taken back"] * 2
     assert sum(edge.kind == "loop" for edge in after.edges) == 5
     before, found = (
@@ -166,8 +163,7 @@ def test_an_alignment_is_as_exact_as_its_planes_and_the_configuration_say() -> N
     rng = np.random.default_rng(0)
     points = rng.uniform(-10, 10, (300, 3))
     normals = np.eye(3)[rng.integers(1, 3, 300)]  # walls and floor of a corridor along x
-    ones = np.ones(300)
-    pairs = PlanePairs(points, rng.normal(0, 0.02, 300), normals, ones, ones)
+    pairs = PlanePairs(points, rng.normal(0, 0.02, 300), normals)
     T = pose(3.0, -1.0, 0.4)
     information = with_least_covariance(plane_information(pairs, T, max_residual_m=0.15), 0.1, 0.02)
     covariance = np.linalg.inv(information)
@@ -176,7 +172,7 @@ def test_an_alignment_is_as_exact_as_its_planes_and_the_configuration_say() -> N
     assert np.sqrt(along @ covariance[:3, :3] @ along) > 5.0
     np.testing.assert_allclose(np.sqrt(across @ covariance[:3, :3] @ across), 0.1, atol=0.01)
     assert (np.linalg.eigvalsh(covariance - np.diag([0.01] * 3 + [0.0004] * 3)) > -1e-9).all()
-    few = PlanePairs(points[:3], np.zeros(3), normals[:3], ones[:3], ones[:3])
+    few = PlanePairs(points[:3], np.zeros(3), normals[:3])
     assert np.linalg.inv(plane_information(few, T, max_residual_m=0.15))[0, 0] > 50.0
 
 
@@ -188,7 +184,7 @@ def test_a_part_starts_where_a_loop_says() -> None:
     T_world_keyframe[40:] = pose(3000.0, -800.0, 3.0) @ T_world_keyframe[40:]
     apart = KeyframeMap(slam_map.keyframes, T_world_keyframe, slam_map.vectors, tuple(edges))
     loops = tuple(loop_between(truth, 79 - row, row) for row in (0, 3))
-    after, state = optimize_map(apart, LoopState(loops), CONFIG)
+    after, state = optimize_map(apart, LoopState(loops))
     assert all(loop.status == "accepted" for loop in state.loops)
     np.testing.assert_allclose(after.T_world_keyframe, truth, atol=1e-3)
 
@@ -206,7 +202,7 @@ def test_a_guess_gives_way_to_loops() -> None:
     T_world_keyframe[40:] = pose(30.0, 80.0, 1.0) @ T_world_keyframe[40:]
     lost = KeyframeMap(slam_map.keyframes, T_world_keyframe, slam_map.vectors, tuple(edges))
     loops = tuple(loop_between(moved, row, row - 40) for row in (45, 50))
-    after, _ = optimize_map(lost, LoopState(loops), CONFIG)
+    after, _ = optimize_map(lost, LoopState(loops))
     np.testing.assert_allclose(after.T_world_keyframe, moved, atol=1e-3)
 
 

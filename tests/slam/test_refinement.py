@@ -11,7 +11,7 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import KeyframeMap, SlamConfig, SlamMethods, refine_keyframes, refinement, run_slam
+from dpmjax.slam import KeyframeMap, SlamConfig, SlamMethods, map_optimization, refine_keyframes, run_slam
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 TRUTH = laps(1, side_m=60.0, step_m=2.0)
@@ -40,14 +40,14 @@ def use_fit(patch: pytest.MonkeyPatch, slam_map: KeyframeMap, kept: str = "fit")
         rows = [int(cloud[0, 0]) for cloud in clouds]
         return SimpleNamespace(T_world_scan=start[0] @ rigid.inverse(true[rows[0]]) @ true[rows], kept=kept)
 
-    patch.setattr(refinement, "register_clouds", fit)
+    patch.setattr(map_optimization, "register_clouds", fit)
 
 
 @pytest.mark.parametrize("num", [1, 2, 31, 32, 33, 56, 57, 200])
 def test_windows_cover_all_keyframes(num: int) -> None:
-    parts = refinement.windows(num)
+    parts = map_optimization.windows(num)
     assert sorted({row for rows in parts for row in rows}) == list(range(num))
-    assert all(b.start == a.stop - refinement.OVERLAP for a, b in itertools.pairwise(parts))
+    assert all(b.start == a.stop - map_optimization.OVERLAP for a, b in itertools.pairwise(parts))
 
 
 def test_refined_motions_and_loops_make_one_map(drifted, monkeypatch) -> None:

@@ -95,8 +95,8 @@ class TruthGeometry:
 
     def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
         # Relative to the last keyframe: odometry drifts.
-        T_map_last, elements = local_map.keyframes[0]
-        last, number = round(float(elements.positions[0, 0])), number_of_scan(scan)
+        T_map_last, positions, *_ = local_map.keyframes[0]
+        last, number = round(float(positions[0, 0])), number_of_scan(scan)
         rng = np.random.default_rng([self.seed, number, last])
         T = T_map_last @ rigid.inverse(self.T_world_scan[last]) @ self.T_world_scan[number]
         apart_m = np.linalg.norm(T_map_scan[:, :3, 3] - T[:3, 3], axis=1).min()

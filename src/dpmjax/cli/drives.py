@@ -107,7 +107,7 @@ def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
 
 def with_raised_beams(drive: LidarSequence) -> LidarSequence:
     """Returns the drive with the beams of KITTI's lidar raised to their true elevation."""
-    from dpmjax.scans.elevation import KITTI_ELEVATION_DEG
+    from dpmjax.scans.corrections import KITTI_ELEVATION_DEG
 
     def read_scan(index: int) -> np.ndarray:
         return scans.raise_beams(drive.read_scan(index), KITTI_ELEVATION_DEG)

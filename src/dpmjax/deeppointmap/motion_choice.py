@@ -21,7 +21,6 @@ from dpmjax.deeppointmap.verification import (
     verify_motions,
 )
 from dpmjax.geometry import rigid
-from dpmjax.scans.plane_information import WeakDirection, weakest_direction
 from dpmjax.scans.surface_alignment import (
     AlignmentConfig,
     AlignmentLevel,
@@ -32,11 +31,13 @@ from dpmjax.scans.surface_alignment import (
 from dpmjax.scans.view_correlation import T_level_lidar, correlate_views
 from dpmjax.scans.weak_directions import (
     WallAxis,
+    WeakDirection,
     facing_surface,
     facing_weights,
     sliding_motions,
     wall_axis,
     weak_share,
+    weakest_direction,
 )
 from dpmjax.types import Verification
 

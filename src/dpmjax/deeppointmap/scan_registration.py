@@ -31,7 +31,7 @@ from dpmjax.deeppointmap.prepared_scans import (
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
-from dpmjax.scans.plane_information import WeakDirection
+from dpmjax.scans.weak_directions import WeakDirection
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
 NUM_ELEMENTS = 1024

@@ -1,4 +1,4 @@
-from .map_coding import Precision as Precision
+from .map_arrays import Precision as Precision
 from .map_file import load_map as load_map
 from .map_file import map_bytes as map_bytes
 from .map_file import save_map as save_map

@@ -1,109 +1,89 @@
-"""A keyframe map as named arrays, and back. Ragged arrays are concatenated, with the rows of each keyframe."""
+"""A keyframe map as named arrays, and back: exactly, or as codes of few bytes for the smallest maps.
+
+Coded features are written in the basis of their principal components (few carry nearly all), and all coefficients are
+rounded to one step. Coded surface elements are rounded to centimetres. Ragged arrays are concatenated.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+from jaxtyping import Bool, Float, Int8
 from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
-from dpmjax.saved_maps.map_coding import (
-    NUM_ELEMENTS,
-    ElementCodes,
-    FeatureCodes,
-    Precision,
-    decode_elements,
-    decode_features,
-    encode_elements,
-    encode_features,
-)
-from dpmjax.scans.compact import CompactElements, CompactImage
+from dpmjax.scans.compact import MAX_COMPONENT, CompactElements, CompactImage
 from dpmjax.slam.config import MapOrigin
 from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, orthonormal
 
+Precision = Literal["float32", "int8"]
 KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
 TRIANGLE = np.triu_indices(6)
 MAX_ROTATION_ERROR = 1e-4
+NUMBERS = {"scan": np.int64, "segment": np.int32, "path_m": np.float64, "extent_m": np.float64}
+"""Numbers of a keyframe, and their types in the file."""
+
+MAX_RANK = 16
+"""Largest number of principal components."""
+
+STEP_SHARE = 0.7
+"""Step of the coefficients, as a share of the standard deviation of a channel."""
+
+NUM_ELEMENTS = 256
+"""Number of surface elements of a keyframe, if it has no more descriptors: localisation needs keyframes more."""
+
+POSITION_STEP_M = 0.02
+PLANARITY_STEP = 17
+MAX_CODE = np.iinfo(np.int8).max
+MAX_IMAGE_ROWS = 1 << 16
+
 Arrays = dict[str, NDArray[Any]]
 
 
-class ArrayReader:
-    """Arrays of a file, taken with a check of shape and kind.
+def pack_map(slam_map: KeyframeMap, precision: Precision) -> Arrays:
+    """Makes the arrays of a map.
 
     Args:
-        arrays: by name.
-    """
-
-    def __init__(self, arrays: Arrays) -> None:
-        self._arrays = arrays
-
-    def take(self, name: str, *shape: int | None, kind: str = "f") -> NDArray[Any]:
-        """Returns an array.
-
-        Args:
-            name: name of the array.
-            *shape: expected sizes; None for any.
-            kind: expected kind of its numbers, as NumPy abbreviates it; several letters allow several.
-
-        Returns:
-            The array.
-
-        Raises:
-            ValueError: if it is missing, or of another shape or kind.
-        """
-        if name not in self._arrays:
-            raise ValueError(f"{name} is missing")
-        array = self._arrays[name]
-        is_right = array.ndim == len(shape) and array.dtype.kind in kind
-        if not is_right or any(a is not None and a != b for a, b in zip(shape, array.shape, strict=True)):
-            expected = ", ".join("any" if size is None else str(size) for size in shape)
-            raise ValueError(f"{name}: expected shape ({expected}), got {array.shape} {array.dtype}")
-        return array
-
-    def take_rows(self, name: str, num_keyframes: int) -> list[slice]:
-        """Returns the rows of each keyframe in ragged arrays.
-
-        Args:
-            name: name of the array of their numbers.
-            num_keyframes: number of keyframes.
-
-        Returns:
-            One slice a keyframe.
-
-        Raises:
-            ValueError: if a number is negative.
-        """
-        counts = self.take(name, num_keyframes, kind="iu").astype(np.int64)
-        if counts.min(initial=0) < 0 or counts.max(initial=0) > 1 << 32:
-            raise ValueError(f"{name}: expected numbers of rows, got {counts.min()} to {counts.max()}")
-        ends = np.cumsum(counts)
-        return [slice(int(end - count), int(end)) for end, count in zip(ends, counts, strict=True)]
-
-
-def pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
-    """Makes the arrays of poses and edges.
-
-    Args:
-        slam_map: the map.
-        precision: "float32" keeps float64 poses exactly; others round them to float32.
+        slam_map: with at least one keyframe; all scans have one number of descriptors and channels.
+        precision: see `save_map`.
 
     Returns:
         The arrays by name.
     """
-    dtype = np.float64 if precision == "float32" else np.float32
-    keyframes, edges = slam_map.keyframes, slam_map.edges
+    scans = [keyframe.compact for keyframe in slam_map.keyframes]
+    return _pack_graph(slam_map, precision) | _pack_scans(scans, precision)
 
-    def poses(of_all: Iterable[NDArray[Any]]) -> NDArray[Any]:
-        return np.array([T[:3] for T in of_all], dtype).reshape(-1, 3, 4)
+
+def unpack_map(arrays: Arrays, precision: Precision, origin: MapOrigin) -> KeyframeMap:
+    """Makes the map.
+
+    Args:
+        arrays: arrays from `pack_map`; others may be among them.
+        precision: that was given to `pack_map`.
+        origin: what made the map.
+
+    Returns:
+        The map.
+
+    Raises:
+        ValueError: if arrays are missing or do not fit together.
+    """
+    return _unpack_graph(arrays, _unpack_scans(arrays, precision), origin)
+
+
+def _pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
+    """Makes the arrays of poses and edges; "float32" keeps float64 poses exactly, others round them to float32."""
+    dtype = np.float64 if precision == "float32" else np.float32
+    edges = slam_map.edges
+
+    def poses(T: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        return np.array([pose[:3] for pose in T], dtype).reshape(-1, 3, 4)
 
     return {
-        "scan": np.array([keyframe.scan for keyframe in keyframes], np.int64),
-        "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
-        "path_m": np.array([keyframe.path_m for keyframe in keyframes], np.float64),
-        "extent_m": np.array([keyframe.extent_m for keyframe in keyframes], np.float64),
-        "T_odometry_keyframe": poses(keyframe.T_odometry_keyframe for keyframe in keyframes),
+        **{name: slam_map.column(name).astype(kind) for name, kind in NUMBERS.items()},
+        "T_odometry_keyframe": poses(slam_map.column("T_odometry_keyframe")),
         "T_world_keyframe": poses(slam_map.T_world_keyframe),
         "vectors": slam_map.vectors.astype(np.float32 if precision == "float32" else np.float16),
         "edge_rows": np.array([edge[:2] for edge in edges], np.int32).reshape(-1, 2),
@@ -113,121 +93,77 @@ def pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     }
 
 
-def unpack_graph(reader: ArrayReader, scans: Sequence[CompactScan], origin: MapOrigin) -> KeyframeMap:
-    """Makes the map.
-
-    Args:
-        reader: reader of arrays from `pack_graph`.
-        scans: scans of the keyframes.
-        origin: what made the map.
-
-    Returns:
-        The map.
-
-    Raises:
-        ValueError: if arrays are missing or do not fit together.
-    """
+def _unpack_graph(arrays: Arrays, scans: Sequence[CompactScan], origin: MapOrigin) -> KeyframeMap:
     k = len(scans)
-    numbers = [reader.take(name, k, kind=kind) for name, kind in (("scan", "i"), ("path_m", "f"), ("segment", "i"))]
-    extents = reader.take("extent_m", k)
-    if extents.min() <= 0 or numbers[0].min() < 0:
+    numbers = {name: _take(arrays, name, k, kind=np.dtype(kind).kind) for name, kind in NUMBERS.items()}
+    if numbers["extent_m"].min() <= 0 or numbers["scan"].min() < 0:
         raise ValueError("extent_m and scan: expected numbers above 0")
-    T_odometry, T_world = (_poses(reader, name, k) for name in ("T_odometry_keyframe", "T_world_keyframe"))
-    described = zip(*(array.tolist() for array in numbers), extents.tolist(), T_odometry, scans, strict=True)
-    keyframes = (Keyframe(scan, T, path_m, seg, extent, found) for scan, path_m, seg, extent, T, found in described)
-    rows = reader.take("edge_rows", None, 2, kind="i")
-    kinds = reader.take("edge_kind", len(rows), kind="u")
-    triangles = reader.take("edge_information", len(rows), 21).astype(np.float64)
+    T_odometry, T_world = (_poses(arrays, name, k) for name in ("T_odometry_keyframe", "T_world_keyframe"))
+    rows = _take(arrays, "edge_rows", None, 2, kind="i")
+    kinds = _take(arrays, "edge_kind", len(rows), kind="u")
     if rows.min(initial=0) < 0 or rows.max(initial=-1) >= k or kinds.max(initial=0) >= len(KINDS):
         raise ValueError(f"edge_rows and edge_kind: expected rows of {k} keyframes and {len(KINDS)} kinds")
     information = np.zeros((len(rows), 6, 6))
-    for one, other in (TRIANGLE, TRIANGLE[::-1]):
-        information[:, one, other] = triangles
-    T_edges = _poses(reader, "edge_T", len(rows))
-    edges = (
-        MapEdge(int(source), int(target), T, matrix, KINDS[kind])
-        for (source, target), T, matrix, kind in zip(rows, T_edges, information, kinds.tolist(), strict=True)
+    information[:, *TRIANGLE] = information[:, *TRIANGLE[::-1]] = _take(arrays, "edge_information", len(rows), 21)
+    columns = zip(*(array.tolist() for array in numbers.values()), T_odometry, scans, strict=True)
+    edges = zip(*rows.T.tolist(), _poses(arrays, "edge_T", len(rows)), information, kinds, strict=True)
+    return KeyframeMap(
+        tuple(
+            Keyframe(scan, T, path_m, segment, extent_m, kept) for scan, segment, path_m, extent_m, T, kept in columns
+        ),
+        T_world,
+        _take(arrays, "vectors", k, None).astype(np.float32),
+        tuple(MapEdge(source, target, T, matrix, KINDS[kind]) for source, target, T, matrix, kind in edges),
+        origin,
     )
-    vectors = reader.take("vectors", k, None).astype(np.float32)
-    return KeyframeMap(tuple(keyframes), T_world, vectors, tuple(edges), origin)
 
 
-def _poses(reader: ArrayReader, name: str, count: int) -> NDArray[np.float64]:
-    stored = reader.take(name, count, 3, 4)
+def _poses(arrays: Arrays, name: str, count: int) -> NDArray[np.float64]:
+    stored = _take(arrays, name, count, 3, 4)
     T = np.tile(np.eye(4), (count, 1, 1))
     T[:, :3] = stored
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     if np.abs(products - np.eye(3)).max(initial=0) > MAX_ROTATION_ERROR or (np.linalg.det(T) < 0).any():
         raise ValueError(f"{name}: expected rotations")
-    if stored.dtype == np.float64:
-        return T
-    return np.array([orthonormal(pose) for pose in T]).reshape(-1, 4, 4)
+    return T if stored.dtype == np.float64 else np.array([orthonormal(pose) for pose in T]).reshape(-1, 4, 4)
 
 
-def pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
-    """Makes the arrays of the compact scans.
-
-    Args:
-        scans: scans, at least one, of one number of descriptors and channels.
-        precision: see `save_map`.
-
-    Returns:
-        The arrays by name.
-    """
+def _pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     num_elements = max(len(scan.elements.mask) for scan in scans)
     if precision == "int8":
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
     elements = [_of_length(scan.elements, num_elements) for scan in scans]
-    arrays = {"directions": np.stack([scan.directions for scan in scans])}
-    arrays |= _pack_images([scan.image for scan in scans])
+    arrays = {"directions": np.stack([scan.directions for scan in scans]), **_pack_images(scans)}
     if precision == "int8":
         features = np.concatenate([scan.features * scan.feature_steps[:, None] for scan in scans])
-        arrays |= _prefixed("feature", encode_features(features)) | _prefixed("element", encode_elements(elements))
-        return arrays
+        return arrays | _encode_features(features) | _encode_elements(elements)
     arrays |= {name: np.stack([getattr(scan, name) for scan in scans]) for name in ("features", "feature_steps")}
     return arrays | {
         f"element_{name}": np.stack([getattr(one, name) for one in elements]) for name in CompactElements._fields
     }
 
 
-def unpack_scans(reader: ArrayReader, precision: Precision) -> list[CompactScan]:
-    """Makes the compact scans.
-
-    Args:
-        reader: reader of arrays from `pack_scans`.
-        precision: that was given to `pack_scans`.
-
-    Returns:
-        The scans.
-
-    Raises:
-        ValueError: if arrays are missing or do not fit together.
-    """
-    directions = reader.take("directions", None, None, kind="i")
-    mask = reader.take("element_mask", None, None, kind="b")
+def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
+    directions = _take(arrays, "directions", None, None, kind="i")
+    mask = _take(arrays, "element_mask", None, None, kind="b")
     (k, m), (_, n) = directions.shape, mask.shape
     if k == 0 or len(mask) != k or m > n:
         raise ValueError(f"element_mask: expected rows of {k} keyframes with {m} descriptors or more, got {mask.shape}")
     if precision == "int8":
-        features = decode_features(_feature_codes(reader, k * m)).reshape(k, m, -1)
-        rounded = [round_features(one) for one in features]
-        codes = ElementCodes(
-            reader.take("element_positions", k, 3, n, kind="i"),
-            reader.take("element_normals", k, 2, n, kind="i"),
-            reader.take("element_planarity", k, n, kind="u"),
-            mask,
-        )
-        elements = decode_elements(codes)
+        elements = _decode_elements(arrays, mask)
+        rounded = [round_features(one) for one in _decode_features(arrays, k * m).reshape(k, m, -1)]
     else:
-        steps = reader.take("feature_steps", k, m)
-        rounded = list(zip(reader.take("features", k, m, None, kind="i"), steps, strict=True))
-        units_m, positions = reader.take("element_unit_m", k), reader.take("element_positions", k, n, 3, kind="i")
-        normals = reader.take("element_normals", k, n, 3, kind="i")
-        planarity = reader.take("element_planarity", k, n, kind="u")
-        columns = zip(units_m.tolist(), positions, normals, planarity, mask, strict=True)
-        elements = [CompactElements(*parts) for parts in columns]
-    parts_of_scans = zip(elements, rounded, directions, _unpack_images(reader, k), strict=True)
-    return [CompactScan(one, *codes_of, angles, image) for one, codes_of, angles, image in parts_of_scans]
+        columns = (
+            _take(arrays, "element_unit_m", k).tolist(),
+            _take(arrays, "element_positions", k, n, 3, kind="i"),
+            _take(arrays, "element_normals", k, n, 3, kind="i"),
+            _take(arrays, "element_planarity", k, n, kind="u"),
+        )
+        elements = [CompactElements(*parts) for parts in zip(*columns, mask, strict=True)]
+        steps = _take(arrays, "feature_steps", k, m)
+        rounded = list(zip(_take(arrays, "features", k, m, None, kind="i"), steps, strict=True))
+    parts_of_scans = zip(elements, rounded, directions, _unpack_images(arrays, k), strict=True)
+    return [CompactScan(one, *features_of, angles, image) for one, features_of, angles, image in parts_of_scans]
 
 
 def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
@@ -238,18 +174,70 @@ def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
     return CompactElements(elements.unit_m, *padded)
 
 
-def _prefixed(name: str, codes: FeatureCodes | ElementCodes) -> Arrays:
-    return {f"{name}_{field}": np.asarray(value) for field, value in codes._asdict().items()}
+def _encode_features(features: Float[np.ndarray, "d c"]) -> Arrays:
+    """Rounds features to coefficients of principal components: `mean + step * codes.T @ basis`."""
+    mean = features.mean(axis=0, dtype=np.float64) if len(features) else np.zeros(features.shape[1])
+    centred = features - mean
+    variances, axes = np.linalg.eigh(centred.T @ centred / max(len(features), 1))
+    basis = axes[:, ::-1][:, :MAX_RANK].T
+    coefficients = basis @ centred.T
+    largest = float(np.abs(coefficients).max(initial=0))
+    step = max(STEP_SHARE * float(np.sqrt(max(variances.mean(), 0))), largest / MAX_CODE, 1e-12)
+    codes = np.rint(coefficients / step).astype(np.int8)
+    is_used = codes.any(axis=1)
+    return {
+        "feature_mean": mean.astype(np.float32),
+        "feature_basis": basis[is_used].astype(np.float16),
+        "feature_step": np.asarray(step),
+        "feature_codes": codes[is_used],
+    }
 
 
-def _feature_codes(reader: ArrayReader, num_descriptors: int) -> FeatureCodes:
-    codes = reader.take("feature_codes", None, num_descriptors, kind="i")
-    mean = reader.take("feature_mean", None)
-    basis = reader.take("feature_basis", len(codes), len(mean)).astype(np.float32)
-    return FeatureCodes(mean, basis, float(reader.take("feature_step")), codes)
+def _decode_features(arrays: Arrays, num_descriptors: int) -> Float[np.ndarray, "d c"]:
+    codes = _take(arrays, "feature_codes", None, num_descriptors, kind="i")
+    mean = _take(arrays, "feature_mean", None)
+    basis = _take(arrays, "feature_basis", len(codes), len(mean)).astype(np.float32)
+    return (codes.T.astype(np.float32) * np.float32(_take(arrays, "feature_step"))) @ basis + mean
 
 
-def _pack_images(images: Sequence[CompactImage]) -> Arrays:
+def _encode_elements(keyframes: Sequence[CompactElements]) -> Arrays:
+    """Rounds positions to 2 cm, normals to two octahedral coordinates (Meyer et al. 2010), planarity to 16 steps."""
+    positions = [np.rint(one.positions.T * (one.unit_m / POSITION_STEP_M)) for one in keyframes]
+    return {
+        "element_positions": np.stack(positions).astype(np.int16),
+        "element_normals": np.stack([_octahedral(one.normals) for one in keyframes]),
+        "element_planarity": np.stack([np.rint(one.planarity / PLANARITY_STEP) for one in keyframes]).astype(np.uint8),
+        "element_mask": np.stack([one.mask for one in keyframes]),
+    }
+
+
+def _decode_elements(arrays: Arrays, mask: Bool[np.ndarray, "k n"]) -> list[CompactElements]:
+    k, n = mask.shape
+    positions = _take(arrays, "element_positions", k, 3, n, kind="i").astype(np.int16)
+    planarity = _take(arrays, "element_planarity", k, n, kind="u").astype(np.int64)
+    normals = [
+        np.where(flat[:, None] > 0, _from_octahedral(codes), 0)
+        for flat, codes in zip(planarity, _take(arrays, "element_normals", k, 2, n, kind="i"), strict=True)
+    ]
+    planarity = np.minimum(planarity * PLANARITY_STEP, 255).astype(np.uint8)
+    columns = zip(positions.transpose(0, 2, 1), np.array(normals, np.int8), planarity, mask, strict=True)
+    return [CompactElements(POSITION_STEP_M, *arrays) for arrays in columns]
+
+
+def _octahedral(normals: Int8[np.ndarray, "n 3"]) -> Int8[np.ndarray, "2 n"]:
+    upward = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
+    flat = upward[:, :2] / np.maximum(np.abs(upward).sum(axis=1, keepdims=True), 1)
+    return np.rint(flat.T * MAX_COMPONENT).astype(np.int8)
+
+
+def _from_octahedral(stored: Int8[np.ndarray, "2 n"]) -> Float[np.ndarray, "n 3"]:
+    flat = stored.astype(np.float64) / MAX_COMPONENT
+    normals = np.column_stack([*flat, np.maximum(1 - np.abs(flat).sum(axis=0), 0)])
+    return np.rint(normals / np.linalg.norm(normals, axis=1, keepdims=True) * MAX_COMPONENT)
+
+
+def _pack_images(scans: Sequence[CompactScan]) -> Arrays:
+    images = [scan.image for scan in scans]
     return {
         "image_count": np.array([len(image.nearest) for image in images], np.int32),
         "image_num_rows": np.array([image.num_rows for image in images], np.int32),
@@ -259,15 +247,29 @@ def _pack_images(images: Sequence[CompactImage]) -> Arrays:
     }
 
 
-def _unpack_images(reader: ArrayReader, k: int) -> list[CompactImage]:
-    rows = reader.take_rows("image_count", k)
-    num_rows, first_rows = (reader.take(f"image_{name}", k, kind="i").tolist() for name in ("num_rows", "first_row"))
-    nearest = reader.take("image_nearest", rows[-1].stop, None, kind="u")
-    farthest = reader.take("image_farthest", *nearest.shape, kind="u")
-    for part, num, first in zip(rows, num_rows, first_rows, strict=True):
-        if not 0 <= first <= first + part.stop - part.start <= num <= 1 << 16:
-            raise ValueError("image_first_row: expected rows within the image")
-    return [
-        CompactImage(num, first, nearest[part], farthest[part])
-        for num, first, part in zip(num_rows, first_rows, rows, strict=True)
-    ]
+def _unpack_images(arrays: Arrays, k: int) -> list[CompactImage]:
+    counts, num_rows, first_rows = (
+        _take(arrays, f"image_{name}", k, kind="iu").astype(np.int64) for name in ("count", "num_rows", "first_row")
+    )
+    if (
+        (np.minimum(counts, first_rows) < 0).any()
+        or (first_rows + counts > num_rows).any()
+        or num_rows.max() > MAX_IMAGE_ROWS
+    ):
+        raise ValueError("image_count and image_first_row: expected rows within the image")
+    nearest = _take(arrays, "image_nearest", int(counts.sum()), None, kind="u")
+    farthest = _take(arrays, "image_farthest", *nearest.shape, kind="u")
+    parts = (np.split(codes, np.cumsum(counts)[:-1]) for codes in (nearest, farthest))
+    return [CompactImage(*image) for image in zip(num_rows.tolist(), first_rows.tolist(), *parts, strict=True)]
+
+
+def _take(arrays: Arrays, name: str, *shape: int | None, kind: str = "f") -> NDArray[Any]:
+    """Returns an array of a file; its shape may be None for any size, and several letters allow several kinds."""
+    if name not in arrays:
+        raise ValueError(f"{name} is missing")
+    array = arrays[name]
+    is_right = array.ndim == len(shape) and array.dtype.kind in kind
+    if not is_right or any(a is not None and a != b for a, b in zip(shape, array.shape, strict=True)):
+        expected = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name}: expected shape ({expected}), got {array.shape} {array.dtype}")
+    return array

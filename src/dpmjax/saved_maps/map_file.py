@@ -16,8 +16,7 @@ import numpy as np
 
 from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import refusing, write_atomically
-from dpmjax.saved_maps.map_arrays import ArrayReader, Arrays, pack_graph, pack_scans, unpack_graph, unpack_scans
-from dpmjax.saved_maps.map_coding import Precision
+from dpmjax.saved_maps.map_arrays import Arrays, Precision, pack_map, unpack_map
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import MapOrigin, SlamConfig
 from dpmjax.slam.keyframes import KeyframeMap
@@ -107,8 +106,7 @@ def map_arrays(slam_map: KeyframeMap, precision: Precision) -> Arrays:
         "config": dataclasses.asdict(origin.config),
     }
     named: Arrays = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
-    scans = [keyframe.compact for keyframe in slam_map.keyframes]
-    return named | pack_graph(slam_map, precision) | pack_scans(scans, precision)
+    return named | pack_map(slam_map, precision)
 
 
 def load_map(path: str | Path) -> KeyframeMap:
@@ -159,5 +157,4 @@ def map_of_arrays(path: str | Path, arrays: Arrays) -> KeyframeMap:
         is_good = array.dtype.kind in "iub" or (array.dtype.kind == "f" and bool(np.isfinite(array).all()))
         require(is_good, path, f"{name} holds values that are not finite numbers", ADVICE)
     with refusing(path, "damaged: {error}", ADVICE, (Exception,)):
-        reader = ArrayReader(arrays)
-        return unpack_graph(reader, unpack_scans(reader, precision), origin)
+        return unpack_map(arrays, precision, origin)

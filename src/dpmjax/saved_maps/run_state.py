@@ -16,11 +16,10 @@ from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import refusing, write_atomically
 from dpmjax.saved_maps.map_file import map_arrays, map_of_arrays
 from dpmjax.sequences import InputError, require
-from dpmjax.slam.front_end import FrontEndState
+from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.local_map import PlacedElements
-from dpmjax.slam.reports import Loop, LoopState, ScanReport
+from dpmjax.slam.loops import Loop, LoopState
 from dpmjax.slam.system import SlamState
-from dpmjax.types import SurfaceElements
 
 Arrays = dict[str, np.ndarray]
 
@@ -29,7 +28,7 @@ def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = 
     """Turns records of one type into one array a field.
 
     Args:
-        records: named tuples of numbers, texts, arrays of one shape, or None.
+        records: named tuples of numbers, texts, arrays of one shape or of many rows, or None.
         name: prefix of the names of the arrays.
         without: fields that are left out.
 
@@ -39,11 +38,14 @@ def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = 
     columns = {name: np.array(len(records))}
     for field in [field for field in records[0]._fields if field not in without] if records else ():
         values = [getattr(record, field) for record in records]
-        is_there = np.array([value is not None for value in values])
-        if is_there.any():
-            columns[f"{name}.{field}"] = np.array([value for value in values if value is not None])
-        if not is_there.all():
-            columns[f"{name}.{field}.is_there"] = is_there
+        found = [value for value in values if value is not None]
+        if len({np.shape(value) for value in found}) > 1:
+            columns[f"{name}.{field}"] = np.concatenate(found)
+            columns[f"{name}.{field}.lengths"] = np.array([len(value) for value in found])
+        elif found:
+            columns[f"{name}.{field}"] = np.array(found)
+        if len(found) < len(values):
+            columns[f"{name}.{field}.is_there"] = np.array([value is not None for value in values])
     return columns
 
 
@@ -64,16 +66,18 @@ def from_columns(
     Raises:
         ValueError: if a field is missing.
     """
-    num = int(columns[name])
-    fields = []
+    num, fields = int(columns[name]), []
     for field in record_type._fields:
-        key, mask = f"{name}.{field}", f"{name}.{field}.is_there"
-        if num and field not in without and key not in columns and mask not in columns:
+        key = f"{name}.{field}"
+        is_there = columns.get(f"{key}.is_there", np.full(num, key in columns))
+        if num and field not in without and not (key in columns or f"{key}.is_there" in columns):
             raise ValueError(f"{key} is missing")
         column = columns.get(key, np.zeros(0))
-        found = iter(column.tolist() if column.ndim == 1 else column)
-        is_there = columns.get(mask, np.full(num, key in columns))
-        fields.append([next(found) if there else None for there in is_there])
+        found: Any = column.tolist() if column.ndim == 1 else column
+        if f"{key}.lengths" in columns:
+            found = np.split(column, np.cumsum(columns[f"{key}.lengths"])[:-1])
+        rest = iter(found)
+        fields.append([next(rest) if there else None for there in is_there])
     return [record_type(*values) for values in zip(*fields, strict=True)] if num else []
 
 
@@ -89,7 +93,6 @@ def prefixed(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
 
 ADVICE = "start the run again without --resume"
 OF_LOOPS = ("loops",)
-OF_ELEMENTS = ("positions", "normals", "planarity", "mask")
 OF_FRONT_END = ("local_map", "recent", "scores")
 """Fields that are written apart, or made again from the map."""
 
@@ -120,15 +123,14 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
     Raises:
         ValueError: if the map is empty, or the last scan is not the one of a keyframe.
     """
-    if state.front_end.local_map is not None:
+    front_end, slam_map, loops = state
+    if front_end.local_map is not None:
         raise ValueError("state: expected the state after a keyframe, got scans since the last one")
-    arrays = prefixed(map_arrays(state.slam_map, "float32"), "map") | to_columns(reports, "report")
-    arrays |= to_columns(state.loops.loops, "loop") | to_columns([state.loops], "loops", without=OF_LOOPS)
-    arrays |= to_columns([state.front_end], "front_end", without=OF_FRONT_END)
-    arrays["scores"] = np.array(state.front_end.scores)
-    arrays |= prefixed(_arrays_of_recent(state.front_end.recent), "recent")
+    arrays = prefixed(map_arrays(slam_map, "float32"), "map") | to_columns(reports, "report")
+    arrays |= to_columns(loops.loops, "loop") | to_columns([loops], "loops", without=OF_LOOPS)
+    arrays |= to_columns(front_end.recent, "recent") | to_columns([front_end], "front_end", without=OF_FRONT_END)
     content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **arrays)
+    np.savez(content, allow_pickle=False, scores=np.array(front_end.scores), **arrays)
     return write_atomically(path, content.getvalue())
 
 
@@ -153,23 +155,7 @@ def load_state(path: str | Path) -> RunState:
     with refusing(path, "damaged: {error}", ADVICE, (Exception,)):
         (loops,) = from_columns(LoopState, arrays, "loops", without=OF_LOOPS)
         (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=OF_FRONT_END)
-        recent = _recent_of_arrays(part_of(arrays, "recent"))
+        recent = tuple(from_columns(PlacedElements, arrays, "recent"))
         front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent)
         loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
         return RunState(SlamState(front_end, slam_map, loops), tuple(from_columns(ScanReport, arrays, "report")))
-
-
-def _arrays_of_recent(recent: Sequence[PlacedElements]) -> Arrays:
-    """Returns the elements of all scans in one array a field, and the number of each scan."""
-    arrays = {"T_map_scan": np.array([placed.T_map_scan for placed in recent]).reshape(-1, 4, 4)}
-    arrays["num_elements"] = np.array([len(placed.elements.mask) for placed in recent], np.int64)
-    for name in OF_ELEMENTS if recent else ():
-        arrays[name] = np.concatenate([getattr(placed.elements, name) for placed in recent])
-    return arrays
-
-
-def _recent_of_arrays(arrays: Arrays) -> tuple[PlacedElements, ...]:
-    ends = np.cumsum(arrays["num_elements"])[:-1]
-    columns = [np.split(arrays[name], ends) for name in OF_ELEMENTS if name in arrays]
-    elements = [SurfaceElements(*fields) for fields in zip(*columns, strict=True)]
-    return tuple(PlacedElements(*placed) for placed in zip(arrays["T_map_scan"], elements, strict=True))

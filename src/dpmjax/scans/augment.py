@@ -7,7 +7,7 @@ configuration uses azimuth sectors; both are here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,25 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.rigid import namespace_of
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud
+
+Interval = tuple[float, float]
+"""Lower and upper bound of a uniform draw."""
+
+MAX_SECTORS = 3
+"""Largest number of azimuth sectors that are empty from some range on; each number from 1 to it is equally likely."""
+
+SECTOR_WIDTH_DEG = (10.0, 150.0)
+"""Width of the first sector; the width of the i-th sector is divided by i (DeepPointMap's published configuration)."""
+
+SECTOR_MIN_RANGE_M = (2.0, 10.0)
+"""Range beyond which a sector hides its points (DeepPointMap's published configuration)."""
+
+MAX_BOXES = 3
+"""Largest number of upright boxes around the sensor, from the size of a car to that of a truck; the paper has no
+numbers."""
+
+BOX_GAP_M = (1.0, 10.0)
+"""Free space between the sensor and the circle around a box."""
 
 BOX_CENTRE_Z_M = (-1.5, 0.5)
 """Height of the centre of the box, in the frame of the lidar."""
@@ -36,53 +55,7 @@ BOX_LENGTH_M = (2.0, 10.0)
 JITTER_CLIP_SIGMAS = 3.0
 """The noise is clipped at this many standard deviations."""
 
-Interval = tuple[float, float]
 TURN = (-math.pi, math.pi)
-
-
-@dataclass(frozen=True)
-class SectorConfig:
-    """Azimuth sectors that are empty from some range on (defaults: DeepPointMap's published configuration).
-
-    Attributes:
-        max_count: largest number of sectors; each number from 1 to it is equally likely.
-        width_deg: bounds of the width of the first sector; the width of the i-th sector is divided by i.
-        min_range_m: bounds of the range beyond which a sector hides its points.
-    """
-
-    max_count: int = 3
-    width_deg: Interval = (10.0, 150.0)
-    min_range_m: Interval = (2.0, 10.0)
-
-    def __post_init__(self) -> None:
-        require_fields(self, "max_count", low=1)
-        _require_intervals(self, "width_deg", "min_range_m")
-
-
-@dataclass(frozen=True)
-class BoxConfig:
-    """Upright boxes around the sensor, from the size of a car to that of a truck (the paper gives no numbers).
-
-    All intervals are lower and upper bounds of uniform draws.
-
-    Attributes:
-        max_count: largest number of boxes; each number from 1 to it is equally likely.
-        gap_m: free space between the sensor and the circle around the box.
-    """
-
-    max_count: int = 3
-    gap_m: Interval = (1.0, 10.0)
-
-    def __post_init__(self) -> None:
-        require_fields(self, "max_count", low=1)
-        _require_intervals(self, "gap_m")
-
-
-def _require_intervals(config: SectorConfig | BoxConfig | AugmentConfig, *names: str, low: float = 0.0) -> None:
-    for name in names:
-        interval: Interval = getattr(config, name)
-        if not low <= interval[0] <= interval[1]:
-            raise ValueError(f"{name}: expected {low:g} <= lower <= upper bound, got {interval}")
 
 
 @dataclass(frozen=True)
@@ -95,9 +68,7 @@ class AugmentConfig:
         sparse_points: bounds of the number of points that such a scan keeps at most, uniform in its logarithm.
         sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
             scan in ten is occluded (DeepPointMap section 3.3), by either at equal odds.
-        sectors: settings of the sectors.
         box_probability: probability that boxes occlude a scan.
-        boxes: settings of the boxes.
         max_yaw_rad: largest rotation about z, to either side.
         max_tilt_rad: largest rotation about x and about y, to either side.
         tilt_power: the uniform number that gives a tilt is raised to this power: above 1, most scans stand upright.
@@ -109,9 +80,7 @@ class AugmentConfig:
     sparse_probability: float = 0.0
     sparse_points: Interval = (300.0, 20000.0)
     sector_probability: float = 0.05
-    sectors: SectorConfig = field(default_factory=SectorConfig)
     box_probability: float = 0.05
-    boxes: BoxConfig = field(default_factory=BoxConfig)
     max_yaw_rad: float = math.pi
     max_tilt_rad: float = math.pi / 10
     tilt_power: float = 1.0
@@ -122,7 +91,8 @@ class AugmentConfig:
         require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
         require_fields(self, "sparse_probability", low=0, high=1)
         require_fields(self, "tilt_power", low=1)
-        _require_intervals(self, "sparse_points", low=1.0)
+        if not 1 <= self.sparse_points[0] <= self.sparse_points[1]:
+            raise ValueError(f"sparse_points: expected 1 <= lower <= upper bound, got {self.sparse_points}")
         if self.sector_probability + self.box_probability > 1:
             both = f"{self.sector_probability} and {self.box_probability}"
             raise ValueError(f"sector_probability, box_probability: expected a sum of at most 1, got {both}")
@@ -231,16 +201,15 @@ def _is_occluded(points: Float[Array, "n 3"], config: AugmentConfig, key: PRNGKe
     coin = jax.random.uniform(coin_key)
     has_sectors = coin < config.sector_probability
     has_boxes = ~has_sectors & (coin < config.sector_probability + config.box_probability)
-    by_sectors = has_sectors & is_behind_sectors(points, config.sectors, key=sector_key)
-    return by_sectors | (has_boxes & is_behind_boxes(points, config.boxes, key=box_key))
+    by_sectors = has_sectors & is_behind_sectors(points, key=sector_key)
+    return by_sectors | (has_boxes & is_behind_boxes(points, key=box_key))
 
 
-def is_behind_sectors(points: Float[AnyArray, "n 3"], config: SectorConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
+def is_behind_sectors(points: Float[AnyArray, "n 3"], *, key: PRNGKeyArray) -> Bool[Array, " n"]:
     """Returns True for points in a random sector beyond its range; metres, in the frame of the sensor, z up."""
-    draws = jax.random.uniform(key, (4, config.max_count))
-    index = jnp.arange(1, config.max_count + 1)
-    count = _count(draws[0, 0], config.max_count)
-    width_deg, start, min_range = _between((config.width_deg, TURN, config.min_range_m), draws[1:])
+    draws, index = jax.random.uniform(key, (4, MAX_SECTORS)), jnp.arange(1, MAX_SECTORS + 1)
+    count = _count(draws[0, 0], MAX_SECTORS)
+    width_deg, start, min_range = _between((SECTOR_WIDTH_DEG, TURN, SECTOR_MIN_RANGE_M), draws[1:])
     width = jnp.deg2rad(width_deg) / index
     azimuth = jnp.arctan2(points[:, 1], points[:, 0])[:, None]
     is_in_sector = jnp.mod(azimuth - start, 2 * jnp.pi) <= width
@@ -248,18 +217,18 @@ def is_behind_sectors(points: Float[AnyArray, "n 3"], config: SectorConfig, *, k
     return jnp.any(is_in_sector & is_far & (index <= count), axis=1)
 
 
-def is_behind_boxes(points: Float[AnyArray, "n 3"], config: BoxConfig, *, key: PRNGKeyArray) -> Bool[Array, " n"]:
+def is_behind_boxes(points: Float[AnyArray, "n 3"], *, key: PRNGKeyArray) -> Bool[Array, " n"]:
     """Returns True for points that a random box hides; metres, in the frame of the sensor, z up."""
-    draws = jax.random.uniform(key, (8, config.max_count))
-    count = _count(draws[0, 0], config.max_count)
-    bounds = (BOX_LENGTH_M, BOX_WIDTH_M, BOX_HEIGHT_M, BOX_CENTRE_Z_M, TURN, TURN, config.gap_m)
+    draws = jax.random.uniform(key, (8, MAX_BOXES))
+    count = _count(draws[0, 0], MAX_BOXES)
+    bounds = (BOX_LENGTH_M, BOX_WIDTH_M, BOX_HEIGHT_M, BOX_CENTRE_Z_M, TURN, TURN, BOX_GAP_M)
     length, width, height, z, azimuth, heading, gap = _between(bounds, draws[1:])
     # The gap keeps the sensor outside of the box: inside, everything would be hidden.
     distance = gap + jnp.hypot(length, width) / 2
     centres = jnp.stack([distance * jnp.cos(azimuth), distance * jnp.sin(azimuth), z], axis=1)
     sizes = jnp.stack([length, width, height], axis=1)
     is_hidden = jax.vmap(is_behind_box, (None, 0, 0, 0))(points, centres, sizes, heading)
-    return jnp.any(is_hidden & (jnp.arange(config.max_count) < count)[:, None], axis=0)
+    return jnp.any(is_hidden & (jnp.arange(MAX_BOXES) < count)[:, None], axis=0)
 
 
 def is_behind_box(

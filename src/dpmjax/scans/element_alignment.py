@@ -163,7 +163,7 @@ def _stepper(
         if is_symmetric:
             rows, is_pair = near_source(_moved(rigid.inverse(T_target_source), target).positions)
             others = _pairs(target, _rows(moved, rows), is_pair, sign=-1, min_cosine=config.min_cosine)
-            pairs = jax.tree.map(lambda *parts: _module(parts[0]).concatenate(parts), pairs, others)
+            pairs = jax.tree.map(lambda *parts: rigid.namespace_of(parts[0]).concatenate(parts), pairs, others)
         return _solve(pairs, T_target_source, level, config)
 
     return step_from
@@ -171,17 +171,14 @@ def _stepper(
 
 def _planes(side: SurfaceElements, level: AlignmentLevel) -> SurfaceElements:
     """Returns the first elements of a side; those that are no plane are masked, and 0."""
-    num = level.num_points
-    positions, normals, planarity = side.positions[:num], side.normals[:num], side.planarity[:num]
-    xp = _module(positions)
-    mask = side.mask[:num] & (planarity > MIN_FLATNESS)
-    return SurfaceElements(
-        xp.where(mask[:, None], positions, 0), xp.where(mask[:, None], normals, 0), xp.where(mask, planarity, 0), mask
-    )
+    side = _rows(side, slice(level.num_points))
+    xp, mask = rigid.namespace_of(side.positions), side.mask & (side.planarity > MIN_FLATNESS)
+    positions, normals = (xp.where(mask[:, None], vectors, 0) for vectors in (side.positions, side.normals))
+    return SurfaceElements(positions, normals, xp.where(mask, side.planarity, 0), mask)
 
 
 def _rows(side: SurfaceElements, rows: Any) -> SurfaceElements:
-    return SurfaceElements(side.positions[rows], side.normals[rows], side.planarity[rows], side.mask[rows])
+    return jax.tree.map(lambda leaf: leaf[rows], side)
 
 
 def _search(side: SurfaceElements, radius_m: float) -> Callable[[Any], tuple[Any, Any]]:
@@ -222,7 +219,7 @@ class _Pairs(NamedTuple):
 
 def _pairs(queries: SurfaceElements, planes: SurfaceElements, is_pair: Any, *, sign: int, min_cosine: float) -> _Pairs:
     """Pairs queries with planes, row for row; `sign` is 1 where the queries move, and -1 where the planes do."""
-    xp = _module(queries.positions)
+    xp = rigid.namespace_of(queries.positions)
     residuals = sign * ((queries.positions - planes.positions) * planes.normals).sum(axis=1)
     cosines = xp.abs((queries.normals * planes.normals).sum(axis=1))
     weights = (is_pair & queries.mask) * planes.planarity * xp.maximum(cosines - min_cosine, 0)
@@ -230,7 +227,7 @@ def _pairs(queries: SurfaceElements, planes: SurfaceElements, is_pair: Any, *, s
 
 
 def _solve(pairs: _Pairs, T_target_source: Any, level: AlignmentLevel, config: AlignmentConfig) -> _Step:
-    xp = _module(pairs.points)
+    xp = rigid.namespace_of(pairs.points)
     num_pairs = (pairs.weights > 0).sum()
     is_enough = num_pairs >= MIN_PAIRS
     weights = pairs.weights * geman_mcclure(pairs.residuals, config.kernel_width_m(level))
@@ -239,17 +236,6 @@ def _solve(pairs: _Pairs, T_target_source: Any, level: AlignmentLevel, config: A
     step = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights)
     step = PlaneStep(xp.where(is_enough, step.tangent, 0), step.centre)
     mean_square = (weights * pairs.residuals**2).sum() / xp.maximum(weights.sum(), np.finfo(weights.dtype).tiny)
-    rmse = xp.where(is_enough, _sqrt(mean_square), np.inf)
-    T = motion_about(step)
-    T = rigid.compose(T, T_target_source) if xp is jnp else T @ T_target_source
+    rmse = xp.where(is_enough, rigid.safe_sqrt(mean_square), np.inf)
+    T = rigid.matmul(motion_about(step), T_target_source)
     return _Step(ElementAlignment(T, rmse, num_pairs), step)
-
-
-def _sqrt(squared: Any) -> Any:
-    # The derivative at 0 is 0 instead of infinite.
-    xp = _module(squared)
-    return xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, 1)), 0)
-
-
-def _module(array: Any) -> Any:
-    return jnp if isinstance(array, jax.Array) else np

@@ -116,6 +116,20 @@ class SurfaceAlignment(NamedTuple):
     num_pairs: int
 
 
+class PlanePairs(NamedTuple):
+    """Source points and the planes of the target nearest to them.
+
+    Attributes:
+        points: (p, 3) source points in the frame of the target.
+        residuals: (p,) signed distances to the planes, metres.
+        normals: (p, 3) normals of the planes.
+    """
+
+    points: Float[np.ndarray, "p 3"]
+    residuals: Float[np.ndarray, " p"]
+    normals: Float[np.ndarray, "p 3"]
+
+
 class NearestPlanes(NamedTuple):
     """Samples of the source under several motions, and the planes of the target nearest to them.
 
@@ -136,34 +150,10 @@ class NearestPlanes(NamedTuple):
     cosines: Float[np.ndarray, "s n"]
     flatness: Float[np.ndarray, "s n"]
 
-    def take(self, rows: Bool[np.ndarray, " s"]) -> NearestPlanes:
-        """Returns those of some motions.
-
-        Args:
-            rows: which motions.
-
-        Returns:
-            Their planes.
-        """
-        return NearestPlanes(*(values[rows] for values in self))
-
-
-class PlanePairs(NamedTuple):
-    """Source points and the planes of the target nearest to them.
-
-    Attributes:
-        points: (p, 3) source points in the frame of the target.
-        residuals: (p,) signed distances to the planes, metres.
-        normals: (p, 3) normals of the planes.
-        cosines: (p,) absolute cosine between the normals of both surfaces.
-        flatness: (p,) of the target's neighbourhood.
-    """
-
-    points: Float[np.ndarray, "p 3"]
-    residuals: Float[np.ndarray, " p"]
-    normals: Float[np.ndarray, "p 3"]
-    cosines: Float[np.ndarray, " p"]
-    flatness: Float[np.ndarray, " p"]
+    @property
+    def pairs(self) -> PlanePairs:
+        """The samples that are paired."""
+        return PlanePairs(*(values[self.is_paired] for values in self[1:4]))
 
 
 def align_surfaces(
@@ -217,7 +207,7 @@ def align_surfaces_from(
             lost = rows[~is_enough]
             rmse[lost], has_pairs[lost], is_active[lost] = np.inf, False, False
             if not is_enough.all():
-                rows, pairs = rows[is_enough], pairs.take(is_enough)
+                rows, pairs = rows[is_enough], NearestPlanes(*(values[is_enough] for values in pairs))
             if len(rows) == 0:
                 break
             step, rmse[rows] = _step(pairs, level, config)
@@ -276,8 +266,7 @@ def pair_with_planes(
     Returns:
         The pairs; points without a neighbour within the radius are left out.
     """
-    pairs = nearest_planes(source, target, np.asarray(T_target_source)[None], level)
-    return PlanePairs(*(values[pairs.is_paired] for values in pairs[1:]))
+    return nearest_planes(source, target, np.asarray(T_target_source)[None], level).pairs
 
 
 def _step(

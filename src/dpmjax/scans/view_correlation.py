@@ -7,7 +7,7 @@ peaks are motions within a cell and half a step of the turn; `align_surfaces` fi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +24,15 @@ DISTINCT_TURNS = 1.5
 
 DISTINCT_CELLS = 2.0
 """Two motions are distinct if they differ by more cells than this."""
+
+CELL_M = 1.0
+"""Side of a cell; down to half of it where scans reach less than `FULL_EXTENT_M`, as in rooms."""
+
+NUM_CELLS, NUM_TURNS = 96, 60
+"""Cells along a side, and turns of a circle."""
+
+RANGE_SHARE, SHIFT_SHARE = 0.36, 0.27
+"""Points within these shares of a side, and shifts up to them, do not wrap around; others are left out."""
 
 NUM_DIRECTIONS = 4
 """Images by the direction of the normals; one more image holds points without a surface."""
@@ -46,34 +55,16 @@ EXTENT_PERCENT, MIN_EXTENT_SHARE = 90.0, 0.5
 
 @dataclass(frozen=True)
 class ViewCorrelationConfig:
-    """Resolution and extent of the search.
+    """Extent of the search.
 
     Attributes:
-        cell_m: side of a cell; down to half of it where scans reach less than `full_extent_m`, as in rooms.
-        num_cells: cells along a side; points within 0.36 sides and shifts up to 0.27 sides do not wrap around.
-        num_turns: turns of a circle.
         num_motions: distinct motions that are returned; 0 switches the search off.
     """
 
-    cell_m: float = 1.0
-    num_cells: int = 96
-    num_turns: int = 60
     num_motions: int = 24
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_cells", "num_turns", low=1)
-        require_fields(self, "cell_m", low=1e-9)
         require_fields(self, "num_motions", low=0)
-
-    @property
-    def max_range_m(self) -> float:
-        """Farther points are left out."""
-        return 0.36 * self.num_cells * self.cell_m
-
-    @property
-    def max_shift_m(self) -> float:
-        """Longer shifts are not tried."""
-        return 0.27 * self.num_cells * self.cell_m
 
 
 def correlate_views(
@@ -94,10 +85,10 @@ def correlate_views(
     if len(source.points) == 0 or len(target.points) == 0:
         return np.zeros((0, 4, 4))
     levels = T_level_lidar(source), T_level_lidar(target)
-    config = replace(config, cell_m=config.cell_m * _extent_share(source, target, config))
-    turns = np.arange(config.num_turns) * (2 * np.pi / config.num_turns)
-    images = _images(source, levels[0], turns, config)
-    fixed = _images(target, levels[1], np.zeros(1), config)[0]
+    cell_m = CELL_M * _extent_share(source, target)
+    turns = np.arange(NUM_TURNS) * (2 * np.pi / NUM_TURNS)
+    images = _images(source, levels[0], turns, cell_m)
+    fixed = _images(target, levels[1], np.zeros(1), cell_m)[0]
     fixed = gaussian_filter(fixed, (0, BLUR_CELLS, BLUR_CELLS), mode="wrap")
     norms = np.sqrt(np.sum(images[0] ** 2, axis=(1, 2)) * np.sum(fixed**2, axis=(1, 2)))
     if not norms.any():
@@ -106,11 +97,11 @@ def correlate_views(
     fixed /= np.where(norms > 0, norms, 1)[:, None, None]
     spectra = np.conj(fft.rfft2(images)) * fft.rfft2(fixed)
     scores = fft.irfft2(spectra.sum(axis=1), s=images.shape[2:])
-    found = _best_peaks(scores, turns, config)
+    found = _best_peaks(scores, turns, cell_m, config.num_motions)
     return np.stack([rigid.inverse(levels[1]) @ planar_motion(*row) @ levels[0] for row in found])
 
 
-def _extent_share(source: Surface, target: Surface, config: ViewCorrelationConfig) -> float:
+def _extent_share(source: Surface, target: Surface) -> float:
     extents = [np.percentile(np.hypot(*surface.points[:, :2].T), EXTENT_PERCENT) for surface in (source, target)]
     return float(np.clip(max(extents) / FULL_EXTENT_M, MIN_EXTENT_SHARE, 1))
 
@@ -141,23 +132,20 @@ def T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
 
 
 def _images(
-    surface: Surface,
-    T_level_lidar: Float[np.ndarray, "4 4"],
-    turns: Float[np.ndarray, " t"],
-    config: ViewCorrelationConfig,
+    surface: Surface, T_level_lidar: Float[np.ndarray, "4 4"], turns: Float[np.ndarray, " t"], cell_m: float
 ) -> Float[np.ndarray, "t c n n"]:
     R = T_level_lidar[:3, :3]
     x, y, _ = (surface.points @ R.T).T
     normals = surface.normals @ R.T
     is_flat = surface.flatness > MIN_FLATNESS
-    is_used = (np.hypot(x, y) < config.max_range_m) & (~is_flat | (np.abs(normals[:, 2]) < STEEP_COSINE))
+    is_used = (np.hypot(x, y) < RANGE_SHARE * NUM_CELLS * cell_m) & (~is_flat | (np.abs(normals[:, 2]) < STEEP_COSINE))
     x, y, is_flat = x[is_used], y[is_used], is_flat[is_used]
     angles = np.arctan2(normals[is_used, 1], normals[is_used, 0])
-    size, num = config.num_cells, NUM_DIRECTIONS
+    size, num = NUM_CELLS, NUM_DIRECTIONS
     shape = (len(turns), num + 1, size, size)
     cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
     turned = cosine * x - sine * y, sine * x + cosine * y
-    columns = [np.round(part / config.cell_m).astype(np.int64) % size for part in turned]
+    columns = [np.round(part / cell_m).astype(np.int64) % size for part in turned]
     channel = np.floor((angles + turns[:, None]) * (num / np.pi)).astype(np.int64) % num
     channel = np.where(is_flat, channel, num)
     number = np.arange(len(turns))[:, None]
@@ -169,11 +157,11 @@ def _images(
 
 
 def _best_peaks(
-    scores: Float[np.ndarray, "t n n"], turns: Float[np.ndarray, " t"], config: ViewCorrelationConfig
+    scores: Float[np.ndarray, "t n n"], turns: Float[np.ndarray, " t"], cell_m: float, num_motions: int
 ) -> list[tuple[float, float, float]]:
     """Returns turn and shift of the best peaks after non-maximum suppression."""
-    shifts = fft.fftfreq(config.num_cells, 1 / config.num_cells) * config.cell_m
-    is_near = np.hypot(shifts[:, None], shifts) <= config.max_shift_m
+    shifts = fft.fftfreq(NUM_CELLS, 1 / NUM_CELLS) * cell_m
+    is_near = np.hypot(shifts[:, None], shifts) <= SHIFT_SHARE * NUM_CELLS * cell_m
     flat = np.flatnonzero(is_near)
     within = scores.reshape(len(turns), -1)[:, flat]
     best = np.argpartition(-within, min(NUM_PEAKS, within.size - 1), axis=None)[:NUM_PEAKS]
@@ -181,12 +169,12 @@ def _best_peaks(
     turn, cell = np.unravel_index(best, within.shape)
     x, y = (shifts[part] for part in np.unravel_index(flat[cell], is_near.shape))
     remaining, found = np.ones(len(best), bool), list[tuple[float, float, float]]()
-    while remaining.any() and len(found) < config.num_motions:
+    while remaining.any() and len(found) < num_motions:
         k = int(np.argmax(remaining))
         found.append((float(turns[turn[k]]), float(x[k]), float(y[k])))
         steps = np.abs(turn - turn[k])
         is_same = np.minimum(steps, len(turns) - steps) <= DISTINCT_TURNS
-        remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= DISTINCT_CELLS * config.cell_m))
+        remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= DISTINCT_CELLS * cell_m))
     return found
 
 

@@ -1,26 +1,53 @@
-"""Several agents: each maps alone, keyframes are exchanged, maps that meet are joined (DeepPointMap section 4)."""
+"""Several agents: each maps alone, keyframes are exchanged, maps that meet are joined (DeepPointMap section 4).
+
+The relative pose of two maps is unknown. Candidates are similar keyframes of different maps. They are registered,
+verified and accepted like all loops: only together with loops that agree with them over the odometry of both maps.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import AnyScan
 from dpmjax.slam.interfaces import SlamMethods
-from dpmjax.slam.keyframes import KeyframeMap
-from dpmjax.slam.map_joining import JoinedMaps, OnKeyframe, join_maps, take_component
-from dpmjax.slam.reports import Loop
+from dpmjax.slam.keyframes import KeyframeMap, connected_parts, joined_maps, take_keyframes, with_origin
+from dpmjax.slam.loop_candidates import similar_keyframes
+from dpmjax.slam.loop_closure import examine_candidates, is_resting
+from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
+from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
 
 BYTES_A_POINT = 12
 """Three float32 numbers."""
+
+OnKeyframe = Callable[[int, int], None]
+"""Called with the number of keyframes that were compared, and with that of all to be compared."""
+
+
+class JoinedMaps(NamedTuple):
+    """Several maps in one record; those that meet have one frame.
+
+    Attributes:
+        slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
+        map_of_keyframe: (k,) which map each keyframe comes from.
+        component_of_map: which maps are joined: equal numbers, counted from 0. Maps of other components have frames
+            of their own, and their poses cannot be compared.
+        loops: candidates between maps and what became of them, by rows of `slam_map`.
+    """
+
+    slam_map: KeyframeMap
+    map_of_keyframe: Int[np.ndarray, " k"]
+    component_of_map: tuple[int, ...]
+    loops: tuple[Loop, ...]
 
 
 class SentBytes(NamedTuple):
@@ -123,9 +150,8 @@ def join_agents(
     Returns:
         Trajectories, who has met whom, the joined graph, bytes sent.
     """
-    joined = join_maps(methods, [agent.state.slam_map for agent in agents], on_keyframe=on_keyframe)
-    trajectories = _trajectories(joined, agents)
-    traffic = tuple(map(_traffic, agents))
+    joined = join_maps(methods, [agent.map for agent in agents], on_keyframe=on_keyframe)
+    trajectories, traffic = _trajectories(joined, agents), tuple(map(_traffic, agents))
     return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)
 
 
@@ -163,15 +189,103 @@ def merge_maps(
     return MergedMaps(tuple(merged), joined)
 
 
+def join_maps(
+    methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe | None = None
+) -> JoinedMaps:
+    """Finds loops between maps and optimises those that meet as one graph.
+
+    The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
+
+    Args:
+        methods: matcher and settings; the matcher that made the maps.
+        maps: at least one.
+        on_keyframe: for progress.
+
+    Returns:
+        All keyframes, and which maps were joined.
+
+    Raises:
+        ValueError: if a map was made by another matcher.
+    """
+    joined = _side_by_side(maps)
+    with_origin(joined, methods.origin)
+    map_of_row = np.repeat(np.arange(len(maps)), [len(each) for each in maps])
+    inner = loops_of_map(joined).loops
+    loops: tuple[Loop, ...] = ()
+    order = sorted(range(len(maps)), key=lambda number: (-len(maps[number]), maps[number].vectors.tobytes()))
+    compared = [
+        (row, place) for place in range(1, len(maps)) for row in np.flatnonzero(map_of_row == order[place]).tolist()
+    ]
+    for number, (row, place) in enumerate(compared, start=1):
+        if not is_resting(joined, loops, row):
+            is_other = np.isin(map_of_row, order[:place])
+            candidates = similar_keyframes(joined, row, is_other, methods.config.loops)
+            loops = examine_candidates(methods, joined, loops, candidates)
+        if on_keyframe is not None:
+            on_keyframe(number, len(compared))
+    if num_accepted(loops):
+        joined, state = optimize_map(joined, LoopState((*inner, *loops)))
+        loops = state.loops[len(inner) :]
+    between = [map_of_row[list(loop[:2])].tolist() for loop in loops if loop.status == "accepted"]
+    # Scipy numbers the parts in the order of their first nodes.
+    components = tuple(connected_parts(len(maps), between).tolist())
+    joined = replace(joined, T_world_keyframe=_in_own_frames(joined, map_of_row, components, maps))
+    return JoinedMaps(joined, map_of_row, components, loops)
+
+
+def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
+    """Takes one component out.
+
+    Args:
+        joined: from `join_maps`.
+        component: its number.
+
+    Returns:
+        The map of the keyframes and edges of that component, with rows of its own.
+    """
+    is_taken = np.array(joined.component_of_map)[joined.map_of_keyframe] == component
+    new_row = np.cumsum(is_taken) - 1
+    edges = [
+        edge._replace(source=int(new_row[edge.source]), target=int(new_row[edge.target]))
+        for edge in joined.slam_map.edges
+        if is_taken[edge.source]
+    ]
+    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist(), edges)
+
+
+def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
+    """Puts all keyframes into one record; rows, segments and scans are numbered on, and no edge joins two maps."""
+    joined, rows, scans, segments = KeyframeMap(), 0, 0, 0
+    for other in maps:
+        keyframes = [one._replace(scan=one.scan + scans, segment=one.segment + segments) for one in other.keyframes]
+        edges = [edge._replace(source=edge.source + rows, target=edge.target + rows) for edge in other.edges]
+        if other.origin is not None:
+            joined = joined_maps(joined, replace(other, keyframes=tuple(keyframes), edges=tuple(edges)))
+            joined, rows = with_origin(joined, other.origin), len(joined)
+            scans, segments = (1 + int(joined.column(name).max()) for name in ("scan", "segment"))
+    return joined
+
+
+def _in_own_frames(
+    joined: KeyframeMap, map_of_row: np.ndarray, components: Sequence[int], maps: Sequence[KeyframeMap]
+) -> Float[np.ndarray, "k 4 4"]:
+    """Moves each component, so that the first keyframe of its first map stays where it was."""
+    T_world = joined.T_world_keyframe.copy()
+    component_of_row = np.array(components)[map_of_row]
+    for component in np.unique(component_of_row):
+        rows = np.flatnonzero(component_of_row == component)
+        T_new_old = maps[map_of_row[rows[0]]].T_world_keyframe[0] @ rigid.inverse(T_world[rows[0]])
+        T_world[rows] = T_new_old @ T_world[rows]
+    return T_world
+
+
 def _traffic(agent: SlamResult) -> SentBytes:
-    slam_map = agent.state.slam_map
-    scans = [keyframe.compact for keyframe in slam_map.keyframes]
-    vectors_and_poses = slam_map.vectors.nbytes + slam_map.T_world_keyframe.nbytes
+    scans = [keyframe.compact for keyframe in agent.map.keyframes]
     scan_bytes = [BYTES_A_POINT * report.num_points for report in agent.reports]
     return SentBytes(
-        keyframe_bytes=sum(map(_num_bytes, scans)) + vectors_and_poses,
-        descriptor_bytes=sum(_num_bytes((scan.features, scan.feature_steps, scan.directions)) for scan in scans),
-        keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in slam_map.keyframes),
+        keyframe_bytes=_num_bytes((scans, agent.map.vectors, agent.map.T_world_keyframe)),
+        descriptor_bytes=_num_bytes([(scan.features, scan.feature_steps, scan.directions) for scan in scans]),
+        keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in agent.map.keyframes),
         scan_bytes=sum(scan_bytes),
     )
 

@@ -81,7 +81,6 @@ class LoopClosureConfig:
         is_on: False leaves the map as odometry makes it.
         num_near: largest number of candidates by distance.
         num_similar: largest number of candidates by retrieval.
-        min_cosine: smallest similarity of a candidate by retrieval.
         min_overlap: smallest overlap probability of a candidate that is registered; 0 uses no network.
         num_asked: number of candidates whose overlap is predicted at a time, of both kinds in turn.
         num_registered: largest number of candidates that are registered.
@@ -94,7 +93,6 @@ class LoopClosureConfig:
     is_on: bool = True
     num_near: int = 6
     num_similar: int = 6
-    min_cosine: float = 0.8
     min_overlap: float = 0.3
     num_asked: int = 4
     num_registered: int = 2

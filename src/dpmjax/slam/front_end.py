@@ -6,17 +6,16 @@ the share of elements that meet planes decides whether the pose is accepted.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.scans.deskew import deskew
+from dpmjax.scans.corrections import deskew
 from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
-    EdgeKind,
     Keyframe,
     KeyframeMap,
     MapEdge,
@@ -29,6 +28,7 @@ from dpmjax.slam.keyframes import (
     with_origin,
 )
 from dpmjax.slam.local_map import (
+    RECENT_SHARE,
     LocalMap,
     PlacedElements,
     joined_surface,
@@ -37,7 +37,6 @@ from dpmjax.slam.local_map import (
     placed_scan,
     with_scan,
 )
-from dpmjax.slam.reports import ScanReport, ScanStatus
 from dpmjax.types import AnyArray
 
 KEYFRAME_RAD = 0.6
@@ -77,6 +76,46 @@ UNKNOWN_M = 1000.0
 """Standard deviation of a place that nothing is known of."""
 
 
+ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
+"""How the pose of a scan was found.
+
+"first": the scan starts the map, or a new part of a loaded one. "tracked": geometry, from the predicted pose.
+"network": geometry failed there, and agreed from the network's pose, or both agree on a pose of a low score.
+"predicted": nothing agreed, the pose is a guess: what geometry prefers, or the motion of before. "empty": the scan has
+too few points. "restarted": nothing agreed for a while, a new part of the map begins here, and loops may join it.
+"""
+
+
+class ScanReport(NamedTuple):
+    """The pose of a scan and how it was found.
+
+    Attributes:
+        scan: its number.
+        status: how the pose was found.
+        reason: the numbers that decided.
+        keyframe: row of the keyframe that it hangs on; its own row if it is one.
+        T_keyframe_scan: relative pose; loops move the keyframe only.
+        is_keyframe: whether it became one.
+        score: agreement of the scan with the local map.
+        probability: P(correct) of the network; None where it did not run.
+        num_accepted: number of loops that were accepted at this scan.
+        num_points: number of points of the scan.
+        T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
+    """
+
+    scan: int
+    status: ScanStatus
+    reason: str
+    keyframe: int
+    T_keyframe_scan: Pose
+    is_keyframe: bool = False
+    score: float = 0.0
+    probability: float | None = None
+    num_accepted: int = 0
+    num_points: int = 0
+    T_turn: Pose | None = None
+
+
 class FrontEndState(NamedTuple):
     """State of odometry after a scan. The frame is that of the last keyframe.
 
@@ -100,29 +139,15 @@ class FrontEndState(NamedTuple):
     scores: tuple[float, ...] = ()
     num_lost: int = 0
 
+    @property
+    def predicted(self) -> Pose:
+        """The pose of the next scan if the last motion goes on."""
+        return self.T_keyframe_last @ self.T_before_last
 
-class Located(NamedTuple):
-    """The pose of a scan in the frame of the last keyframe, and why it is accepted or not.
-
-    Attributes:
-        T_keyframe_scan: the pose.
-        status: how it was found.
-        reason: the numbers that decided.
-        score: agreement with the local map.
-        information: (6, 6) in the tangent of the scan.
-        probability: P(correct) of the network's motion; None without one.
-        compact: the encoded scan; None where it was not encoded.
-        T_turn: predicted motion that the scan was deskewed by; None for none.
-    """
-
-    T_keyframe_scan: Pose
-    status: ScanStatus
-    reason: str
-    score: float
-    information: Float[np.ndarray, "6 6"]
-    probability: float | None = None
-    compact: CompactScan | None = None
-    T_turn: Pose | None = None
+    @property
+    def usual_score(self) -> float:
+        """Median score of recent scans; 1 without any."""
+        return float(np.median(self.scores)) if self.scores else 1.0
 
 
 class TimedScan(NamedTuple):
@@ -138,6 +163,20 @@ class TimedScan(NamedTuple):
 
 
 AnyScan = Float[AnyArray, "_n 3"] | TimedScan
+
+
+class Located(NamedTuple):
+    """The pose of a scan in the frame of the last keyframe, and what a keyframe needs beside it.
+
+    Attributes:
+        report: the pose, and why it is accepted or not.
+        information: (6, 6) in the tangent of the scan.
+        compact: the encoded scan; None where it was not encoded.
+    """
+
+    report: ScanReport
+    information: Float[np.ndarray, "6 6"]
+    compact: CompactScan | None = None
 
 
 def place_scan(
@@ -156,29 +195,31 @@ def place_scan(
     """
     T_turn = state.T_before_last if isinstance(scan, TimedScan) else None
     thinned = methods.geometry.thin(corrected_points(scan, T_turn))
+    report = ScanReport(state.num_scans, "empty", "too few points", max(len(slam_map) - 1, 0), state.predicted)
     if thinned is None:
-        return _pass_over(state, slam_map)
+        return state._replace(num_scans=state.num_scans + 1, T_keyframe_last=state.predicted), slam_map, report
+    report = report._replace(T_turn=T_turn)
     if not state.is_begun:
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
-        located = Located(np.eye(4), "first", reason, 1.0, diagonal_information(UNKNOWN_M, np.pi))
-        return _make_keyframe(methods, state, slam_map, thinned, located._replace(T_turn=T_turn))
+        report = report._replace(status="first", reason=reason, T_keyframe_scan=np.eye(4), score=1.0)
+        located = Located(report, diagonal_information(UNKNOWN_M, np.pi))
+        return _make_keyframe(methods, state, slam_map, thinned, located)
     local_map = state.local_map or local_map_of(slam_map, state.recent, methods.config.odometry)
     state = state._replace(local_map=local_map)
-    located = _locate(methods, state, local_map, thinned)
-    # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
-    located = located._replace(T_keyframe_scan=orthonormal(located.T_keyframe_scan), T_turn=T_turn)
-    if located.status == "restarted" or _is_keyframe(methods, located, thinned):
+    located = _locate(methods, state, local_map, thinned, report)
+    if located.report.status == "restarted" or _is_keyframe(methods, located.report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
-    after = _advanced(methods, state, located)
-    if located.status != "predicted":
-        placed = placed_scan(thinned.measured.surface, located.T_keyframe_scan)
+    after, report = _advanced(state, located.report), located.report
+    if report.status != "predicted":
+        placed = placed_scan(thinned.measured.surface, report.T_keyframe_scan)
         # Around a lidar that stands still, people move: the map of before fits less and less.
-        is_changed = bool(state.scores) and located.score < GOOD_SHARE * _usual_score(state)
-        recent = with_scan(state.recent, placed, thinned.extent_m, methods.config.odometry, is_changed=is_changed)
+        is_changed = bool(state.scores) and report.score < GOOD_SHARE * state.usual_score
+        spacing_m = 0.0 if is_changed else RECENT_SHARE * thinned.extent_m
+        recent = with_scan(state.recent, placed, spacing_m, methods.config.odometry)
         if recent is not state.recent:
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
-    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
+    return after, slam_map, report
 
 
 def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
@@ -198,162 +239,125 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
     return deskew(points[is_finite], np.asarray(scan.offsets)[is_finite], T_turn)
 
 
-def _pass_over(state: FrontEndState, slam_map: KeyframeMap) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
-    guess = diagonal_information(1.0, 1.0)
-    located = Located(state.T_keyframe_last @ state.T_before_last, "empty", "too few points", 0.0, guess)
-    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=located.T_keyframe_scan)
-    return after, slam_map, _report(state, slam_map, located, is_keyframe=False)
-
-
 class _Attempt(NamedTuple):
-    # The best pose from the prediction and other motions; the best pose from the decoder's motions, and these.
+    # The best pose; that from the prediction and other motions; the decoder's first motion.
+    best: Alignment
     tracked: Alignment | None
-    matched: Alignment | None = None
     T_map_scan: Pose | None = None
     probability: float | None = None
     compact: CompactScan | None = None
 
 
-def _locate(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> Located:
-    config, predicted = methods.config.front_end, state.T_keyframe_last @ state.T_before_last
-    usual = _usual_score(state)
+def _locate(
+    methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, report: ScanReport
+) -> Located:
+    config, usual = methods.config.front_end, state.usual_score
+    tried = _attempt(methods, state, local_map, scan)
+    best, probability = tried.best, tried.probability
     # Nothing is usual yet where a part of the map begins: sparse scans never score high.
     wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
-    tried = _attempt(methods, state, local_map, scan, usual)
-    # Nothing supports the prediction before any motion is known.
-    best = _better(tried, MIN_MARGIN if state.scores else 0.0)
-    is_matched = best is tried.matched
-    numbers = f"score {best.score:.2f} of usually {usual:.2f}"
-    if tried.probability is not None:
-        numbers += f", P {tried.probability:.2f} by the network"
-    network = tried.probability, tried.compact
-    is_far = not are_near(predicted, best.T_map_scan, NEAR_M, np.inf)
-    if is_far and state.scores and (tried.probability or 0.0) < config.min_probability:
+    is_far = not are_near(state.predicted, best.T_map_scan, NEAR_M, np.inf)
+    if is_far and state.scores and (probability or 0.0) < config.min_probability:
         # A motion that neither the motion of before nor the decoder supports needs the usual score.
         wanted = GOOD_SHARE * usual
-    if best.score >= wanted or _is_confirmed(methods, tried, best):
-        status: ScanStatus = "network" if is_matched else "tracked"
-        return Located(best.T_map_scan, status, numbers, best.score, best.information, *network)
-    status = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
-    guess = diagonal_information(GUESS_M, GUESS_RAD)
-    # The best alignment is the better guess, unless a robot hardly moves like that.
-    is_likely = are_near(predicted, best.T_map_scan, 3 * GUESS_M, 3 * GUESS_RAD)
-    return Located(best.T_map_scan if is_likely else predicted, status, numbers, best.score, guess, *network)
+    T, information = best.T_map_scan, best.information
+    status: ScanStatus = "tracked" if best is tried.tracked else "network"
+    if best.score < wanted and not _is_confirmed(tried, config.min_probability):
+        status = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
+        information = diagonal_information(GUESS_M, GUESS_RAD)
+        # The best alignment is the better guess, unless a robot hardly moves like that.
+        T = T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
+    reason = f"score {best.score:.2f} of usually {usual:.2f}"
+    if probability is not None:
+        reason += f", P {probability:.2f} by the network"
+    # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
+    report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
+    return Located(report._replace(score=best.score, probability=probability), information, tried.compact)
 
 
-def _usual_score(state: FrontEndState) -> float:
-    return float(np.median(state.scores)) if state.scores else 1.0
-
-
-def _attempt(
-    methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, usual: float
-) -> _Attempt:
+def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> _Attempt:
     """Aligns from the prediction and from the decoder's motions, in the order that the configuration names."""
-    geometry, config = methods.geometry, methods.config.odometry
-    predicted = state.T_keyframe_last @ state.T_before_last
+    geometry, predicted = methods.geometry, state.predicted
+    is_predicted = methods.config.odometry.proposer == "prediction"
+    good_score = GOOD_SHARE * state.usual_score
     # The second scan of a drive has no motion to go on with.
-    has_motion = len(state.scores) > 0
-    tracked = None
-    if config.proposer == "prediction" and has_motion:
+    has_motion, tracked = len(state.scores) > 0, None
+    if is_predicted and has_motion:
         tracked = geometry.align(local_map, scan, predicted)
-        if tracked.score >= GOOD_SHARE * usual:
-            return _Attempt(tracked)
+        if tracked.score >= good_score:
+            return _Attempt(tracked, tracked)
     compact = methods.matcher.encode(scan)
     row = nearest_keyframe(local_map, predicted[:3, 3])
     proposal = methods.matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
     starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
-    matched = geometry.search(local_map, scan, starts)
-    if tracked is None and (config.proposer == "prediction" or matched.score < GOOD_SHARE * usual):
+    best = matched = geometry.search(local_map, scan, starts)
+    if tracked is None and (is_predicted or matched.score < good_score):
         tracked = geometry.align(local_map, scan, predicted)
-    if tracked is not None and matched.score < GOOD_SHARE * usual:
-        others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
-        tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
-    return _Attempt(tracked, matched, starts[0], proposal.probability, compact)
+    if tracked is not None:
+        if matched.score < good_score:
+            others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
+            tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
+        # Another place must fit better by a margin; nothing supports the prediction before any motion is known.
+        is_same = are_near(tracked.T_map_scan, matched.T_map_scan, NEAR_M, np.inf)
+        if matched.score <= tracked.score + (0.0 if is_same or not has_motion else MIN_MARGIN):
+            best = tracked
+    return _Attempt(best, tracked, starts[0], proposal.probability, compact)
 
 
-def _better(tried: _Attempt, min_margin: float) -> Alignment:
-    """Returns the better pose; another place must fit better by a margin than the one that the prediction supports."""
-    tracked, matched = tried.tracked, tried.matched
-    if tracked is None or matched is None:
-        return best_of([found for found in (tracked, matched) if found is not None])
-    is_same = are_near(tracked.T_map_scan, matched.T_map_scan, NEAR_M, np.inf)
-    return matched if matched.score > tracked.score + (0.0 if is_same else min_margin) else tracked
-
-
-def _is_confirmed(methods: SlamMethods, tried: _Attempt, best: Alignment) -> bool:
+def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
     """Returns True where the decoder alone and the alignment from other starts end at the same pose."""
-    config = methods.config.front_end
-    if tried.tracked is None or tried.T_map_scan is None or (tried.probability or 0.0) < config.min_probability:
+    if tried.tracked is None or tried.T_map_scan is None or (tried.probability or 0.0) < min_probability:
         return False
     ends = (tried.tracked.T_map_scan, tried.T_map_scan)
-    are_equal = all(are_near(T, best.T_map_scan, NEAR_M, NEAR_RAD) for T in ends)
-    return are_equal and best.score >= MIN_SCORE
+    are_equal = all(are_near(T, tried.best.T_map_scan, NEAR_M, NEAR_RAD) for T in ends)
+    return are_equal and tried.best.score >= MIN_SCORE
 
 
-def _is_keyframe(methods: SlamMethods, located: Located, scan: ThinnedScan) -> bool:
-    if located.status == "predicted":
-        return False
-    config, T = methods.config.front_end, located.T_keyframe_scan
-    spacing_m = config.keyframe_share * scan.extent_m
-    spacing_m = float(np.clip(spacing_m, config.min_keyframe_m, config.max_keyframe_m))
-    return bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > KEYFRAME_RAD
+def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: ThinnedScan) -> bool:
+    config, T = methods.config.front_end, report.T_keyframe_scan
+    spacing_m = np.clip(config.keyframe_share * scan.extent_m, config.min_keyframe_m, config.max_keyframe_m)
+    is_away = bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > KEYFRAME_RAD
+    return is_away and report.status != "predicted"
 
 
 def _make_keyframe(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: ThinnedScan, located: Located
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
-    T, row = located.T_keyframe_scan, len(slam_map)
-    is_guess = row > 0 and located.status in ("first", "restarted")
+    report, row = located.report, len(slam_map)
+    T, is_guess = report.T_keyframe_scan, row > 0 and report.status in ("first", "restarted")
     compact = methods.matcher.encode(scan) if located.compact is None else located.compact
-    T_odometry, T_world, path_m, segment, edge = T, T, 0.0, 0, None
+    keyframe, T_world, edge = Keyframe(state.num_scans, T, 0.0, 0, scan.extent_m, compact), T, None
     if row:
-        last = slam_map.keyframes[-1]
-        T_odometry, T_world = last.T_odometry_keyframe @ T, slam_map.T_world_keyframe[-1] @ T
-        path_m, segment = last.path_m + float(np.linalg.norm(T[:3, 3])), last.segment + is_guess
-        kind: EdgeKind = "guess" if is_guess else "odometry"
-        edge = MapEdge(row, row - 1, T, located.information, kind)
-    keyframe = Keyframe(state.num_scans, T_odometry, path_m, segment, scan.extent_m, compact)
+        last, T_world = slam_map.keyframes[-1], slam_map.T_world_keyframe[-1] @ T
+        keyframe = keyframe._replace(
+            T_odometry_keyframe=last.T_odometry_keyframe @ T,
+            path_m=last.path_m + float(np.linalg.norm(T[:3, 3])),
+            segment=last.segment + is_guess,
+        )
+        edge = MapEdge(row, row - 1, T, located.information, "guess" if is_guess else "odometry")
     slam_map = with_origin(slam_map, methods.origin)
     slam_map = add_keyframe(slam_map, keyframe, T_world, methods.matcher.vector(compact), edge)
     # In the frame of the new keyframe; the scans of another segment have no place in it.
-    moved = (
-        [] if is_guess else [entry._replace(T_map_scan=rigid.inverse(T) @ entry.T_map_scan) for entry in state.recent]
-    )
+    T_new_old = rigid.inverse(T)
+    moved = () if is_guess else tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in state.recent)
     placed = placed_scan(scan.measured.surface, np.eye(4))
-    after = _advanced(methods, state, located)._replace(
+    spacing_m = RECENT_SHARE * scan.extent_m
+    after = _advanced(state, report)._replace(
         is_begun=True,
-        recent=with_scan(tuple(moved), placed, scan.extent_m, methods.config.odometry),
+        recent=with_scan(moved, placed, spacing_m, methods.config.odometry),
         local_map=None,
         T_keyframe_last=np.eye(4),
     )
-    return after, slam_map, _report(state, slam_map, located._replace(T_keyframe_scan=np.eye(4)), is_keyframe=True)
+    return after, slam_map, report._replace(keyframe=row, T_keyframe_scan=np.eye(4), is_keyframe=True)
 
 
-def _advanced(methods: SlamMethods, state: FrontEndState, located: Located) -> FrontEndState:
+def _advanced(state: FrontEndState, report: ScanReport) -> FrontEndState:
     """Returns the state after a scan: only an accepted one changes the predicted motion."""
-    T = located.T_keyframe_scan
-    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T)
-    if located.status == "predicted":
+    T = report.T_keyframe_scan
+    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T, num_lost=0)
+    if report.status == "predicted":
         return after._replace(num_lost=state.num_lost + 1)
-    if located.status in ("first", "restarted"):
-        return after._replace(num_lost=0, scores=())
-    return after._replace(
-        T_before_last=rigid.inverse(state.T_keyframe_last) @ T,
-        scores=(*state.scores, located.score)[-USUAL_WINDOW:],
-        num_lost=0,
-    )
-
-
-def _report(state: FrontEndState, slam_map: KeyframeMap, located: Located, *, is_keyframe: bool) -> ScanReport:
-    keyframe, T = max(len(slam_map) - 1, 0), located.T_keyframe_scan
-    return ScanReport(
-        state.num_scans,
-        located.status,
-        located.reason,
-        keyframe,
-        T,
-        is_keyframe,
-        score=located.score,
-        probability=located.probability,
-        T_turn=located.T_turn,
-    )
+    if report.status in ("first", "restarted"):
+        return after._replace(scores=())
+    T_before_last = rigid.inverse(state.T_keyframe_last) @ T
+    return after._replace(T_before_last=T_before_last, scores=(*state.scores, report.score)[-USUAL_WINDOW:])

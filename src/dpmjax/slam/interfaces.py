@@ -63,7 +63,6 @@ class Geometry(Protocol):
         Returns:
             The thinned scan; None for a scan without enough flat points.
         """
-        ...
 
     def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
         """Aligns a scan from a first guess that is nearly right.
@@ -76,7 +75,6 @@ class Geometry(Protocol):
         Returns:
             The pose.
         """
-        ...
 
     def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Float[np.ndarray, "s 4 4"]) -> Alignment:
         """Aligns a scan from several first guesses, coarse to fine.
@@ -89,7 +87,6 @@ class Geometry(Protocol):
         Returns:
             The pose of the highest score.
         """
-        ...
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
         """Returns motions that a vehicle may make instead of the predicted one.
@@ -101,7 +98,6 @@ class Geometry(Protocol):
         Returns:
             The motions.
         """
-        ...
 
 
 def best_of(alignments: Sequence[Alignment]) -> Alignment:
@@ -155,7 +151,8 @@ class Matcher(Protocol):
     """
 
     @property
-    def fingerprint(self) -> str: ...  # noqa: D102
+    def fingerprint(self) -> str:
+        """Returns a text that is equal for equal matchers."""
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
         """Prepares a scan for any number of registrations.
@@ -166,7 +163,6 @@ class Matcher(Protocol):
         Returns:
             Descriptors, surface elements and free space.
         """
-        ...
 
     def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
         """Returns one vector for retrieval, of a length that is the same for all scans.
@@ -177,7 +173,6 @@ class Matcher(Protocol):
         Returns:
             The vector.
         """
-        ...
 
     def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:
         """Registers a scan by descriptors alone.
@@ -190,7 +185,6 @@ class Matcher(Protocol):
         Returns:
             Distinct motions; at least one.
         """
-        ...
 
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
         """Registers pairs of source and target, and verifies them by their surfaces.
@@ -201,7 +195,6 @@ class Matcher(Protocol):
         Returns:
             One match a pair, between the frames of the two submaps.
         """
-        ...
 
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:
         """Estimates the probability that scans see the same place, for many scans at once.
@@ -213,7 +206,6 @@ class Matcher(Protocol):
         Returns:
             The probabilities.
         """
-        ...
 
 
 class SlamMethods(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -83,6 +83,18 @@ class KeyframeMap:
     def __len__(self) -> int:
         return len(self.keyframes)
 
+    def column(self, name: str) -> np.ndarray:
+        """Returns one field of all keyframes, such as "path_m", as an array."""
+        return np.array([getattr(keyframe, name) for keyframe in self.keyframes])
+
+    def edges_of(self, *kinds: EdgeKind) -> list[MapEdge]:
+        """Returns the edges of some kinds; those of "odometry" and "loop" are measured."""
+        return [edge for edge in self.edges if edge.kind in kinds]
+
+    def distances_to(self, position_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
+        """Returns the distances of all keyframes to a position, in metres."""
+        return np.asarray(np.linalg.norm(self.T_world_keyframe[:, :3, 3] - position_world, axis=1))
+
 
 class Submap(NamedTuple):
     """Keyframes around a central one, which are registered as a whole.
@@ -116,12 +128,45 @@ def add_keyframe(
         The map after.
     """
     unit = np.asarray(vector, np.float32)[None] / np.float32(max(float(np.linalg.norm(vector)), 1e-12))
-    return replace(
-        slam_map,
-        keyframes=(*slam_map.keyframes, keyframe),
-        T_world_keyframe=np.concatenate([slam_map.T_world_keyframe, T_world_keyframe[None]]),
-        vectors=np.concatenate([slam_map.vectors.reshape(len(slam_map), -1 if len(slam_map) else unit.shape[1]), unit]),
-        edges=slam_map.edges if edge is None else (*slam_map.edges, edge),
+    edges = () if edge is None else (edge,)
+    return joined_maps(slam_map, KeyframeMap((keyframe,), T_world_keyframe[None], unit, edges))
+
+
+def joined_maps(slam_map: KeyframeMap, other: KeyframeMap) -> KeyframeMap:
+    """Appends the keyframes and the edges of another map, which count the rows of both.
+
+    Args:
+        slam_map: the map before.
+        other: the further keyframes; at least one.
+
+    Returns:
+        The map after, with the origin of the first.
+    """
+    if len(slam_map) == 0:
+        return replace(other, origin=slam_map.origin)
+    return KeyframeMap(
+        (*slam_map.keyframes, *other.keyframes),
+        np.concatenate([slam_map.T_world_keyframe, other.T_world_keyframe]),
+        np.concatenate([slam_map.vectors, other.vectors]),
+        (*slam_map.edges, *other.edges),
+        slam_map.origin,
+    )
+
+
+def take_keyframes(slam_map: KeyframeMap, rows: Sequence[int], edges: Iterable[MapEdge]) -> KeyframeMap:
+    """Takes some keyframes out of a map.
+
+    Args:
+        slam_map: the map.
+        rows: of the keyframes.
+        edges: between the keyframes, by their new rows.
+
+    Returns:
+        The smaller map.
+    """
+    keyframes = tuple(slam_map.keyframes[row] for row in rows)
+    return KeyframeMap(
+        keyframes, slam_map.T_world_keyframe[rows], slam_map.vectors[rows], tuple(edges), slam_map.origin
     )
 
 
@@ -145,80 +190,21 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
     return replace(slam_map, origin=origin)
 
 
-def with_edges(slam_map: KeyframeMap, edges: Iterable[MapEdge]) -> KeyframeMap:
-    """Replaces the edges.
-
-    Args:
-        slam_map: the map before.
-        edges: all edges after.
-
-    Returns:
-        The map after.
-    """
-    return replace(slam_map, edges=tuple(edges))
-
-
-def with_poses(slam_map: KeyframeMap, T_world_keyframe: Float[np.ndarray, "k 4 4"]) -> KeyframeMap:
-    """Replaces the poses.
-
-    Args:
-        slam_map: the map before.
-        T_world_keyframe: all poses after.
-
-    Returns:
-        The map after.
-    """
-    return replace(slam_map, T_world_keyframe=np.asarray(T_world_keyframe, np.float64))
-
-
-def distances_to(slam_map: KeyframeMap, position_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
-    """Computes the distances of all keyframes to a position.
-
-    Args:
-        slam_map: the map.
-        position_world: metres.
-
-    Returns:
-        Metres.
-    """
-    return np.asarray(np.linalg.norm(slam_map.T_world_keyframe[:, :3, 3] - position_world, axis=1))
-
-
-def graph_steps(slam_map: KeyframeMap, row: int, max_steps: int) -> Float[np.ndarray, " k"]:
-    """Counts the edges between a keyframe and all others.
-
-    Args:
-        slam_map: the map.
-        row: of the keyframe.
-        max_steps: others farther away count as not reached.
-
-    Returns:
-        Number of edges; infinite where not reached. Predicted motions are no edges here.
-    """
-    measured = [(edge.source, edge.target) for edge in slam_map.edges if edge.kind != "guess"]
-    sources, targets = np.asarray(measured, np.int64).reshape(-1, 2).T
-    joined = sp.coo_array((np.ones(len(sources)), (sources, targets)), (len(slam_map), len(slam_map))).tocsr()
-    found = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=max_steps)
-    return np.asarray(found)[0]
-
-
-def connected_parts(num_keyframes: int, edges: Sequence[MapEdge]) -> Int[np.ndarray, " k"]:
+def connected_parts(num_nodes: int, edges: Iterable[Sequence[Any]]) -> Int[np.ndarray, " n"]:
     """Numbers the connected parts of a graph.
 
     Args:
-        num_keyframes: number of nodes.
-        edges: what joins them.
+        num_nodes: number of nodes.
+        edges: records whose first two fields are the nodes that they join.
 
     Returns:
-        The number of the part of each keyframe.
+        The number of the part of each node.
     """
-    rows = np.array([(edge.source, edge.target) for edge in edges], np.int64).reshape(-1, 2).T
-    joined = sp.coo_array((np.ones(rows.shape[1]), (rows[0], rows[1])), (num_keyframes, num_keyframes))
-    return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1], np.int64)
+    return np.asarray(sp.csgraph.connected_components(_joined(num_nodes, edges), directed=False)[1], np.int64)
 
 
 def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Int[np.ndarray, " n"]:
-    """Finds the nearest keyframes among those that the graph joins to a keyframe.
+    """Finds the nearest keyframes among those that measured edges join to a keyframe.
 
     Args:
         slam_map: the map.
@@ -229,10 +215,16 @@ def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius
     Returns:
         Rows, the keyframe itself first, then nearest first.
     """
-    steps = graph_steps(slam_map, row, num_keyframes)
-    apart = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
-    rows = np.flatnonzero(np.isfinite(steps) & (apart <= radius_m))
-    return rows[np.lexsort((apart[rows], rows != row))][:num_keyframes]
+    joined = _joined(len(slam_map), slam_map.edges_of("odometry", "loop"))
+    steps = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=num_keyframes)[0]
+    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
+    rows = np.flatnonzero(np.isfinite(steps) & (apart_m <= radius_m))
+    return rows[np.lexsort((apart_m[rows], rows != row))][:num_keyframes]
+
+
+def _joined(num_nodes: int, edges: Iterable[Sequence[Any]]) -> sp.csr_array:
+    ends = np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2).T
+    return sp.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (num_nodes, num_nodes)).tocsr()
 
 
 def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap:
@@ -260,14 +252,11 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     Returns:
         The graph.
     """
-    edges = slam_map.edges
-    records = Edges(
-        np.array([edge.source for edge in edges], np.int64),
-        np.array([edge.target for edge in edges], np.int64),
-        np.array([edge.T_target_source for edge in edges]).reshape(-1, 4, 4),
-        np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
-    )
-    return PoseGraph.create(slam_map.T_world_keyframe, records, ids=[keyframe.scan for keyframe in slam_map.keyframes])
+    ends = np.array([edge[:2] for edge in slam_map.edges], np.int64).reshape(-1, 2).T
+    T_target_source = np.array([edge.T_target_source for edge in slam_map.edges]).reshape(-1, 4, 4)
+    information = np.array([edge.information for edge in slam_map.edges]).reshape(-1, 6, 6)
+    edges = Edges(ends[0], ends[1], T_target_source, information)
+    return PoseGraph.create(slam_map.T_world_keyframe, edges, ids=slam_map.column("scan"))
 
 
 def turn_rad(T_a_b: Pose) -> float:

@@ -17,18 +17,9 @@ from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframes import (
-    KeyframeMap,
-    Pose,
-    Submap,
-    are_near,
-    distances_to,
-    orthonormal,
-    submap_around,
-    with_origin,
-)
-from dpmjax.slam.loop_consistency import scans_agree
-from dpmjax.slam.retrieval import most_similar
+from dpmjax.slam.keyframes import KeyframeMap, Pose, Submap, are_near, orthonormal, submap_around, with_origin
+from dpmjax.slam.loop_candidates import most_similar
+from dpmjax.slam.loops import scans_agree
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray
 
@@ -44,6 +35,12 @@ SAME_PLACE_M = 1.5
 NUM_AT_ONCE = 2
 """Number of registrations at a time; the next ones follow only where the place is not clear."""
 
+NUM_NEIGHBOURS = 2
+"""Number of further keyframes near the best place that are registered."""
+
+MIN_PROBABILITY = 0.2
+"""A registration supports a place from this P(correct) on, if the scans agree."""
+
 LocalizationStatus = Literal["found", "not in this map", "empty"]
 
 
@@ -54,9 +51,6 @@ class LocalizationConfig:
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
         num_registered: largest number of them that are registered, in order of their overlap.
-        num_neighbours: number of further keyframes near the best place that are registered.
-        num_submap: number of keyframes whose descriptors are merged for a registration.
-        min_probability: a registration supports a place from this P(correct) on, if the scans agree.
         min_support: number of registrations that must end at the same place; the scans of at least one must agree. One
             registration suffices where no other keyframe is near.
         min_best: smallest P(correct) of the best registration of a place. Streets look alike: several may agree on a
@@ -65,16 +59,12 @@ class LocalizationConfig:
 
     num_similar: int = 16
     num_registered: int = 8
-    num_neighbours: int = 2
-    num_submap: int = 1
-    min_probability: float = 0.2
     min_support: int = 2
     min_best: float = 0.9
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_similar", "num_registered", "num_submap", "min_support", low=1)
-        require_fields(self, "num_neighbours", low=0)
-        require_fields(self, "min_probability", "min_best", low=0, high=1)
+        require_fields(self, "num_similar", "num_registered", "min_support", low=1)
+        require_fields(self, "min_best", low=0, high=1)
 
 
 class KeyframeMatch(NamedTuple):
@@ -116,15 +106,6 @@ class Localization(NamedTuple):
     def is_in_map(self) -> bool:
         """True where the scan was found."""
         return self.status == "found"
-
-
-class _Place(NamedTuple):
-    # Registrations that agree, the most probable first.
-    members: tuple[KeyframeMatch, ...]
-
-    @property
-    def total(self) -> float:
-        return sum(member.match.probability for member in self.members)
 
 
 def localize(
@@ -176,107 +157,95 @@ def localize_each(
     methods = model if isinstance(model, SlamMethods) else make_methods(model, slam_map.origin.config)
     with_origin(slam_map, methods.origin)
     for scan in scans:
-        yield _localized(methods, slam_map, np.asarray(scan), config or LocalizationConfig())
+        yield _Search(methods, slam_map, config or LocalizationConfig()).localized(np.asarray(scan))
 
 
-def _localized(
-    methods: SlamMethods, slam_map: KeyframeMap, scan: np.ndarray, config: LocalizationConfig
-) -> Localization:
-    if scan.ndim != 2 or scan.shape[1] != 3:
-        raise ValueError(f"scan: expected shape (n, 3), got {scan.shape}")
-    points = scan[np.isfinite(scan).all(axis=1)]
-    thinned = methods.geometry.thin(points)
-    if thinned is None:
-        return Localization("empty", None, 0.0, None, "too few points")
-    compact, extent_m = methods.matcher.encode(thinned), thinned.extent_m
-    rows = _candidates(slam_map, compact, methods, config)
-    tried: list[KeyframeMatch] = []
-    for start in range(0, len(rows), NUM_AT_ONCE):
-        done = {one.keyframe for one in tried}
-        left = [row for row in rows[start : start + NUM_AT_ONCE] if row not in done]
-        tried += _registered(slam_map, left, compact, methods, config)
-        place = max(_places(tried, config), key=lambda place: place.total, default=None)
-        if place is not None and not _is_supported(place, config, config.min_support):
-            near = _neighbours(slam_map, place.members[0], tried, extent_m, config)
-            tried += _registered(slam_map, near, compact, methods, config)
-        found = _decided(slam_map, tried, extent_m, config)
-        if found.status == "found":
-            return found
-    return found
+Place = tuple[KeyframeMatch, ...]
+"""Registrations that agree, the most probable first."""
 
 
-def _candidates(
-    slam_map: KeyframeMap, compact: CompactScan, methods: SlamMethods, config: LocalizationConfig
-) -> list[int]:
-    """Returns the keyframes to register, the most probable overlap first."""
-    vector = methods.matcher.vector(compact)
-    vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
-    rows, _ = most_similar(slam_map.vectors, vector, config.num_similar)
-    overlaps = methods.matcher.overlaps(compact, [slam_map.keyframes[row].compact for row in rows])
-    order = np.argsort(-overlaps, kind="stable")[: config.num_registered]
-    return [int(rows[number]) for number in order]
+class _Search(NamedTuple):
+    # Where scans are looked for, and how.
+    methods: SlamMethods
+    slam_map: KeyframeMap
+    config: LocalizationConfig
 
+    def localized(self, scan: np.ndarray) -> Localization:
+        """Registers the scan with keyframes until the place is clear, or none is left."""
+        if scan.ndim != 2 or scan.shape[1] != 3:
+            raise ValueError(f"scan: expected shape (n, 3), got {scan.shape}")
+        thinned = self.methods.geometry.thin(scan[np.isfinite(scan).all(axis=1)])
+        if thinned is None:
+            return Localization("empty", None, 0.0, None, "too few points")
+        compact, extent_m = self.methods.matcher.encode(thinned), thinned.extent_m
+        rows, tried = self._candidates(compact), list[KeyframeMatch]()
+        for start in range(0, len(rows), NUM_AT_ONCE):
+            tried += self._registered(rows[start : start + NUM_AT_ONCE], compact, tried)
+            places = self._places(tried)
+            if places and not self._is_supported(places[0], self.config.min_support):
+                apart_m = self.slam_map.distances_to(places[0][0].T_world_scan[:3, 3])
+                done = [one.keyframe for one in tried]
+                nearest = [row for row in np.argsort(apart_m, kind="stable").tolist() if apart_m[row] <= extent_m]
+                near = [row for row in nearest if row not in done][:NUM_NEIGHBOURS]
+                tried += self._registered(near, compact, tried)
+            found = self._decided(tried, extent_m)
+            if found.status == "found":
+                break
+        return found
 
-def _registered(
-    slam_map: KeyframeMap, rows: list[int], compact: CompactScan, methods: SlamMethods, config: LocalizationConfig
-) -> list[KeyframeMatch]:
-    source = Submap((compact,), np.eye(4)[None])
-    targets = [submap_around(slam_map, row, config.num_submap) for row in rows]
-    matches = methods.matcher.register([(source, target) for target in targets]) if rows else []
-    return [
-        KeyframeMatch(
-            row, orthonormal(slam_map.T_world_keyframe[row] @ match.T_target_source), match, scans_agree(match)
-        )
-        for row, match in zip(rows, matches, strict=True)
-    ]
+    def _candidates(self, compact: CompactScan) -> list[int]:
+        """Returns the keyframes to register, the most probable overlap first."""
+        matcher, config = self.methods.matcher, self.config
+        vector = matcher.vector(compact)
+        vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
+        rows, _ = most_similar(self.slam_map.vectors, vector, config.num_similar)
+        overlaps = matcher.overlaps(compact, [self.slam_map.keyframes[row].compact for row in rows])
+        return rows[np.argsort(-overlaps, kind="stable")[: config.num_registered]].tolist()
 
+    def _registered(self, rows: list[int], compact: CompactScan, tried: list[KeyframeMatch]) -> list[KeyframeMatch]:
+        """Registers the scan with the keyframes that were not tried before."""
+        rows = [row for row in rows if row not in [one.keyframe for one in tried]]
+        source, targets = Submap((compact,), np.eye(4)[None]), [submap_around(self.slam_map, row, 1) for row in rows]
+        matches = self.methods.matcher.register([(source, target) for target in targets]) if rows else []
+        T_world = self.slam_map.T_world_keyframe
+        return [
+            KeyframeMatch(row, orthonormal(T_world[row] @ match.T_target_source), match, scans_agree(match))
+            for row, match in zip(rows, matches, strict=True)
+        ]
 
-def _places(tried: list[KeyframeMatch], config: LocalizationConfig) -> list[_Place]:
-    """Groups registrations around the most probable ones whose scans agree."""
-    # Fewer points meet planes of a keyframe farther off: that it puts the scan at the same place is enough.
-    left = sorted(tried, key=lambda one: -one.match.probability)
-    left = [one for one in left if one.match.probability >= config.min_probability]
-    places = []
-    while first := next((one for one in left if one.do_scans_agree), None):
-        others = [one for one in left if one is not first and _agree(first, one)]
-        places.append(_Place((first, *others)))
-        left = [one for one in left if not any(one is member for member in places[-1].members)]
-    return places
+    def _places(self, tried: list[KeyframeMatch]) -> list[Place]:
+        """Groups registrations around the most probable ones whose scans agree; the most probable place first."""
+        # Fewer points meet planes of a keyframe farther off: that it puts the scan at the same place is enough.
+        left = sorted(tried, key=lambda one: -one.match.probability)
+        left = [one for one in left if one.match.probability >= MIN_PROBABILITY]
+        places = []
+        while first := next((one for one in left if one.do_scans_agree), None):
+            others = [one for one in left if one is not first and _agree(first, one)]
+            places.append((first, *others))
+            left = [one for one in left if not any(one is member for member in places[-1])]
+        return sorted(places, key=lambda place: -_total(place))
+
+    def _is_supported(self, place: Place, min_support: int) -> bool:
+        return len(place) >= min_support and place[0].match.probability >= self.config.min_best
+
+    def _decided(self, tried: list[KeyframeMatch], extent_m: float) -> Localization:
+        places, evidence = self._places(tried), tuple(tried)
+        if not places:
+            highest = max((one.match.probability for one in tried), default=0.0)
+            return Localization("not in this map", None, 0.0, None, f"best P {highest:.2f} of {len(tried)}", evidence)
+        best, total, rival = places[0], _total(places[0]), _total(places[1]) if len(places) > 1 else 0.0
+        first, probability = best[0], best[0].match.probability
+        numbers = f"{len(best)} of {len(tried)} agree, P {probability:.2f}, sum {total:.2f}, next place {rival:.2f}"
+        is_alone = int((self.slam_map.distances_to(first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
+        is_supported = self._is_supported(best, 1 if is_alone else self.config.min_support)
+        if not is_supported or rival > MAX_RIVAL_SHARE * total:
+            return Localization("not in this map", None, 0.0, None, numbers, evidence)
+        return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)
 
 
 def _agree(one: KeyframeMatch, other: KeyframeMatch) -> bool:
     return are_near(one.T_world_scan, other.T_world_scan, SAME_PLACE_M, SAME_PLACE_RAD)
 
 
-def _is_supported(place: _Place, config: LocalizationConfig, min_support: int) -> bool:
-    return len(place.members) >= min_support and place.members[0].match.probability >= config.min_best
-
-
-def _neighbours(
-    slam_map: KeyframeMap, best: KeyframeMatch, tried: list[KeyframeMatch], extent_m: float, config: LocalizationConfig
-) -> list[int]:
-    """Returns keyframes near the place that were not tried yet, nearest first."""
-    apart_m = distances_to(slam_map, best.T_world_scan[:3, 3])
-    done = {one.keyframe for one in tried}
-    near = [int(row) for row in np.argsort(apart_m, kind="stable") if apart_m[row] <= extent_m]
-    return [row for row in near if row not in done][: config.num_neighbours]
-
-
-def _decided(
-    slam_map: KeyframeMap, tried: list[KeyframeMatch], extent_m: float, config: LocalizationConfig
-) -> Localization:
-    places = sorted(_places(tried, config), key=lambda place: -place.total)
-    evidence = tuple(tried)
-    if not places:
-        highest = max((one.match.probability for one in tried), default=0.0)
-        return Localization("not in this map", None, 0.0, None, f"best P {highest:.2f} of {len(tried)}", evidence)
-    best, rival = places[0], places[1].total if len(places) > 1 else 0.0
-    first = best.members[0]
-    numbers = f"{len(best.members)} of {len(tried)} agree, P {first.match.probability:.2f}, sum {best.total:.2f}"
-    numbers += f", next place {rival:.2f}"
-    is_alone = int((distances_to(slam_map, first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
-    is_supported = _is_supported(best, config, 1 if is_alone else config.min_support)
-    if not is_supported or rival > MAX_RIVAL_SHARE * best.total:
-        return Localization("not in this map", None, 0.0, None, numbers, evidence)
-    probability = first.match.probability
-    return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)
+def _total(place: Place) -> float:
+    return sum(member.match.probability for member in place)

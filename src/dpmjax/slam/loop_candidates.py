@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.slam.config import LoopClosureConfig
-from dpmjax.slam.keyframes import KeyframeMap, distances_to
-from dpmjax.slam.retrieval import most_similar
+from dpmjax.slam.keyframes import KeyframeMap
+from dpmjax.slam.loops import Loop
 
 MAX_RADIUS_M = 100.0
 """Upper bound of the radius (DeepPointMap: 100 m)."""
@@ -24,41 +23,14 @@ RADIUS_SHARE = 1.5
 DRIFT_SHARE = 0.03
 """Share of the path since a candidate that is added to the radius."""
 
+MIN_COSINE = 0.8
+"""Smallest similarity of a candidate by retrieval."""
 
-class LoopCandidate(NamedTuple):
-    """An older keyframe that may show the same place.
-
-    Attributes:
-        row: of the keyframe.
-        found_by: how.
-    """
-
-    row: int
-    found_by: Literal["distance", "retrieval"]
+MIN_NUM_CENTRED = 20
+"""The mean of fewer vectors is no background."""
 
 
-class _Path(NamedTuple):
-    # Of all keyframes.
-    path_m: Float[np.ndarray, " k"]
-    segments: Int[np.ndarray, " k"]
-    extents_m: Float[np.ndarray, " k"]
-
-    @classmethod
-    def of(cls, slam_map: KeyframeMap) -> _Path:
-        columns = [(frame.path_m, frame.segment, frame.extent_m) for frame in slam_map.keyframes]
-        return cls(*(np.array(column) for column in zip(*columns, strict=True)))
-
-    def since_m(self, row: int) -> Float[np.ndarray, " k"]:
-        """Returns the path from each keyframe to one; infinite where the track was lost between them."""
-        return np.where(self.segments == self.segments[row], self.path_m[row] - self.path_m, np.inf)
-
-    def is_old(self, row: int) -> Bool[np.ndarray, " k"]:
-        """Returns True for keyframes that a loop may join to one."""
-        is_before = np.arange(len(self.path_m)) < row
-        return is_before & (self.since_m(row) > MIN_PATH_SHARE * self.extents_m[row])
-
-
-def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[LoopCandidate]:
+def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[Loop]:
     """Finds older keyframes that may show the place of a keyframe.
 
     By distance: within a radius that grows with the path since, for odometry drifts. By retrieval: over the whole map,
@@ -67,21 +39,19 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
     Args:
         slam_map: the map.
         row: of the new keyframe.
-        config: radii and numbers.
+        config: numbers.
 
     Returns:
         Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
     """
-    keyframe, path = slam_map.keyframes[row], _Path.of(slam_map)
-    is_old, since_m = path.is_old(row), path.since_m(row)
-    apart_m = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])
-    radius_m = RADIUS_SHARE * keyframe.extent_m + DRIFT_SHARE * since_m
-    is_near = is_old & (apart_m <= np.minimum(radius_m, MAX_RADIUS_M))
+    extent_m, since_m = slam_map.keyframes[row].extent_m, _path_since_m(*_paths(slam_map), row)
+    is_old = _is_old(since_m, row, extent_m)
+    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
+    is_near = is_old & (apart_m <= np.minimum(RADIUS_SHARE * extent_m + DRIFT_SHARE * since_m, MAX_RADIUS_M))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
-    near = _spread(near, slam_map, keyframe.extent_m / 2, config.num_near)
-    similar = _similar(slam_map, row, is_old, config)
-    by_distance = [LoopCandidate(int(other), "distance") for other in near]
-    by_retrieval = [LoopCandidate(int(other), "retrieval") for other in similar if other not in near]
+    near = _spread(near, slam_map, extent_m / 2, config.num_near)
+    by_distance = [Loop(row, int(other), "distance") for other in near]
+    by_retrieval = [loop for loop in similar_keyframes(slam_map, row, is_old, config) if loop.target not in near]
     in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))
     return [candidate for candidate in in_turn if candidate is not None]
 
@@ -95,41 +65,85 @@ def nearest_pairs(slam_map: KeyframeMap) -> list[tuple[float, int, int]]:
     Returns:
         Distance in metres and both rows, newer first, where it is within the extent of the newer scan; nearest first.
     """
-    pairs, path = [], _Path.of(slam_map)
-    positions = slam_map.T_world_keyframe[:, :3, 3]
+    pairs, paths = [], _paths(slam_map)
     for row, keyframe in enumerate(slam_map.keyframes):
-        is_old = path.is_old(row)[:row]
-        apart_m = np.where(is_old, np.linalg.norm(positions[:row] - positions[row], axis=1), np.inf)
-        target = int(np.argmin(apart_m)) if row else 0
-        if row and apart_m[target] < keyframe.extent_m:
+        is_old = _is_old(_path_since_m(*paths, row), row, keyframe.extent_m)
+        apart_m = np.where(is_old, slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3]), np.inf)
+        target = int(np.argmin(apart_m))
+        if apart_m[target] < keyframe.extent_m:
             pairs.append((float(apart_m[target]), row, target))
     return sorted(pairs)
 
 
-def find_meetings(
-    slam_map: KeyframeMap, row: int, is_other: Bool[np.ndarray, " k"], config: LoopClosureConfig
-) -> list[LoopCandidate]:
-    """Finds keyframes of other maps that may show the place of a keyframe, by retrieval alone: no position is known.
+def similar_keyframes(
+    slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"], config: LoopClosureConfig
+) -> list[Loop]:
+    """Finds keyframes that may show the place of a keyframe, by retrieval alone: no position is known.
 
     Args:
-        slam_map: several maps in one record.
+        slam_map: the map; or several maps in one record.
         row: of the keyframe.
-        is_other: True for keyframes of other maps.
+        is_allowed: False for keyframes that are no candidates.
         config: numbers.
 
     Returns:
         Candidates, most similar first.
     """
-    return [LoopCandidate(int(other), "retrieval") for other in _similar(slam_map, row, is_other, config)]
-
-
-def _similar(
-    slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"], config: LoopClosureConfig
-) -> Int[np.ndarray, " m"]:
-    found = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_allowed)
-    rows, cosines = found
+    rows, cosines = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_allowed)
     spacing_m = slam_map.keyframes[row].extent_m / 2
-    return _spread(rows[cosines >= config.min_cosine], slam_map, spacing_m, config.num_similar)
+    similar = _spread(rows[cosines >= MIN_COSINE], slam_map, spacing_m, config.num_similar)
+    return [Loop(row, int(other), "retrieval") for other in similar]
+
+
+def most_similar(
+    vectors: Float[np.ndarray, "k d"],
+    query: Float[np.ndarray, " d"],
+    count: int,
+    *,
+    is_allowed: Bool[np.ndarray, " k"] | None = None,
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Finds the vectors with the largest cosine, by one matrix product.
+
+    The mean of many vectors says nothing about a place, so it is subtracted first.
+
+    Args:
+        vectors: unit vectors.
+        query: any length of vector.
+        count: largest number of vectors.
+        is_allowed: False for vectors that are no candidates.
+
+    Returns:
+        Rows, most similar first, and their cosines.
+    """
+    if len(vectors) == 0 or count == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.float32)
+    mean = vectors.mean(axis=0) if len(vectors) >= MIN_NUM_CENTRED else np.zeros_like(query)
+    centred = query - mean
+    # |v - m|^2 = 1 - 2 v.m + m.m for unit vectors: no centred copy of the whole map.
+    lengths = np.sqrt(np.maximum(1 - 2 * (vectors @ mean) + mean @ mean, 1e-12)) * max(np.linalg.norm(centred), 1e-6)
+    cosines = (vectors @ centred - mean @ centred) / lengths
+    if is_allowed is not None:
+        cosines = np.where(is_allowed, cosines, -np.inf)
+    count = min(count, len(cosines))
+    rows = np.argpartition(-cosines, count - 1)[:count]
+    rows = rows[np.argsort(-cosines[rows], kind="stable")]
+    rows = rows[np.isfinite(cosines[rows])]
+    return rows, cosines[rows].astype(np.float32)
+
+
+def _paths(slam_map: KeyframeMap) -> tuple[Float[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Returns the lengths of the paths to all keyframes, and their segments."""
+    return slam_map.column("path_m"), slam_map.column("segment")
+
+
+def _path_since_m(path_m: Float[np.ndarray, " k"], segments: Int[np.ndarray, " k"], row: int) -> np.ndarray:
+    """Returns the path from each keyframe to one; infinite where the track was lost between them."""
+    return np.where(segments == segments[row], path_m[row] - path_m, np.inf)
+
+
+def _is_old(since_m: Float[np.ndarray, " k"], row: int, extent_m: float) -> Bool[np.ndarray, " k"]:
+    """Returns True for keyframes that a loop may join to one."""
+    return (np.arange(len(since_m)) < row) & (since_m > MIN_PATH_SHARE * extent_m)
 
 
 def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float, count: int) -> Int[np.ndarray, " m"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import rigid
-from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, distances_to
+from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, take_keyframes
 
 
 def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
@@ -35,25 +35,20 @@ def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMa
     for edge in slam_map.edges:
         found = _contracted(slam_map, edge, cover, row_of)
         key = (found.source, found.target, found.kind)
-        if found.source != found.target and (key not in edges or _weight(found) > _weight(edges[key])):
+        is_better = key not in edges or np.trace(found.information) > np.trace(edges[key].information)
+        if found.source != found.target and is_better:
             edges[key] = found
-    return KeyframeMap(
-        tuple(slam_map.keyframes[row] for row in kept),
-        slam_map.T_world_keyframe[kept],
-        slam_map.vectors[kept],
-        tuple(edges.values()),
-        slam_map.origin,
-    )
+    return take_keyframes(slam_map, kept, edges.values())
 
 
 def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
     """Returns the rows that stay, and for each row the nearest of them."""
-    extents_m = np.array([keyframe.extent_m for keyframe in slam_map.keyframes])
+    extents_m = slam_map.column("extent_m")
     # Parts of a map that no loop has joined have no known distance.
-    part = connected_parts(len(slam_map), [edge for edge in slam_map.edges if edge.kind != "guess"])
+    part = connected_parts(len(slam_map), slam_map.edges_of("odometry", "loop"))
 
     def apart_m(row: int) -> Float[np.ndarray, " n"]:
-        distances = distances_to(slam_map, slam_map.T_world_keyframe[row, :3, 3])[kept]
+        distances = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])[kept]
         return np.where(part[kept] == part[row], distances, np.inf)
 
     kept: list[int] = []
@@ -82,7 +77,3 @@ def _moved_information(information: Float[np.ndarray, "6 6"], T_old_new: Float[n
     adjoint = np.block([[R, cross @ R], [np.zeros((3, 3)), R]])
     moved = adjoint.T @ information @ adjoint
     return (moved + moved.T) / 2
-
-
-def _weight(edge: MapEdge) -> float:
-    return float(np.trace(edge.information))

@@ -19,14 +19,12 @@ from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
 from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
 from dpmjax.deeppointmap.verification import PLANE_DISTANCE_M
-from dpmjax.scans.compact import expand_elements
-from dpmjax.scans.plane_information import plane_information
 from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
 from dpmjax.scans.surfaces import Surface
+from dpmjax.scans.weak_directions import plane_information
 from dpmjax.slam.interfaces import Match, Proposal, ThinnedScan
 from dpmjax.slam.keyframes import Submap
-from dpmjax.slam.local_map import PlacedElements, joined_surface
-from dpmjax.slam.retrieval import pooled_vector
+from dpmjax.slam.local_map import joined_surface, placed_keyframe
 from dpmjax.types import DescriptorCloud, Registration
 
 ELEMENT_RADIUS_M = 2.0
@@ -126,22 +124,36 @@ class NetworkMatcher:
 
 
 def _surface(submap: Submap) -> Surface:
-    placed = zip(submap.T_submap_keyframe, submap.scans, strict=False)
-    return joined_surface([PlacedElements(T, expand_elements(scan.elements)) for T, scan in placed])
+    placed = zip(submap.scans, submap.T_submap_keyframe, strict=False)
+    return joined_surface([placed_keyframe(scan, T) for scan, T in placed])
 
 
 def _merged(submap: Submap) -> PreparedScan:
     """Merges descriptors; the number of scans is filled up to a power of two, so that few programs are compiled."""
-    first = expand_scan(submap.scans[0])
-    num = len(submap.scans)
-    clouds = [scan.cloud.described for scan in submap.scans]
-    capacity = 1 << (num - 1).bit_length()
-    clouds += [_without_points(clouds[0])] * (capacity - num)
-    T_submap_scan = np.concatenate([submap.T_submap_keyframe, np.tile(np.eye(4), (capacity - num, 1, 1))])
+    first, clouds = expand_scan(submap.scans[0]), [scan.cloud.described for scan in submap.scans]
+    num_missing = (1 << (len(clouds) - 1).bit_length()) - len(clouds)
+    clouds += [replace(clouds[0], mask=jnp.zeros_like(clouds[0].mask))] * num_missing
+    T_submap_scan = np.concatenate([submap.T_submap_keyframe, np.tile(np.eye(4), (num_missing, 1, 1))])
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *clouds)
     merged = merge_clouds(stacked, jnp.asarray(T_submap_scan, jnp.float32))
     return PreparedScan(thin_merged(merged, len(clouds[0].mask)), first.measured)
 
 
-def _without_points(cloud: DescriptorCloud) -> DescriptorCloud:
-    return replace(cloud, mask=jnp.zeros_like(cloud.mask))
+def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
+    """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
+
+    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
+    where the scan turns about the vertical.
+
+    Args:
+        cloud: descriptors of a scan.
+
+    Returns:
+        (2 c,) float32; zero for an empty cloud.
+    """
+    features = np.asarray(cloud.features, np.float32)[np.asarray(cloud.mask)]
+    if len(features) == 0:
+        return np.zeros(2 * cloud.features.shape[-1], np.float32)
+    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
+    pooled = np.concatenate([features.mean(axis=0), features.std(axis=0)])
+    return np.asarray(pooled / max(float(np.linalg.norm(pooled)), 1e-12), np.float32)

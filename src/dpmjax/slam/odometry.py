@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap.encoding import thin_scan
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.verification import MIN_COSINE, PLANE_DISTANCE_M, MeasuredScan
-from dpmjax.scans.free_space import range_image, view_points
-from dpmjax.scans.plane_information import plane_information, with_least_covariance
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces_from, nearest_planes, pair_with_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
+from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces_from, nearest_planes
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
+from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.interfaces import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import Pose, orthonormal
@@ -119,13 +118,13 @@ class SurfaceGeometry:
         Returns:
             The pose under which most elements meet planes and fewest lie in free space.
         """
-        num_samples = NUM_SAMPLES // 3
-        coarse = []
-        for found in align_surfaces_from(scan.measured.surface, local_map.surface, T_map_scan, self.config.wide):
-            matched = self._matched_share(local_map, scan.measured.surface, found.T_target_source, num_samples)
-            coarse.append((matched, found.T_target_source))
-        coarse.sort(key=lambda entry: -entry[0])
-        return best_of(self._aligned(local_map, scan, np.array([T for _, T in coarse[:NUM_FINE]])))
+        surface = scan.measured.surface
+        coarse = [
+            found.T_target_source
+            for found in align_surfaces_from(surface, local_map.surface, T_map_scan, self.config.wide)
+        ]
+        coarse.sort(key=lambda T: -_matched_share(surface, self._planes(local_map, surface, T, NUM_SAMPLES // 3)))
+        return best_of(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])))
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
         """Returns the predicted step, shorter, longer, turned and tilted, and steps straight ahead; see `Geometry`.
@@ -138,19 +137,16 @@ class SurfaceGeometry:
             The motions.
         """
         R, step = T_last_scan[:3, :3], T_last_scan[:3, 3]
+        turns = [R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix() for turn_deg in TURNS_DEG]
+        tilts = [Rotation.from_euler(*tilt, degrees=True).as_matrix() for tilt in itertools.product("xy", TILTS_DEG)]
         motions = [(R, factor * step) for factor in STEP_FACTORS]
         motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
-        for turn_deg in TURNS_DEG:
-            turned = R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
-            motions += [(turned, np.zeros(3)), (turned, step)]
+        motions += [(turned, translation) for turned in turns for translation in (np.zeros(3), step)]
         # A vehicle that rocks does not turn on: its tilt comes back.
         motions.append((np.eye(3), step))
-        for axis, tilt_deg in itertools.product("xy", TILTS_DEG):
-            tilt = Rotation.from_euler(axis, tilt_deg, degrees=True).as_matrix()
-            motions += [(R @ tilt, step), (tilt, step)]
+        motions += [(rotation, step) for tilt in tilts for rotation in (R @ tilt, tilt)]
         found = np.tile(np.eye(4), (len(motions), 1, 1))
-        for T, (rotation, translation) in zip(found, motions, strict=True):
-            T[:3, :3], T[:3, 3] = rotation, translation
+        found[:, :3, :3], found[:, :3, 3] = (np.array(parts) for parts in zip(*motions, strict=True))
         return found
 
     def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Float[np.ndarray, "s 4 4"]) -> list[Alignment]:
@@ -158,39 +154,35 @@ class SurfaceGeometry:
         return [self._scored(local_map, scan.measured, each.T_target_source) for each in found]
 
     def _scored(self, local_map: LocalMap, measured: MeasuredScan, T: Pose) -> Alignment:
-        config, surface = self.config, measured.surface
-        matched = self._matched_share(local_map, surface, T, NUM_SAMPLES)
-        contradicted = _contradicted_share(local_map, measured, T)
-        score = matched - CONTRADICTION_WEIGHT * contradicted
-        level = AlignmentLevel(config.plane_radius_m, NUM_SAMPLES, 1)
-        pairs = pair_with_planes(surface, local_map.surface, T, level)
-        information = plane_information(pairs, T, max_residual_m=PLANE_DISTANCE_M)
+        planes = self._planes(local_map, measured.surface, T, NUM_SAMPLES)
+        matched, contradicted = _matched_share(measured.surface, planes), _contradicted_share(local_map, measured, T)
+        information = plane_information(planes.pairs, T, max_residual_m=PLANE_DISTANCE_M)
         information = with_least_covariance(information, FLOOR_M, FLOOR_RAD)
-        return Alignment(T, matched, contradicted, score, information)
+        return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
 
-    def _matched_share(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> float:
-        """Returns the mean share of elements that meet planes, over the main directions of their normals.
-
-        Ground meets ground under any motion: without the mean it would outvote the walls.
-        """
-        config = self.config
-        level = AlignmentLevel(config.plane_radius_m, num_samples, 1)
-        planes = nearest_planes(surface, local_map.surface, T_map_scan[None], level)
-        meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M)
-        meets &= planes.cosines > MIN_COSINE
-        direction = np.argmax(np.abs(surface.normals[surface.samples[:num_samples]]), axis=1)
-        counts = np.bincount(direction, minlength=3)
-        shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
-        # A direction of few elements counts less: their share is hardly known.
-        return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
+    def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
+        level = AlignmentLevel(self.config.plane_radius_m, num_samples, 1)
+        return nearest_planes(surface, local_map.surface, T_map_scan[None], level)
 
 
 def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
     """Chooses points in random order: first one of each coarse voxel, then others."""
     rng, is_first = np.random.default_rng(0), np.zeros(len(points), bool)
     is_first[first_of_each_voxel(points, SPREAD_M)] = True
-    parts = (rng.permutation(np.flatnonzero(part)) for part in (is_first, ~is_first))
-    return np.concatenate(list(parts))[:MAX_ELEMENTS]
+    return np.concatenate([rng.permutation(np.flatnonzero(part)) for part in (is_first, ~is_first)])[:MAX_ELEMENTS]
+
+
+def _matched_share(surface: Surface, planes: NearestPlanes) -> float:
+    """Returns the mean share of elements that meet planes, over the main directions of their normals.
+
+    Ground meets ground under any motion: without the mean it would outvote the walls.
+    """
+    meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M) & (planes.cosines > MIN_COSINE)
+    direction = np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)
+    counts = np.bincount(direction, minlength=3)
+    shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
+    # A direction of few elements counts less: their share is hardly known.
+    return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
 
 
 def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,14 +13,14 @@ from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.front_end import AnyScan, FrontEndState, TimedScan
+from dpmjax.slam.front_end import AnyScan, FrontEndState, ScanReport, TimedScan
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
-from dpmjax.slam.loop_closure import close_loops, num_accepted
+from dpmjax.slam.loop_closure import close_loops
+from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.odometry import SurfaceGeometry
-from dpmjax.slam.reports import Loop, LoopState, ScanReport, loops_of_map
 
 
 class SlamState(NamedTuple):
@@ -135,12 +135,11 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     if len(shape) != 2 or shape[1] != 3:
         raise ValueError(f"scan: expected shape (n, 3), got {shape}")
     front, slam_map, report = front_end.place_scan(methods, state.front_end, state.slam_map, scan)
-    report, loops = report._replace(num_points=shape[0]), state.loops
+    loops = state.loops
     if report.is_keyframe:
-        num_before = num_accepted(loops.loops)
         slam_map, loops = close_loops(methods, slam_map, loops)
-        report = report._replace(num_accepted=num_accepted(loops.loops) - num_before)
-    return SlamState(front, slam_map, loops), report
+    num_new = num_accepted(loops.loops) - num_accepted(state.loops.loops)
+    return SlamState(front, slam_map, loops), report._replace(num_points=shape[0], num_accepted=num_new)
 
 
 def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamConfig) -> SlamResult:
@@ -156,19 +155,15 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     """
     reports, slam_map, loops = tuple(reports), state.slam_map, state.loops
     if loops.is_stale:
-        slam_map, loops = optimize_map(slam_map, loops, config.loops)
-    T_odometry_keyframe = [keyframe.T_odometry_keyframe for keyframe in slam_map.keyframes]
-    keyframes = np.array([keyframe.scan for keyframe in slam_map.keyframes], np.int64)
-    graph = as_pose_graph(slam_map) if len(slam_map) else None
-    state = SlamState(state.front_end, slam_map, loops)
+        slam_map, loops = optimize_map(slam_map, loops)
     return SlamResult(
         T_world_scan=place_scans(slam_map.T_world_keyframe, reports),
-        keyframes=keyframes,
+        keyframes=slam_map.column("scan").astype(np.int64),
         loops=loops.loops,
-        graph=graph,
+        graph=as_pose_graph(slam_map) if len(slam_map) else None,
         reports=reports,
-        state=state,
-        T_odometry_scan=place_scans(np.array(T_odometry_keyframe).reshape(-1, 4, 4), reports),
+        state=state._replace(slam_map=slam_map, loops=loops),
+        T_odometry_scan=place_scans(slam_map.column("T_odometry_keyframe").reshape(-1, 4, 4), reports),
     )
 
 
@@ -189,25 +184,6 @@ def place_scans(
     T_keyframe_scan = np.array([report.T_keyframe_scan for report in reports])
     T_world_scan = T_world_keyframe[[report.keyframe for report in reports]] @ T_keyframe_scan
     return rigid.inverse(T_world_scan[0]) @ T_world_scan if reports[0].scan == 0 else T_world_scan
-
-
-def iterate_slam(
-    methods: SlamMethods, scans: Iterable[AnyScan], state: SlamState | None = None
-) -> Iterator[tuple[SlamState, ScanReport]]:
-    """Places scans one by one, for progress and for files that grow.
-
-    Args:
-        methods: from `make_methods`.
-        scans: see `step_slam`; a scan may be empty.
-        state: goes on from there; None begins an empty map.
-
-    Yields:
-        The state after each scan and how the scan was placed.
-    """
-    state = state or init_slam()
-    for scan in scans:
-        state, report = step_slam(methods, state, scan)
-        yield state, report
 
 
 def run_slam(
@@ -235,9 +211,8 @@ def run_slam(
         ValueError: if a scan is not (n, 3), if methods come with another configuration, or if the map was made with
             other weights.
     """
-    methods = as_methods(model, config)
-    start = state = init_slam(slam_map)
-    reports = []
-    for state, report in iterate_slam(methods, scans, start):  # noqa: B007 (the last one is used)
+    methods, state, reports = as_methods(model, config), init_slam(slam_map), []
+    for scan in scans:
+        state, report = step_slam(methods, state, scan)
         reports.append(report)
     return finish_slam(state, reports, methods.config)

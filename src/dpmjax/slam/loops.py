@@ -1,4 +1,4 @@
-"""Acceptance of the registrations of loop candidates: by their own numbers, by odometry, and by one another.
+"""Loops: candidates as records, and their acceptance by their own numbers, by odometry, and by one another.
 
 A single registration may be wrong in a place that looks like another. It becomes an edge only together with others, of
 other keyframes, that agree with it over the odometry between them (pairwise consistency, Mangelson et al. 2018).
@@ -6,15 +6,16 @@ other keyframes, that agree with it over the odometry between them (pairwise con
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframes import KeyframeMap, are_near
-from dpmjax.slam.reports import Loop, LoopStatus
+from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near
 
 MAX_CONTRADICTED_SHARE = 0.1
 """Largest share of points in free space."""
@@ -38,7 +39,94 @@ MIN_DRIFT_SHARE = 0.1
 """Share of the path by which a loop may contradict odometry in any case."""
 
 MAX_WITNESSES = 6
-"""So many accepted loops are asked whether they agree with a new one."""
+"""Largest number of accepted loops that are compared with a new one."""
+
+LoopStatus = Literal[
+    "not asked",
+    "no overlap",
+    "not registered",
+    "improbable",
+    "scans disagree",
+    "against odometry",
+    "waits for support",
+    "accepted",
+    "taken back",
+]
+"""What became of a loop candidate; all but "accepted" are reasons why it is no edge."""
+
+
+class Loop(NamedTuple):
+    """A candidate of a loop.
+
+    Attributes:
+        source: row of the new keyframe.
+        target: row of an older one.
+        found_by: how it became a candidate; "map" is a loop of the map that was extended.
+        status: what became of it.
+        overlap: probability of overlap; 1 where no network predicts it, None where another candidate surely overlaps.
+        probability: P(correct) of the registration; None without one.
+        rmse: of the registration, metres; None without one.
+        T_target_source: the registration; None without one.
+        information: (6, 6) inverse covariance, as in `MapEdge`; None without a registration.
+    """
+
+    source: int
+    target: int
+    found_by: Literal["distance", "retrieval", "map"]
+    status: LoopStatus = "not asked"
+    overlap: float | None = None
+    probability: float | None = None
+    rmse: float | None = None
+    T_target_source: Pose | None = None
+    information: Float[np.ndarray, "6 6"] | None = None
+
+    @property
+    def edge(self) -> MapEdge:
+        """The edge of a registered loop."""
+        measured = np.asarray(self.T_target_source), np.asarray(self.information)
+        return MapEdge(self.source, self.target, *measured, "loop")
+
+
+class LoopState(NamedTuple):
+    """All candidates so far.
+
+    Attributes:
+        loops: every candidate, in the order in which they were found.
+        num_optimized: number of keyframes at the last optimisation.
+        is_stale: whether edges were added since that do not only lengthen the chain of odometry.
+    """
+
+    loops: tuple[Loop, ...] = ()
+    num_optimized: int = 0
+    is_stale: bool = False
+
+
+def loops_of_map(slam_map: KeyframeMap) -> LoopState:
+    """Lists the loops that an earlier run has accepted; the optimisation may remove them later.
+
+    Args:
+        slam_map: of the earlier run.
+
+    Returns:
+        The loops.
+    """
+    known = [
+        Loop(*edge[:2], "map", "accepted", 1.0, T_target_source=edge.T_target_source, information=edge.information)
+        for edge in slam_map.edges_of("loop")
+    ]
+    return LoopState(tuple(known), len(slam_map))
+
+
+def num_accepted(loops: Iterable[Loop]) -> int:
+    """Counts the accepted loops.
+
+    Args:
+        loops: all candidates.
+
+    Returns:
+        The number.
+    """
+    return sum(loop.status == "accepted" for loop in loops)
 
 
 def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
@@ -93,31 +181,29 @@ def accept_consistent(
     Args:
         slam_map: the map.
         loops: all candidates, in the order of their sources.
-        number: of the loop, which is registered.
+        number: of the loop; nothing is changed unless it waits for support.
         config: uncertainties and the number that is enough.
 
     Returns:
         All candidates after.
     """
-    others, num_witnesses = [], 0
-    for other in _near_along(slam_map, loops, number):
-        is_witness = loops[other].status == "accepted"
-        if not (is_witness or loops[other].status == "waits for support"):
-            continue
-        if num_witnesses < MAX_WITNESSES or not is_witness:
-            others.append(other)
-            num_witnesses += is_witness
-    others = [other for other in others if are_consistent(slam_map, loops[number], loops[other], config)]
+    if loops[number].status != "waits for support":
+        return loops
+
+    def agree(one: int, other: int) -> bool:
+        return are_consistent(slam_map, loops[one], loops[other], config)
+
+    near = list(_near_along(slam_map, loops, number))
+    witnesses = [other for other in near if loops[other].status == "accepted"][:MAX_WITNESSES]
+    others = [other for other in near if other in witnesses or loops[other].status == "waits for support"]
+    others = [other for other in others if agree(number, other)]
     members = [number]
     for other in sorted(others, key=lambda other: -(loops[other].probability or 0.0)):
-        if all(are_consistent(slam_map, loops[member], loops[other], config) for member in members[1:]):
+        if all(agree(member, other) for member in members[1:]):
             members.append(other)
     if len(members) < config.min_support:
         return loops
-    after = list(loops)
-    for member in members:
-        after[member] = loops[member]._replace(status="accepted")
-    return tuple(after)
+    return tuple(loop._replace(status="accepted") if row in members else loop for row, loop in enumerate(loops))
 
 
 def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopClosureConfig) -> bool:
