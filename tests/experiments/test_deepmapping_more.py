@@ -10,9 +10,9 @@ import pytest
 
 from dpmjax.cli.command import run_command
 from dpmjax.simulation import simulate_sequence
-from experiments import deepmapping_relocalize, deepmapping_rgbd, toy_1d
+from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d
 
-MODULES = (deepmapping_relocalize, deepmapping_rgbd, toy_1d)
+MODULES = (deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d)
 
 
 def run(module, *options) -> int:
@@ -31,6 +31,7 @@ def test_help_shows_examples(module, capsys) -> None:
     [
         (toy_1d, ["--seeds", 0], "--seeds"),
         (toy_1d, ["--device", "tpu"], "--device"),
+        (deepmapping_ablations, ["--only", "colour"], "--only"),
         (deepmapping_rgbd, ["--methods", "guess"], "--methods"),
         (deepmapping_rgbd, ["--limit", 0], "--limit"),
     ],
@@ -105,6 +106,20 @@ def test_not_moving_is_never_right_on_hard_walks(tmp_path) -> None:
         assert row["zero"]["ate_mm"] == pytest.approx(row["spread_mm"])
         assert row["spread_mm"] >= 450
     assert (metrics["methods"]["zero"]["success"], metrics["methods"]["zero"]["right"]) == (0, 0)
+
+
+def test_ablations_change_one_thing_each() -> None:
+    basis = deepmapping_ablations.settings_of("lnet", "CNN", 600)
+    for ablation, variants in deepmapping_ablations.VARIANTS.items():
+        settings = [deepmapping_ablations.settings_of(ablation, variant, 600) for variant in variants]
+        assert len(set(settings)) == len(variants)
+        for one in settings:
+            changed = (
+                (one.localization != basis.localization)
+                + (one.occupancy != basis.occupancy)
+                + (one.cold_phases != basis.cold_phases)
+            )
+            assert changed <= (2 if ablation == "mnet" else 1)
 
 
 def test_relocalization_tells_known_from_right_and_mapped() -> None:

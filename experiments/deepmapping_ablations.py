@@ -1,0 +1,144 @@
+"""Ablations of DeepMapping: those of the paper (supplement A, figures 10 to 13), and two more.
+
+    python -m experiments.deepmapping_ablations --limit 5
+    python -m experiments.deepmapping_ablations --only lnet chamfer --steps 300
+    python -m experiments.deepmapping_ablations --resume -o out
+
+As in the paper on short walks of a depth camera (here through simulated apartments), from zero: L-Net and M-Net are
+trained together. The variants of the networks are lnet (CNN or PointNet) and mnet (MLP or ResMLP, or our grid). Those
+of their size are depth (4 to 7 layers of 64) and width (32 to 128 with 4 layers). Those of the loss are chamfer (with
+and without) and free (number of free samples a ray). All further settings are fixed. The basis is a small CNN and an
+MLP of 6 layers of 64: a run takes half a minute on a CPU. Each run is written to rows/ when it is done; ablations.png
+has the box plots.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from tyro.conf import arg
+
+from dpmjax import cli, nets, simulation, viz
+from dpmjax import deepmapping as dm
+from dpmjax.registration_rgbd import as_depth_scans
+from experiments.deepmapping_rgbd import errors_of
+
+EXPERIMENT = "deepmapping_ablations"
+_SUCCESS_MM = 450.0
+# Images of a trajectory, and pixels of each in a step.
+_NUM_VIEWS, _NUM_PIXELS = 8, 200
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "lnet": ("CNN", "PointNet"),
+    "mnet": ("MLP", "ResMLP", "grid"),
+    "depth": ("4", "5", "6", "7"),
+    "width": ("32", "64", "96", "128"),
+    "chamfer": ("with", "without"),
+    "free": ("1", "4", "12", "35"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(cli.RunOptions):
+    """Options of the ablations."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "only"})
+
+    limit: Annotated[int, arg(metavar="N")] = 10
+    """Trajectories a variant."""
+    steps: Annotated[int, arg(metavar="N")] = 600
+    """Steps of each fit."""
+    only: tuple[str, ...] = tuple(VARIANTS)
+    """Which ablations."""
+
+    def __post_init__(self) -> None:
+        """Checks ranges."""
+        cli.check_least(self, limit=1, steps=1)
+        cli.check_names("--only", self.only, VARIANTS)
+
+
+def main(config: Config) -> list[cli.Row]:
+    """Runs the missing cases, variant by variant, then writes the table and the box plots."""
+    cases = [
+        {"ablation": ablation, "variant": variant, "trajectory": trajectory}
+        for ablation in config.only
+        for variant in VARIANTS[ablation]
+        for trajectory in range(config.limit)
+    ]
+
+    def work(_: cli.TableRun, ablation: str, variant: str, trajectory: int) -> cli.Row:
+        return run_one(settings_of(ablation, variant, config.steps), trajectory, config.seed)
+
+    return cli.run_table(config, EXPERIMENT, cases, work, report)
+
+
+def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingConfig:
+    """Returns the basis with one thing changed."""
+    phase = replace(
+        dm.JOINT_DEPTH,
+        num_steps=num_steps,
+        occupancy_weight=0.5,
+        final_learning_rate=0.1,
+        beams_per_step=_NUM_PIXELS,
+        num_free=4,
+        is_sampled_as_published=False,
+    )
+    fast, number = dm.preset("fast", "depth"), int(variant) if variant.isdigit() else 0
+    localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
+    maps = {
+        "ResMLP": nets.OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
+        "grid": fast.occupancy,
+        "depth": nets.OccupancyConfig(features=(64,) * number),
+        "width": nets.OccupancyConfig(features=(number,) * 4),
+    }
+    changes: dict[str, dict[str, Any]] = {
+        "without": {"occupancy_weight": 1.0},
+        "free": {"num_free": number},
+    }
+    changed = ablation if number else variant
+    phase = replace(phase, **changes.get(changed, {}))
+    occupancy = maps.get(changed, nets.OccupancyConfig(features=(64,) * 6))
+    networks = {"localization": localization, "occupancy": occupancy, "steps_per_call": min(50, num_steps)}
+    return replace(fast, cold_phases=(phase,), warm_phases=(phase,), **networks)
+
+
+def run_one(settings: dm.DeepMappingConfig, trajectory: int, run_seed: int) -> cli.Row:
+    """Returns the errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
+    import jax
+
+    seed = 1000 * run_seed + trajectory
+    sequence = simulation.simulate_depth_sequence(seed % 15, _NUM_VIEWS, seed=seed)
+    begun = time.perf_counter()
+    scans = as_depth_scans(sequence.points, sequence.mask)
+    fitted = dm.fit_deepmapping(scans, settings, key=jax.random.key(run_seed))
+    return {**errors_of(fitted.T_world_scan, sequence), "run_s": time.perf_counter() - begun}
+
+
+def report(rows: list[cli.Row]) -> cli.Summary:
+    """Returns a line for each variant, and ablations.png."""
+    groups: dict[tuple[str, str], list[cli.Row]] = defaultdict(list)
+    panels: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        groups[row["ablation"], row["variant"]].append(row)
+        panels[f"{row['ablation']}: ATE, mm"][row["variant"]].append(row["ate_mm"])
+    table = []
+    for (ablation, variant), some in groups.items():
+        ate = np.array([row["ate_mm"] for row in some])
+        numbers = {"median_ate_mm": float(np.median(ate)), "success": float((ate < _SUCCESS_MM).mean())}
+        numbers["median_run_s"] = float(np.median([row["run_s"] for row in some]))
+        case = {"ablation": ablation, "variant": variant, "num_runs": len(some)}
+        table.append({**case, **numbers, "quartiles_ate_mm": np.quantile(ate, [0.25, 0.75]).tolist()})
+
+    def draw(folder: cli.RunFolder) -> None:
+        viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "ablations.png")
+
+    columns = ("ablation", "variant", "num_runs", "median_ate_mm", "success", "median_run_s")
+    text = cli.markdown(columns, [[row[name] for name in columns] for row in table])
+    return cli.Summary({"variants": table}, text, draw)
+
+
+if __name__ == "__main__":
+    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
