@@ -98,7 +98,7 @@ def test_full_precision_is_exact(tmp_path) -> None:
 def test_int8_has_small_errors(tmp_path) -> None:
     found = load_map(save_map(tmp_path / "map.npz", MAP, "int8"))
     np.testing.assert_allclose(found.T_world_keyframe, MAP.T_world_keyframe, atol=1e-4)
-    np.testing.assert_allclose(found.vectors, MAP.vectors, atol=1e-3)
+    np.testing.assert_allclose(found.vectors, MAP.vectors, atol=0.6 / 127)
     for keyframe, expected in zip(found.keyframes, MAP.keyframes, strict=True):
         ours, theirs = keyframe.compact.cloud, expected.compact.cloud
         np.testing.assert_array_equal(ours.mask, theirs.mask)
@@ -111,8 +111,11 @@ def test_int8_has_small_errors(tmp_path) -> None:
         is_plane = theirs.mask & (theirs.planarity > 0.04)
         cosines = np.abs(np.sum(ours.normals * theirs.normals, axis=1))
         assert cosines[is_plane].min() > np.cos(np.radians(2.0))
-        for ours, theirs in zip(keyframe.compact.image, expected.compact.image, strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+        ours, theirs = keyframe.compact.image, expected.compact.image
+        assert ours[:2] == theirs[:2]
+        # Free space never grows.
+        assert set(np.unique(theirs.nearest.astype(int) - ours.nearest)) <= {0, 1}
+        assert set(np.unique(ours.farthest.astype(int) - theirs.farthest)) <= {0, 1}
 
 
 @pytest.mark.parametrize("precision", ["float32", "int8"])

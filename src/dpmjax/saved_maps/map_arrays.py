@@ -37,6 +37,9 @@ NUM_ELEMENTS = 256
 POSITION_STEP_M = 0.02
 PLANARITY_STEP = 17
 MAX_CODE = np.iinfo(np.int8).max
+IMAGE_STEP = 2
+"""Coarse codes of ranges, as multiples of those of a `CompactImage`: 4 %, where free space has a margin of 10 %."""
+
 MAX_IMAGE_ROWS = 1 << 16
 
 Arrays = dict[str, NDArray[Any]]
@@ -85,7 +88,7 @@ def _pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
         **{name: slam_map.column(name).astype(kind) for name, kind in NUMBERS.items()},
         "T_odometry_keyframe": poses(slam_map.column("T_odometry_keyframe")),
         "T_world_keyframe": poses(slam_map.T_world_keyframe),
-        "vectors": slam_map.vectors.astype(np.float32 if precision == "float32" else np.float16),
+        "vectors": slam_map.vectors if precision == "float32" else _encode_vectors(slam_map.vectors),
         "edge_rows": np.array([edge[:2] for edge in edges], np.int32).reshape(-1, 2),
         "edge_kind": np.array([KINDS.index(edge.kind) for edge in edges], np.uint8),
         "edge_T": poses(edge.T_target_source for edge in edges),
@@ -112,7 +115,7 @@ def _unpack_graph(arrays: Arrays, scans: Sequence[CompactScan], origin: MapOrigi
             Keyframe(scan, T, path_m, segment, extent_m, kept) for scan, segment, path_m, extent_m, T, kept in columns
         ),
         T_world,
-        _take(arrays, "vectors", k, None).astype(np.float32),
+        _unit_vectors(_take(arrays, "vectors", k, None, kind="fi")),
         tuple(MapEdge(source, target, T, matrix, KINDS[kind]) for source, target, T, matrix, kind in edges),
         origin,
     )
@@ -133,7 +136,7 @@ def _pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     if precision == "int8":
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
     elements = [_of_length(scan.elements, num_elements) for scan in scans]
-    arrays = {"directions": np.stack([scan.directions for scan in scans]), **_pack_images(scans)}
+    arrays = {"directions": np.stack([scan.directions for scan in scans]), **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1)}
     if precision == "int8":
         features = np.concatenate([scan.features * scan.feature_steps[:, None] for scan in scans])
         return arrays | _encode_features(features) | _encode_elements(elements)
@@ -200,6 +203,18 @@ def _decode_features(arrays: Arrays, num_descriptors: int) -> Float[np.ndarray, 
     return (codes.T.astype(np.float32) * np.float32(_take(arrays, "feature_step"))) @ basis + mean
 
 
+def _encode_vectors(vectors: Float[np.ndarray, "k c"]) -> Int8[np.ndarray, "k c"]:
+    """Rounds each vector to steps of its largest component."""
+    return np.rint(vectors * (MAX_CODE / np.abs(vectors).max(axis=1, keepdims=True, initial=1e-12))).astype(np.int8)
+
+
+def _unit_vectors(stored: NDArray[Any]) -> Float[np.ndarray, "k c"]:
+    vectors = stored.astype(np.float32)
+    if stored.dtype.kind == "f":
+        return vectors
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1)
+
+
 def _encode_elements(keyframes: Sequence[CompactElements]) -> Arrays:
     """Rounds positions to 2 cm, normals to two octahedral coordinates (Meyer et al. 2010), planarity to 16 steps."""
     positions = [np.rint(one.positions.T * (one.unit_m / POSITION_STEP_M)) for one in keyframes]
@@ -236,14 +251,17 @@ def _from_octahedral(stored: Int8[np.ndarray, "2 n"]) -> Float[np.ndarray, "n 3"
     return np.rint(normals / np.linalg.norm(normals, axis=1, keepdims=True) * MAX_COMPONENT)
 
 
-def _pack_images(scans: Sequence[CompactScan]) -> Arrays:
+def _pack_images(scans: Sequence[CompactScan], step: int) -> Arrays:
+    """Rounds near ranges down and far ranges up, so that the free space of a scan never grows."""
     images = [scan.image for scan in scans]
+    farthest = np.concatenate([image.farthest for image in images])
     return {
+        "image_step": np.asarray(step),
         "image_count": np.array([len(image.nearest) for image in images], np.int32),
         "image_num_rows": np.array([image.num_rows for image in images], np.int32),
         "image_first_row": np.array([image.first_row for image in images], np.int32),
-        "image_nearest": np.concatenate([image.nearest for image in images]),
-        "image_farthest": np.concatenate([image.farthest for image in images]),
+        "image_nearest": np.concatenate([image.nearest for image in images]) // step,
+        "image_farthest": farthest // step + (farthest % step > 0),
     }
 
 
@@ -259,7 +277,10 @@ def _unpack_images(arrays: Arrays, k: int) -> list[CompactImage]:
         raise ValueError("image_count and image_first_row: expected rows within the image")
     nearest = _take(arrays, "image_nearest", int(counts.sum()), None, kind="u")
     farthest = _take(arrays, "image_farthest", *nearest.shape, kind="u")
-    parts = (np.split(codes, np.cumsum(counts)[:-1]) for codes in (nearest, farthest))
+    step = int(_take(arrays, "image_step", kind="i")) if "image_step" in arrays else 1
+    largest = np.iinfo(np.uint8).max
+    coarse = (np.minimum(codes.astype(np.int64) * step, largest).astype(np.uint8) for codes in (nearest, farthest))
+    parts = (np.split(codes, np.cumsum(counts)[:-1]) for codes in coarse)
     return [CompactImage(*image) for image in zip(num_rows.tolist(), first_rows.tolist(), *parts, strict=True)]
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import zipfile
 from pathlib import Path
 from typing import get_args
 
@@ -77,7 +78,13 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
     if spacing_share != 0:
         slam_map = thin_map(slam_map, spacing_share=spacing_share)
     content = io.BytesIO()
-    np.savez_compressed(content, allow_pickle=False, **map_arrays(slam_map, precision))
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in map_arrays(slam_map, precision).items():
+            # LZMA packs codes smaller by a sixth, slowly; a mask of equal values would look like a harmful archive.
+            is_code = precision == "int8" and array.dtype != bool
+            stored = io.BytesIO()
+            np.save(stored, array, allow_pickle=False)
+            archive.writestr(f"{name}.npy", stored.getvalue(), zipfile.ZIP_LZMA if is_code else None)
     return content.getvalue()
 
 
