@@ -22,9 +22,8 @@ from dpmjax.registration_rgbd import (
     initialize_depth,
     projective_consistency,
 )
-from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
 from dpmjax.registration_rgbd.depth_images import PixelSample
-from dpmjax.registration_rgbd.initialization import _best_that_differ, _explained, _window
+from dpmjax.registration_rgbd.initialization import SampledImages, _best_that_differ, _explained, _window, adjust_poses
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     SearchCamera,
