@@ -24,7 +24,7 @@ from dpmjax.registration_rgbd import (
     projective_consistency,
 )
 from dpmjax.registration_rgbd.depth_images import PixelSample
-from dpmjax.registration_rgbd.initialization import _best_that_differ, _explained, _window
+from dpmjax.registration_rgbd.initialization import SampledImages, _best_that_differ, _explained, _window, adjust_poses
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     SearchCamera,
