@@ -82,6 +82,9 @@ def read_learned_folder(folder: Path) -> Drive3D:
     """Lists a folder of N.npz with lidar_pcd, ego_rotation and ego_translation (DeepPointMap's published data).
 
     Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
+
+    Returns:
+        The drive.
     """
     files = scan_files(folder, (".npz",))
     keys = ("ego_rotation", "ego_translation")
@@ -130,6 +133,9 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up; they need `Tr` in calib.txt. Last
     come files of other usual names, in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the
     scans.
+
+    Returns:
+        The drive.
     """
     files = scan_files(folder / "velodyne")
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
@@ -184,6 +190,9 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
     after the last pose are left out.
+
+    Returns:
+        The drive.
     """
     root = folder.resolve().parents[1]
     path = root / "data_poses" / drive.name / "poses.txt"
@@ -206,6 +215,9 @@ def read_kitti_carla(folder: Path) -> Drive3D:
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
     during a turn.
+
+    Returns:
+        The drive.
     """
     home = folder / "generated" if (folder / "generated").is_dir() else folder
     files = scan_files(home / "frames", (".ply",))
@@ -224,6 +236,9 @@ def read_mulran(folder: Path) -> Drive3D:
     """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame. Scans half a second or more outside of the poses are left out.
+
+    Returns:
+        The drive.
     """
     from scipy.spatial.transform import Rotation
 
