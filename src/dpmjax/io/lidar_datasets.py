@@ -11,13 +11,11 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses, read_stamped_poses
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
 from dpmjax.io.scan_files import POSE_FILES, match_rows, numbers_of, scan_files
 from dpmjax.sequences import FloatArray, InputError, Note, require
 
-# Axes of a camera that looks along x of the lidar: x right, y down, z forward.
-_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
 # MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
@@ -105,25 +103,6 @@ def read_learned_folder(folder: Path) -> Drive3D:
         return drive
     stacked = np.stack([known if pose is None else pose for pose in poses])
     return drive._replace(T_world_lidar=check_poses(stacked, folder))
-
-
-def read_lidar_trajectory(path: str | Path) -> FloatArray:
-    """Reads the poses of a drive; those of a camera, which moves along its z axis, are turned into the lidar's axes.
-
-    Args:
-        path: rows of TUM or KITTI, metres.
-
-    Returns:
-        (n, 4, 4) poses, x forward, y left, z up.
-
-    Raises:
-        InputError: no such file, planar poses, or another layout.
-    """
-    path = Path(path)
-    advice = "give poses in space: TUM (stamp tx ty tz qx qy qz qw) or KITTI (12 numbers a row)"
-    require(read_table(path).shape[1] > 3, path, "rows of 3 columns", advice)
-    T = read_poses(path)
-    return T if camera_note(T, path) is None else rigid.inverse(_T_CAM0_LIDAR) @ T @ _T_CAM0_LIDAR
 
 
 def read_kitti_odometry(folder: Path) -> Drive3D:
