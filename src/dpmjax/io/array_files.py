@@ -169,14 +169,14 @@ def read_depth_png(path: str | Path) -> NDArray[np.int64]:
     """
     from matplotlib.image import imread
 
-    content = read_bytes(path)
+    content, advice = read_bytes(path), "copy the picture again"
+    is_png = content.startswith(b"\x89PNG\r\n\x1a\n") and len(content) >= 25
+    require(is_png, path, "not a readable PNG (no PNG header)", advice)
+    width, height, bits = struct.unpack(">IIB", content[16:25])
+    is_small = 0 < width * height <= _MOST_PIXELS
+    require(is_small, path, f"not a readable PNG (a size of {width} x {height})", advice)
     # Pillow raises many kinds of errors.
-    with refusing(path, "not a readable PNG ({error})", "copy the picture again", (Exception,)):
-        if not content.startswith(b"\x89PNG\r\n\x1a\n"):
-            raise ValueError("no PNG signature")
-        width, height, bits = struct.unpack(">IIB", content[16:25])
-        if not 0 < width * height <= _MOST_PIXELS:
-            raise ValueError(f"a size of {width} x {height}")
+    with refusing(path, "not a readable PNG ({error})", advice, (Exception,)):
         image = np.asarray(imread(io.BytesIO(content), format="png"), np.float64)
     is_good = image.ndim == 2 and bits == 16
     require(is_good, path, f"pixels are {image.shape} of {bits} bits", "give a PNG of one channel of 16 bits")

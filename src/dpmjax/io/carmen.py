@@ -175,6 +175,9 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     Some published logs have lines with the scan, time stamp and odometry of another time, while their corrected poses
     are in order. There the time stamps are out of order, and the odometry jumps by metres and back. Time and odometry
     are interpolated where the stamp alone is wrong. Without any order of the stamps the sequence gets no times.
+
+    Returns:
+        The scans in the order of time.
     """
     times, odometry, rows = sequence.times, sequence.odometry_poses, np.arange(len(sequence))
     assert times is not None

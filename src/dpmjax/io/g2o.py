@@ -50,7 +50,7 @@ class _Line(NamedTuple):
     values: list[float]
 
 
-# The first four tags are of g2o, the others of TORO, which writes xx xy yy, then heading heading, x heading, y heading.
+# Four tags of g2o, then four of TORO. Its EDGE2 has xx xy yy, then heading heading, x heading, y heading.
 _TAGS = {
     "VERTEX_SE2": _Tag(1, 3),
     "VERTEX_SE3:QUAT": _Tag(1, 7),

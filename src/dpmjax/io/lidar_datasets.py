@@ -11,13 +11,11 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_poses, read_stamped_poses
+from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
 from dpmjax.io.scan_files import POSE_FILES, match_rows, numbers_of, scan_files
 from dpmjax.sequences import FloatArray, InputError, Note, require
 
-# Axes of a camera that looks along x of the lidar: x right, y down, z forward.
-_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
 # MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
@@ -82,6 +80,9 @@ def read_learned_folder(folder: Path) -> Drive3D:
     """Lists a folder of N.npz with lidar_pcd, ego_rotation and ego_translation (DeepPointMap's published data).
 
     Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
+
+    Returns:
+        The drive.
     """
     files = scan_files(folder, (".npz",))
     keys = ("ego_rotation", "ego_translation")
@@ -104,25 +105,6 @@ def read_learned_folder(folder: Path) -> Drive3D:
     return drive._replace(T_world_lidar=check_poses(stacked, folder))
 
 
-def read_lidar_trajectory(path: str | Path) -> FloatArray:
-    """Reads the poses of a drive; those of a camera, which moves along its z axis, are turned into the lidar's axes.
-
-    Args:
-        path: rows of TUM or KITTI, metres.
-
-    Returns:
-        (n, 4, 4) poses, x forward, y left, z up.
-
-    Raises:
-        InputError: no such file, planar poses, or another layout.
-    """
-    path = Path(path)
-    advice = "give poses in space: TUM (stamp tx ty tz qx qy qz qw) or KITTI (12 numbers a row)"
-    require(read_table(path).shape[1] > 3, path, "rows of 3 columns", advice)
-    T = read_poses(path)
-    return T if camera_note(T, path) is None else rigid.inverse(_T_CAM0_LIDAR) @ T @ _T_CAM0_LIDAR
-
-
 def read_kitti_odometry(folder: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry: velodyne/, times.txt, and poses.
 
@@ -130,6 +112,9 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up; they need `Tr` in calib.txt. Last
     come files of other usual names, in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the
     scans.
+
+    Returns:
+        The drive.
     """
     files = scan_files(folder / "velodyne")
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
@@ -184,6 +169,9 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
     after the last pose are left out.
+
+    Returns:
+        The drive.
     """
     root = folder.resolve().parents[1]
     path = root / "data_poses" / drive.name / "poses.txt"
@@ -206,6 +194,9 @@ def read_kitti_carla(folder: Path) -> Drive3D:
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
     during a turn.
+
+    Returns:
+        The drive.
     """
     home = folder / "generated" if (folder / "generated").is_dir() else folder
     files = scan_files(home / "frames", (".ply",))
@@ -224,6 +215,9 @@ def read_mulran(folder: Path) -> Drive3D:
     """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame. Scans half a second or more outside of the poses are left out.
+
+    Returns:
+        The drive.
     """
     from scipy.spatial.transform import Rotation
 

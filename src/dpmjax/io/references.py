@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dpmjax.geometry import rigid
 from dpmjax.io.files import read_table
-from dpmjax.io.poses import StampedPoses, interpolate_poses
+from dpmjax.io.poses import StampedPoses, interpolate_poses, read_poses
 from dpmjax.io.scan_files import match_rows, stamps_in_names
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, require
 
@@ -21,6 +22,8 @@ _UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
 _LARGEST_STAMP = 1e20
 # A lidar moves along its x axis, a camera along its z axis: least share of the squared distance, and least distance, m.
 _CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
+# Axes of a camera that looks along x of the lidar: x right, y down, z forward.
+_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 # Largest height, roll and pitch of relations in the plane, metres and radians.
 _FLAT = 1e-3
 
@@ -183,6 +186,25 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
     found = f"the poses move along their own z axis ({share:.0%} of the way), as a camera does, not a lidar"
     advice = "their rotations are off by 90 degrees; give poses of the lidar, or a calib.txt with Tr beside them"
     return Note(f"{source}: {found}; {advice}", is_doubt=True)
+
+
+def read_lidar_trajectory(path: str | Path) -> FloatArray:
+    """Reads the poses of a drive; those of a camera, which moves along its z axis, are turned into the lidar's axes.
+
+    Args:
+        path: rows of TUM or KITTI, metres.
+
+    Returns:
+        (n, 4, 4) poses, x forward, y left, z up.
+
+    Raises:
+        InputError: no such file, planar poses, or another layout.
+    """
+    path = Path(path)
+    advice = "give poses in space: TUM (stamp tx ty tz qx qy qz qw) or KITTI (12 numbers a row)"
+    require(read_table(path).shape[1] > 3, path, "rows of 3 columns", advice)
+    T = read_poses(path)
+    return T if camera_note(T, path) is None else rigid.inverse(_T_CAM0_LIDAR) @ T @ _T_CAM0_LIDAR
 
 
 def _are_times(stamps: FloatArray) -> bool:

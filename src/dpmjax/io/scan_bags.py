@@ -96,9 +96,15 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
 
 
 def _ends_of(message: Any, kind: str) -> FloatArray:
-    """Computes end points (b, 2) of a LaserScan, or of the first echoes of a MultiEchoLaserScan; NaN without an echo.
+    """Computes the end points (b, 2) of a planar scan, of several echoes the first.
 
-    A range below `range_min`, of `range_max` or more, or not finite is no echo.
+    NaN stands for a range below `range_min`, of `range_max` or more, or not finite.
+
+    Returns:
+        End points, m.
+
+    Raises:
+        ValueError: angles that are not finite.
     """
     if kind == MULTI_ECHO_SCAN:
         echoes = [np.asarray(echo.echoes, np.float64)[:1] for echo in message.ranges]
