@@ -204,7 +204,8 @@ def test_columns_give_the_records_back() -> None:
         Record(2**40, "b c", np.zeros((2, 2))),
         Record(-3, "", np.ones((2, 2)), np.inf),
     ]
-    for part in (records, records[:1], records[1:2], []):
+    of_many_rows = [records[0], Record(4, "d", np.arange(10.0).reshape(5, 2)), Record(5, "e", np.zeros((0, 2)))]
+    for part in (records, records[:1], records[1:2], [], of_many_rows, of_many_rows[1:2]):
         columns = prefixed(to_columns(part, "record"), "a") | prefixed(to_columns(records, "record"), "b")
         assert_same(tuple(from_columns(Record, part_of(columns, "a"), "record")), tuple(part))
 
