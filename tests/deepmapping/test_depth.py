@@ -170,7 +170,9 @@ def test_every_pair_of_images_counts_once(walk, count: int) -> None:
     T_i_j = np.linalg.inv(T)[:, None] @ T
     sample = [PixelSample(scans.points[i].reshape(-1, 3), scans.mask[i].reshape(-1)) for i in range(count)]
     pairs = [
-        image_agreement(jnp.asarray(T_i_j[i, j], jnp.float32), sample[j], scans.surfaces[i], scans.pinhole, 0.02)
+        image_agreement(
+            jnp.asarray(T_i_j[i, j], jnp.float32), sample[j], scans.surfaces[i], scans.pinhole, jnp.asarray(0.02)
+        )
         for i in range(count)
         for j in range(count)
         if i != j
