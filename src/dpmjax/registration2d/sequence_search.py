@@ -202,15 +202,15 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     scores = pair_scores(profiles, source, source - 1, poses)
     values = scores - _PRIOR_WEIGHT * usual.surprise(poses, np.ones(len(source), np.int64))
-    values, off = values.reshape(len(later), -1), poses.reshape(len(later), len(arcs), 3)
+    values, off = values.reshape(len(later), len(arcs)), poses.reshape(len(later), len(arcs), 3)
     rows, kept = np.arange(len(later)), []
-    for _ in range(_NUM_ARCS if len(later) else 0):
+    for _ in range(_NUM_ARCS):
         best = values.argmax(axis=1)
         kept.append(rows * len(arcs) + best)
         apart = np.abs(off - off[rows, best][:, None])
         is_same = np.hypot(apart[..., 0], apart[..., 1]) < _SAME_SHAPE[0] * scans.typical_range
         values = np.where(is_same & (np.abs(se2.wrap_angle(apart[..., 2])) < _SAME_SHAPE[1]), -np.inf, values)
-    chosen = np.concatenate([*kept, np.zeros(0, np.int64)])
+    chosen = np.concatenate(kept)
     source, poses, scores = source[chosen], poses[chosen], scores[chosen]
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score.
     near = Candidates(source, source - 1, poses[:, None], scores[:, None])
