@@ -105,6 +105,14 @@ def test_arcs_bend_by_half_their_turn_and_have_the_usual_lengths() -> None:
     np.testing.assert_allclose(MotionPrior(1.0, -0.9).arcs()[:, :2], -arcs[:, :2], atol=1e-12)
 
 
+def test_clear_steps_have_no_hypotheses_of_arcs(log) -> None:
+    scans, _ = log
+    found = align_arcs(scans, make_profiles(scans), np.zeros(0, np.int64), MotionPrior(1.0, 1.0))
+    assert found.poses.shape == (0, 3)
+    assert found.source.shape == found.target.shape == found.scores.shape == (0,)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("place", "turn"), [((846.5, 698.5, -2.3), -1.36), ((564.5, 620.5, 0.2), 1.17)])
 def test_a_step_with_little_overlap_is_among_the_hypotheses(place, turn) -> None:
     """The exhaustive search prefers poses with more overlap, and misses the step."""

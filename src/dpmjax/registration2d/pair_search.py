@@ -262,7 +262,7 @@ def _search_batch(
         poses[rows, number, :, 2] = se2.wrap_angle(turn)
     found = Candidates(source, target, poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1))
     # Two candidates may converge to one pose in the refinement.
-    return _keep_apart(_refine(profiles, _keep_apart(found, config, unit), config), config, unit)
+    return _keep_apart(refine_candidates(profiles, _keep_apart(found, config, unit), config), config, unit)
 
 
 def _used_profiles(profiles: RangeProfiles, rows: Indices) -> tuple[RangeProfiles, Indices]:
@@ -307,8 +307,17 @@ def _refine_batch(
     return jax.lax.map(refine, pairs, batch_size=4)
 
 
-def _refine(profiles: RangeProfiles, found: Candidates, config: CorrelativeConfig) -> Candidates:
-    """Refines candidates on local grids, from a spacing of half a cell down."""
+def refine_candidates(profiles: RangeProfiles, found: Candidates, config: CorrelativeConfig) -> Candidates:
+    """Refines candidates on local grids, from a spacing of half a cell down.
+
+    Args:
+        profiles: n scans.
+        found: candidates of p pairs; those without a finite score stay out.
+        config: settings of the grids.
+
+    Returns:
+        Candidates with the best poses near the given ones, in the given order.
+    """
     cell = config.cell * profiles.scans.typical_range
     first, which = np.nonzero(np.isfinite(found.scores))
     poses, scores = found.poses.copy(), np.full(found.scores.shape, -np.inf)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
-from dpmjax.registration2d.pair_search import CorrelativeConfig, search_pairs
+from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, refine_candidates, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import RangeProfiles, contradicted_share, make_profiles
 from dpmjax.registration2d.sequence_joining import join_parts
@@ -202,16 +202,22 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     scores = pair_scores(profiles, source, source - 1, poses)
     values = scores - _PRIOR_WEIGHT * usual.surprise(poses, np.ones(len(source), np.int64))
-    values, off = values.reshape(len(later), -1), poses.reshape(len(later), len(arcs), 3)
+    values, off = values.reshape(len(later), len(arcs)), poses.reshape(len(later), len(arcs), 3)
     rows, kept = np.arange(len(later)), []
-    for _ in range(_NUM_ARCS if len(later) else 0):
+    for _ in range(_NUM_ARCS):
         best = values.argmax(axis=1)
         kept.append(rows * len(arcs) + best)
         apart = np.abs(off - off[rows, best][:, None])
         is_same = np.hypot(apart[..., 0], apart[..., 1]) < _SAME_SHAPE[0] * scans.typical_range
         values = np.where(is_same & (np.abs(se2.wrap_angle(apart[..., 2])) < _SAME_SHAPE[1]), -np.inf, values)
-    chosen = np.concatenate([*kept, np.zeros(0, np.int64)])
-    return StepHypotheses(source[chosen], source[chosen] - 1, poses[chosen], scores[chosen])
+    chosen = np.concatenate(kept)
+    source, poses, scores = source[chosen], poses[chosen], scores[chosen]
+    # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score.
+    near = Candidates(source, source - 1, poses[:, None], scores[:, None])
+    shifted = refine_candidates(profiles, near, SequenceConfig().search).poses[:, 0]
+    after = pair_scores(profiles, source, source - 1, shifted)
+    better = after > scores
+    return StepHypotheses(source, source - 1, np.where(better[:, None], shifted, poses), np.maximum(scores, after))
 
 
 class _Sequences(NamedTuple):
