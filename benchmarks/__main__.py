@@ -21,7 +21,7 @@ import tyro
 
 from benchmarks import COLUMNS, Row, format_table, in_new_process, run_benchmark
 
-BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "slam")
+BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "slam", "toy")
 """Modules, each with a function `run`."""
 
 

@@ -136,7 +136,10 @@ def _pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     if precision == "int8":
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
     elements = [_of_length(scan.elements, num_elements) for scan in scans]
-    arrays = {"directions": np.stack([scan.directions for scan in scans]), **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1)}
+    arrays = {
+        "directions": np.stack([scan.directions for scan in scans]),
+        **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1),
+    }
     if precision == "int8":
         features = np.concatenate([scan.features * scan.feature_steps[:, None] for scan in scans])
         return arrays | _encode_features(features) | _encode_elements(elements)
