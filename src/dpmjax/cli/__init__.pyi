@@ -21,11 +21,10 @@ from .evaluate import registration_row as registration_row
 from .info import environment as environment
 from .info import peak_rss_gb as peak_rss_gb
 from .info import require_importable as require_importable
-from .info import versions as versions
 from .info import why_not_importable as why_not_importable
+from .map2d import read_map2d_run as read_map2d_run
 from .map2d_results import planar_errors as planar_errors
 from .map2d_results import spans_of as spans_of
-from .map2d_run import read_map2d_run as read_map2d_run
 from .program import main as main
 from .result_files import UNKNOWN as UNKNOWN
 from .result_files import load_json as load_json

@@ -24,7 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +32,14 @@ from tyro.conf import Positional, arg
 
 from dpmjax import deepmapping, io, registration2d, simulation
 from dpmjax.cli import map2d_results as results
+from dpmjax.cli import run_folder
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
 from dpmjax.cli.result_files import write_poses
-from dpmjax.cli.run_folder import RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig, Fit
+    from dpmjax.deepmapping import DeepMappingConfig, Fit, Fitted
     from dpmjax.registration2d import RegisteredScans, RegistrationConfig
     from dpmjax.sequences import ScanSequence
 
@@ -52,7 +52,7 @@ _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ScanOptions, RunOptions):
+class Config(run_folder.ScanOptions, run_folder.RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
@@ -99,8 +99,8 @@ def main(config: Config) -> dict[str, Any]:
     sequence = read_scans(config)
     start = starting_poses(config, sequence)
     measure = measures_of(config, sequence)
-    folder = open_run_folder(config, NAME)
-    with recording(folder), StopFlag() as stop:
+    folder = run_folder.open_run_folder(config, NAME)
+    with run_folder.recording(folder), StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
         notes = report_notes(sequence.notes)
         seconds = math.inf if config.seconds is None else config.seconds
@@ -114,14 +114,14 @@ def main(config: Config) -> dict[str, Any]:
         }
         # Numbers first, so that they are written even if a picture fails.
         write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
-        write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
+        run_folder.write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
         registered = results.registered_scans(sequence, result)
         limits = results.draw_map(folder, registered, result, metrics)
         if recorder.has_map:
             results.draw_occupancy(folder, registered, result, limits)
         draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
-        write_metrics(folder, metrics, seed=config.seed)
+        run_folder.write_metrics(folder, metrics, seed=config.seed)
         summary = results.report(sequence.unit, metrics)
         LOGGER.info(summary)
         print(summary, f"results in {folder.path}", sep="\n")
@@ -257,3 +257,58 @@ def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
+
+
+class Map2dRun(NamedTuple):
+    """A finished run.
+
+    Attributes:
+        sequence: the scans.
+        fitted: the fit, with the poses of the map.
+        world: the built-in world; None where the scans were read from files.
+    """
+
+    sequence: ScanSequence
+    fitted: Fitted
+    world: int | str | None
+
+
+def read_map2d_run(path: Path) -> Map2dRun:
+    """Reads a run of all scans in their order.
+
+    Args:
+        path: the folder.
+
+    Returns:
+        Map2dRun.
+
+    Raises:
+        ValueError: the folder holds no options, no trajectory or no checkpoint that can be read; or its fit has other
+            scans than the sequence, or another order of them.
+    """
+    import jax
+
+    from dpmjax.checkpoints import Checkpoints
+
+    config, trajectory = run_folder.load_config(run_folder.find_run(NAME, path), Config), path / "trajectory.npy"
+    if not trajectory.is_file():
+        raise ValueError(f"{path} holds no trajectory.npy: let the run end, or resume it")
+    if not config.ordered:
+        raise ValueError(
+            f"{path} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
+        )
+    sequence = read_scans(config)
+    if sequence.unit == "m":
+        raise ValueError(f"{path} is a run on {sequence.name}, in metres, whose fit may have a part of the scans")
+    settings = fit_settings(config, sequence)
+    data, unit = deepmapping.mapping_data(
+        results.scan_set_of(sequence), None if config.init == "zero" else np.load(trajectory)
+    )
+    problem = deepmapping.mapping_problem(settings, data)
+    like = deepmapping.init(problem, data, key=jax.random.key(0))
+    state = Checkpoints((path / run_folder.CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
+    if state is None:
+        raise ValueError(f"{path} holds no checkpoint that can be read")
+    poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
+    fitted = deepmapping.Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings, int(state.step))
+    return Map2dRun(sequence, fitted, config.world if config.data is None else None)
