@@ -209,10 +209,6 @@ class World:
         if self.is_obstacle.all():
             raise ValueError("is_obstacle must leave free space, got a solid world")
 
-    def fill_pockets(self) -> World:
-        """The same world with every free pixel solid that cannot be reached from the largest free space."""
-        return replace(self, is_obstacle=~largest_region(~self.is_obstacle))
-
 
 def largest_region(is_free: BoolArray) -> BoolArray:
     """The largest connected region of a raster.

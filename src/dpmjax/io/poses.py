@@ -118,11 +118,15 @@ def write_tum(
     Raises:
         ValueError: wrong shapes, or values that are not finite.
     """
+    from scipy.spatial.transform import Rotation
+
     matrices = _as_matrices(poses)
     stamps = np.arange(len(matrices), dtype=np.float64) if times is None else np.asarray(times, np.float64)
     if stamps.shape != (len(matrices),) or not np.isfinite(stamps).all():
         raise ValueError(f"times must be ({len(matrices)},) and finite, got {stamps.shape}")
-    values = np.column_stack([stamps, matrices[:, :3, 3], _to_quaternions(matrices[:, :3, :3])])
+    turns = matrices[:, :3, :3]
+    quaternions = Rotation.from_matrix(turns).as_quat(canonical=True) if len(turns) else np.zeros((0, 4))
+    values = np.column_stack([stamps, matrices[:, :3, 3], quaternions])
     header = f"stamp_s tx ty tz qx qy qz qw; {frame}, unit {unit}"
     return _write_table(path, values, ["%.6f", *["%.9f"] * 7], header)
 
@@ -288,13 +292,6 @@ def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
     is_unit = (np.abs(np.linalg.norm(np.clip(rows[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all()
     require(is_unit, path, "quaternions of another length than 1", "write TUM rows: stamp tx ty tz qx qy qz qw")
     return homogeneous(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
-
-
-def _to_quaternions(rotations: FloatArray) -> FloatArray:
-    """Converts rotations to quaternions (n, 4) x y z w with w >= 0."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotations).as_quat(canonical=True) if len(rotations) else np.zeros((0, 4))
 
 
 def _as_matrices(poses: ArrayLike) -> FloatArray:

@@ -302,7 +302,9 @@ def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.rand
     poses = []
     for _ in range(num_views):
         poses.append([*places[tuple(at)], np.deg2rad(view * _TURN_DEG)])
-        reachable = _free_neighbours(is_free, at)
+        neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
+        reachable = [place for place in neighbours[inside] if is_free[tuple(place)]]
         if config.steps == "one":
             does_move = bool(reachable) and rng.random() < _MOVE_SHARE
             does_turn = not does_move
@@ -319,12 +321,6 @@ def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.rand
     # Noise is added to each pose, unless the new position is not free.
     moved = drawn + np.array([_JITTER_M, _JITTER_M, np.deg2rad(_JITTER_DEG)]) * rng.standard_normal(drawn.shape)
     return np.where(home.is_free(moved[:, :2], _FREE_CLEARANCE_M)[:, None], moved, drawn)
-
-
-def _free_neighbours(is_free: BoolArray, at: np.ndarray) -> list[np.ndarray]:
-    neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
-    return [n for n, ok in zip(neighbours, inside, strict=True) if ok and is_free[tuple(n)]]
 
 
 def _planar_to_matrices(poses: FloatArray) -> FloatArray:

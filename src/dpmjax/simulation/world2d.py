@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dpmjax.sequences import BoolArray, FloatArray, World
+from dpmjax.sequences import BoolArray, FloatArray, World, largest_region
 
 SIZE_PX = 1024
 _WALL_PX = 10
@@ -54,7 +54,8 @@ def make_world(world: int | str) -> World:
     rng = np.random.default_rng([2024, index])
     grid = np.zeros((SIZE_PX, SIZE_PX), bool)
     _KINDS[kind](grid, rng)
-    return World(f"{kind}-{index}", grid, _NUM_PEOPLE if kind == "crowd" else 0).fill_pockets()
+    # Free pixels that cannot be reached from the largest free space become solid.
+    return World(f"{kind}-{index}", ~largest_region(~grid), _NUM_PEOPLE if kind == "crowd" else 0)
 
 
 def _build_office(grid: BoolArray, rng: np.random.Generator) -> None:
@@ -118,14 +119,9 @@ def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int
     for half in (first, second):
         _divide(grid, rng, half, depth + 1)
     for door in doors:
-        _clear_door(grid, along, cut, door)
-
-
-def _clear_door(grid: BoolArray, along: int, at: float, door: float) -> None:
-    """Clears a doorway of later walls."""
-    reach = slice(max(int(at) - 40, _WALL_PX), int(at) + 40)
-    width = slice(int(door), int(door) + _DOOR_PX)
-    grid[(width, reach) if along else (reach, width)] = False
+        # Later walls must not stand in the doorway.
+        reach, width_of_door = slice(max(cut - 40, _WALL_PX), cut + 40), slice(int(door), int(door) + _DOOR_PX)
+        grid[(width_of_door, reach) if along else (reach, width_of_door)] = False
 
 
 def _furnish(

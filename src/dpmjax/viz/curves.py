@@ -93,9 +93,8 @@ def history_figure(history: History, unit: str) -> Figure:
     rows[-1].set_xlabel("run time (s)", color=INK)
     first, last = seconds[0], seconds[-1]
     rows[-1].set_xlim(first, last if last > first else first + 1.0)
-    figure.subplots_adjust(
-        left=0.12, right=0.9, top=0.93 if has_ate else 0.89, bottom=0.1 if has_ate else 0.17, hspace=0.08
-    )
+    top, bottom = (0.93, 0.1) if has_ate else (0.89, 0.17)
+    figure.subplots_adjust(left=0.12, right=0.9, top=top, bottom=bottom, hspace=0.08)
     return figure
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.geometry.alignment import best_motion
 from dpmjax.viz import figures
 from dpmjax.viz.figures import INK, MUTED, Limits
 
@@ -57,9 +58,8 @@ class Panel:
         """
         points, mask, poses = (np.shape(x) for x in (self.scans.points, self.scans.mask, self.poses))
         if len(points) != 3 or points[-1] != 2 or mask != points[:2] or poses != (points[0], 3):
-            raise ValueError(
-                f"expected points (n, b, 2), mask (n, b), poses (n, 3); got points {points}, mask {mask}, poses {poses}"
-            )
+            got = f"got points {points}, mask {mask}, poses {poses}"
+            raise ValueError(f"expected points (n, b, 2), mask (n, b), poses (n, 3); {got}")
 
     @property
     def trajectory_world(self) -> NDArray[np.float64]:
@@ -127,16 +127,10 @@ def time_colormap() -> Colormap:
 
 def _laid_onto(panel: Panel, anchor: Panel) -> Panel:
     """Returns the panel moved rigidly, its trajectory as close as possible to the anchor's (least squares)."""
-    # A position as one complex number: a turn is then a product with a number of length one.
-    source, target = (one.trajectory_world @ np.array([1.0, 1.0j]) for one in (panel, anchor))
-    is_used = np.isfinite(source) & np.isfinite(target)
-    if not is_used.any():
-        return panel
-    source, target = source[is_used], target[is_used]
-    turn = np.angle(np.vdot(source - source.mean(), target - target.mean()))
-    shift = target.mean() - np.exp(1.0j * turn) * source.mean()
-    motion = np.array([shift.real, shift.imag, turn])
-    return replace(panel, poses=se2.compose(motion, np.asarray(panel.poses, np.float64)))
+    source, target = panel.trajectory_world, anchor.trajectory_world
+    is_used = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+    T_anchor_panel = best_motion(source, target, is_used.astype(np.float64))
+    return replace(panel, poses=se2.compose(se2.from_matrix(T_anchor_panel), np.asarray(panel.poses, np.float64)))
 
 
 def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:

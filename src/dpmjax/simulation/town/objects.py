@@ -158,14 +158,6 @@ def put_pole(into: Collection, place: Place, radius: float, height: float) -> No
     into.cylinders.append((*centre, radius, radius, 0.5 * height + 0.1, 0.0, 0.0, 0.0))
 
 
-def _put_tuft(
-    into: Collection, place: Place, level: float, radius: float, half_height: float, softness: float = 0.0
-) -> None:
-    """Adds a spheroid to the objects, with its centre `level` above the ground, m."""
-    size = (radius, radius, half_height)
-    into.spheroids.append((place.x, place.y, place.ground + level, *size, 0.0, softness, 0.0))
-
-
 def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
     """Adds a sign to the objects: a post with a plate across the street's direction.
 
@@ -217,7 +209,7 @@ def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None
     """
     height = rng.uniform(1.5, 1.9)
     put_pole(into, place, 0.22, height - 0.25)
-    _put_tuft(into, place, height - 0.12, 0.11, 0.14)
+    into.spheroids.append((place.x, place.y, place.ground + (height - 0.12), 0.11, 0.11, 0.14, 0.0, 0.0, 0.0))
 
 
 def put_car_park(into: Collection, rng: np.random.Generator, place: Place, size: Size) -> None:
