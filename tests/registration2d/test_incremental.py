@@ -7,6 +7,7 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
+from dpmjax.registration2d.incremental import scan_odometry
 from dpmjax.registration2d.pair_alignment import Schedule
 
 
@@ -65,6 +66,15 @@ def test_a_scan_that_fits_nowhere_is_bridged(walk, chained) -> None:
     poses = incremental_icp(planar_scans(points, walk.mask)).poses
     others = np.delete(np.arange(len(poses)), 11)
     assert ate(poses[others], walk.reference_poses[others]) < 0.1
+
+
+def test_a_step_without_a_match_is_no_standing_robot(walk) -> None:
+    points = walk.points[:4].copy()
+    points[3] = 0.2 * points[3]
+    scans = planar_scans(points)
+    motion = scan_odometry(scans)
+    assert np.hypot(*(motion[3] - motion[2])[:2]) > 0.5 * scans.typical_range
+    assert np.hypot(*(motion[2] - motion[1])[:2]) < 0.5 * scans.typical_range
 
 
 def test_one_scan_is_a_trajectory(walk_scans) -> None:

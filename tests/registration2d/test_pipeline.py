@@ -180,10 +180,12 @@ def test_stop_ends_the_fit_between_calls_of_its_step(few) -> None:
 
 @pytest.mark.slow
 def test_each_stage_is_told_before_it_begins(few) -> None:
-    stages: list[str] = []
-    hooks = RegistrationHooks(on_progress=lambda stage, _: stages.append(stage), engine=Untrained())
+    stages, shares = list[str](), list[float]()
+    hooks = RegistrationHooks(lambda stage, _: stages.append(stage), engine=Untrained(), on_share=shares.append)
     register(few, start="icp-plane", hooks=hooks)
     assert stages[:3] == [f"start: {ICP}", DEEPMAPPING, f"{ICP}, refined"]
+    assert shares == sorted(shares)
+    assert 0.0 <= shares[0] < shares[-1] == 1.0
     assert stages[-1] == "choice and assessment"
 
 

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dpmjax.registration_rgbd.adjustment import SampledImages, adjust_poses
 
 from dpmjax import io, simulation
 from dpmjax.geometry.sampling import typical_range

@@ -131,29 +131,37 @@ def main(config: Config) -> dict[str, Any]:
 def register_sequence(
     sequence: ScanSequence, start: str | Floats, config: Config, recorder: FitRecorder, stop: StopFlag
 ) -> RegisteredScans:
-    """Registers the scans, with the recorder as engine of the fit, and prints each stage."""
+    """Registers the scans, with the recorder as engine of the fit, and prints each stage and a bar of all."""
     import jax
+    from tqdm import tqdm
 
     from dpmjax.geometry import typical_range
 
+    bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}]", desc="registration")
+
     def show(stage: str, share: float) -> None:
         if share == 0.0:
-            print(f"{stage} ...", flush=True)
+            bar.write(f"{stage} ...")
 
     def engine(rows: NDArray[np.integer]) -> Callable[..., Fit]:
         if len(rows) < len(sequence):
-            print(f"{len(rows)} of the scans are registered, chosen by their motion")
+            bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
         return partial(recorder, measure=results.ate_of(fitted, typical_range(fitted.points, fitted.mask)))
 
-    return registration2d.register_scans(
-        results.scan_set_of(sequence),
-        registration_settings(config, sequence),
-        key=jax.random.key(config.seed),
-        start=start,
-        odometry=sequence.odometry_poses if config.ordered else None,
-        hooks=registration2d.RegistrationHooks(show, lambda: stop.is_requested, engine),
-    )
+    def advance(share: float) -> None:
+        bar.update(share - bar.n)
+
+    hooks = registration2d.RegistrationHooks(show, lambda: stop.is_requested, engine, advance)
+    with bar:
+        return registration2d.register_scans(
+            results.scan_set_of(sequence),
+            registration_settings(config, sequence),
+            key=jax.random.key(config.seed),
+            start=start,
+            odometry=sequence.odometry_poses if config.ordered else None,
+            hooks=hooks,
+        )
 
 
 def map_numbers(

@@ -81,7 +81,8 @@ def scan_odometry(scans: PlanarScans) -> Floats:
     """Chains coarse alignments of each scan with the one before, from zero motion.
 
     These poses select scans of a dense recording that lie apart, for a robot without odometry. Steps that are long or
-    unconstrained in some direction are wrong.
+    unconstrained in some direction are wrong. A step without a match gets the length of one typical range, because the
+    zero motion that it starts from would be that of a standing robot, whose scans are left out.
 
     Args:
         scans: n scans in time order.
@@ -89,7 +90,9 @@ def scan_odometry(scans: PlanarScans) -> Floats:
     Returns:
         (n, 3) T_world_scan, the first one zero.
     """
-    return se2.chain(match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane").poses)
+    matches = match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane")
+    is_lost = (matches.fitness < _POOR_FITNESS)[:, None]
+    return se2.chain(np.where(is_lost, [scans.typical_range, 0.0, 0.0], matches.poses))
 
 
 def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:

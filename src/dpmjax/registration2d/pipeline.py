@@ -86,21 +86,40 @@ class RegistrationConfig:
         require_positive("min_turn", self.min_turn)
 
 
+class _Stage(NamedTuple):
+    """Usual shares of a registration that are done where a stage begins and ends; stages may be left out."""
+
+    begins: float
+    ends: float
+
+
+_MOTION, _CALIBRATION, _START = _Stage(0.0, 0.1), _Stage(0.1, 0.15), _Stage(0.15, 0.3)
+_FIT, _REFINED_START, _REFINED_FIT = _Stage(0.3, 0.45), _Stage(0.45, 0.65), _Stage(0.65, 0.8)
+_CHOICE, _RETRIAL, _BETWEEN = _Stage(0.8, 0.85), _Stage(0.85, 0.95), _Stage(0.95, 1.0)
+
+
 class RegistrationHooks(NamedTuple):
     """Functions that `register_scans` calls.
 
     Attributes:
-        on_progress: called with the name of a stage and the share of it that is done: 0 where the stage begins, and
-            after each call of the step of the fit.
+        on_progress: called with the name of a stage and the share of it that is done: 0 where the stage begins, after
+            each call of the step of the fit, and after the parts of a refinement.
         stop: called before each stage that may be left out and before each call of the step of the fit. Where it
             returns True, the fit ends, and the best of the candidates so far is kept.
         engine: called with the rows of the scans that are fitted, in the order of the fit; returns the `engine` of
             `fit_deepmapping`, which must report progress and handle stops. None: `deepmapping.fit`.
+        on_share: called with the share of the whole registration that is done, which never falls.
     """
 
     on_progress: Callable[[str, float], None] = lambda _stage, _share: None
     stop: Callable[[], bool] = lambda: False
     engine: EngineOf | None = None
+    on_share: Callable[[float], None] = lambda _share: None
+
+    def report(self, stage: _Stage, name: str, share: float = 0.0) -> None:
+        """Reports the share of a stage that is done, and that of the registration."""
+        self.on_progress(name, share)
+        self.on_share(stage.begins + (stage.ends - stage.begins) * share)
 
 
 class Candidate(NamedTuple):
@@ -190,21 +209,25 @@ def register_scans(
         found[DEEPMAPPING] = fitted.poses
     if config.refine and not hooks.stop():
         found |= _refined_candidates(lines, found, evidence, hooks)
-    hooks.on_progress("choice and assessment", 0.0)
+    hooks.report(_CHOICE, "choice and assessment")
     kept, scores, assessment = _choose(lines, found, evidence)
     has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
     has_other = has_other and not (evidence is not None and evidence.is_mirrored)
     if has_other and not assessment.is_trusted and not hooks.stop():
-        hooks.on_progress("the map from odometry cannot be trusted: registration without it", 0.0)
+        retrial = "the map from odometry cannot be trusted: registration without it"
+        hooks.report(_RETRIAL, retrial)
         name = START_NAMES["icp-plane"]
-        found[f"{name}, refined"] = refine(lines, incremental_icp(lines).poses).poses
+        first = incremental_icp(lines).poses
+        found[f"{name}, refined"] = refine(lines, first, on_progress=partial(hooks.report, _RETRIAL, retrial)).poses
         kept, scores, assessment = _choose(lines, found, evidence)
     if recording.motion is not None:
-        hooks.on_progress("poses between the registered scans", 0.0)
+        hooks.report(_BETWEEN, "poses between the registered scans")
+    poses = recording.aligned(found[kept])
+    hooks.on_share(1.0)
     candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
     uncertain = tuple(recording.chosen[list(assessment.uncertain_scans)].tolist())
     assessment = assessment._replace(uncertain_scans=uncertain)
-    return RegisteredScans(recording.aligned(found[kept]), kept, start_name, candidates, assessment, fitted, recording)
+    return RegisteredScans(poses, kept, start_name, candidates, assessment, fitted, recording)
 
 
 def _choose(
@@ -232,7 +255,7 @@ def _find_evidence(
     given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
     if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
         return None
-    hooks.on_progress("calibration of the odometry", 0.0)
+    hooks.report(_CALIBRATION, "calibration of the odometry")
     return calibrate_odometry(scans, given[recording.chosen])
 
 
@@ -265,7 +288,7 @@ def _choose_scans(
     if config.min_distance is None:
         return choose_scans(scans, None, 1.0, 1.0)
     if motion is None and len(scans.points) > _MAX_WHOLE:
-        hooks.on_progress("odometry from the scans", 0.0)
+        hooks.report(_MOTION, "odometry from the scans")
         motion = scan_odometry(planar_scans(scans))
     return choose_scans(scans, motion, config.min_distance, config.min_turn)
 
@@ -277,7 +300,7 @@ def _start_poses(
     if not isinstance(start, str):
         return GIVEN_POSES, start[recording.chosen]
     name = START_NAMES[start]
-    hooks.on_progress(f"start: {name}", 0.0)
+    hooks.report(_START, f"start: {name}")
     match start:
         case "zero":
             return name, np.zeros((len(scans), 3))
@@ -326,10 +349,10 @@ def _fit(
     recording: Recording, start: Floats | None, config: RegistrationConfig, *, key: jax.Array, hooks: RegistrationHooks
 ) -> Fitted:
     """Fits the registered scans by the engine of the hooks, or by one that reports to them."""
-    hooks.on_progress(DEEPMAPPING, 0.0)
+    hooks.report(_FIT, DEEPMAPPING)
 
     def report(progress: Progress) -> None:
-        hooks.on_progress(DEEPMAPPING, progress.share)
+        hooks.report(_FIT, DEEPMAPPING, progress.share)
 
     def engine_of(order: Indices) -> Engine:
         if hooks.engine is not None:
@@ -352,8 +375,10 @@ def _refined_candidates(
     found: dict[str, Floats] = {}
 
     def add_refined(name: str, poses: Floats) -> None:
-        hooks.on_progress(f"{name}, refined", 0.0)
-        found[f"{name}, refined"] = refine(scans, poses, prior=prior).poses
+        stage = _REFINED_START if name == start else _REFINED_FIT
+        report = partial(hooks.report, stage, f"{name}, refined")
+        report(0.0)
+        found[f"{name}, refined"] = refine(scans, poses, prior=prior, on_progress=report).poses
 
     if start != START_NAMES["zero"]:
         add_refined(start, start_poses)

@@ -5,6 +5,7 @@ With range noise the scans are then adjusted to common lines (line_adjustment.py
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -34,6 +35,8 @@ _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
 _NUM_REPAIRS = 2
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
+# Shares of a refinement that are usually done after the steps, the loops and the joint alignment.
+_STEPS_SHARE, _LOOPS_SHARE, _ALIGNED_SHARE = 0.1, 0.4, 0.9
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ def refine(
     config: RefinementConfig | None = None,
     *,
     prior: StepPrior | None = None,
+    on_progress: Callable[[float], None] = lambda _share: None,
 ) -> Refined:
     """Refines a trajectory by loop closure, joint alignment of all scans, and adjustment to common lines.
 
@@ -84,6 +88,7 @@ def refine(
         poses: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
         config: settings.
         prior: of the steps of ordered scans; None: the steps of the initial poses, with the usual deviations.
+        on_progress: called with the share of the refinement that is done.
 
     Returns:
         Refined; the first pose is the initial one, unless loops are kept.
@@ -103,15 +108,20 @@ def refine(
         rows = np.flatnonzero(fitting_scans(scans, chained))
         if len(rows) < len(scans):
             some = scans.take(rows).replace(is_ordered=True)
-            fitting = refine(some, start[rows], config, prior=prior.through(rows))
+            fitting = refine(some, start[rows], config, prior=prior.through(rows), on_progress=on_progress)
             whole = interpolate(len(scans), rows, fitting.poses)
             return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
+        on_progress(_STEPS_SHARE)
         settled, slides = settle_steps(scans, steps, prior)
         matched = matched_steps(settled, slides, scans.typical_range)
         candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
         num_loops["loops"] = int((weights > 0.25).sum())
         fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
-    aligned = {name: _align(scans, candidate, fitting_steps, config, prior) for name, candidate in candidates.items()}
+    aligned: dict[str, Floats] = {}
+    for name, candidate in candidates.items():
+        on_progress(_LOOPS_SHARE + (_ALIGNED_SHARE - _LOOPS_SHARE) * len(aligned) / len(candidates))
+        aligned[name] = _align(scans, candidate, fitting_steps, config, prior)
+    on_progress(_ALIGNED_SHARE)
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
