@@ -21,8 +21,8 @@ import jax
 
 from dpmjax.cli import environment
 
+# Folder of recorded data; without it the cases that need them are left out.
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data"))
-"""Folder of recorded data; without it the cases that need them are left out."""
 
 COLUMNS = ("name", "case", "metric", "value", "unit")
 

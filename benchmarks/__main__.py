@@ -21,8 +21,8 @@ import tyro
 
 from benchmarks import COLUMNS, Row, format_table, in_new_process, run_benchmark
 
+# Modules, each with a function `run`.
 BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "slam", "toy")
-"""Modules, each with a function `run`."""
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,11 @@ from dpmjax.simulation import HDL64E, simulate_lidar_sequence
 
 Scan = NDArray[np.float32]
 KITTI = ("kitti_00", "kitti_07", "kitti_raw_0013")
+# Parts that run on the host, and the sum of parts that are compiled by then.
 NOT_COMPILED = ("preprocess", "pyramid", "preprocess + encode")
-"""Parts that run on the host, and the sum of parts that are compiled by then."""
 
+# 2048 descriptors at the size of the paper.
 SCANS_IN_MAP = 8
-"""2048 descriptors at the size of the paper."""
 
 
 def make_scans(folder: Path, quick: bool) -> list[Row]:
@@ -204,6 +204,7 @@ class Figure(NamedTuple):
     goal: float | None = None
 
 
+# By case. Held against the median, or against the peak memory of the one process that does all of it.
 FIGURES: dict[str, Figure] = {
     "paper, KITTI scan: preprocess": Figure(theirs=98.0),
     "paper, KITTI scan: pyramid": Figure(theirs=990.0),
@@ -218,7 +219,6 @@ FIGURES: dict[str, Figure] = {
     "small, K = 2, 16 scans: training step": Figure(goal=450.0),
     "process of everything paper": Figure(theirs=1.0, goal=1.0),
 }
-"""By case. Held against the median, or against the peak memory of the one process that does all of it."""
 
 
 def run(quick: bool) -> list[Row]:

@@ -25,8 +25,8 @@ from experiments._baselines import multiway, optimize_directly, swarm_chain
 Floats = NDArray[np.float64]
 Candidates = dict[str, Floats]
 
+# ATE below which the paper calls a run a success (section 4.1).
 SUCCESS_PX = 20.0
-"""ATE below which the paper calls a run a success (section 4.1)."""
 
 _LBFGS_ITERATIONS = 150
 
@@ -202,11 +202,11 @@ METHODS: dict[str, Method] = {
 }
 
 
+# Baselines of the paper that have no column, and why.
 NOT_RUN = {
     "go-icp": "its packages on PyPI search the turns of 3-D clouds, which may turn a flat scan over; py-goicp does not "
     "build with today's setuptools, py-simple-go-icp-interface took 20 s for one pair of flat scans and gave up",
 }
-"""Baselines of the paper that have no column, and why."""
 # A candidate whose ATE is larger than the least by no more than this is as good.
 _AS_GOOD_PX = 0.1
 

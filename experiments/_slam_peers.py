@@ -170,12 +170,12 @@ class SmallGicp(Peer):
         return GAUSSIAN_BYTES * int(self._whole.size())
 
 
+# The peers by name: the module that must be there, and the class.
 PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
     "KISS-ICP": ("kiss_icp.kiss_icp", KissIcp),
     "KISS-SLAM": ("kiss_slam.slam", KissSlam),
     "small_gicp": ("small_gicp", SmallGicp),
 }
-"""The peers by name: the module that must be there, and the class."""
 
 
 def why_missing(name: str) -> str | None:

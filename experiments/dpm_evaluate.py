@@ -55,8 +55,8 @@ _ANSWERS = {
     SEARCH: ("search", "is_right"),
     KISS: ("KISS-Matcher", "is_right"),
 }
+# Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data.
 MONITORED = ("kitti_00_drive",)
-"""Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data."""
 
 
 @dataclass(frozen=True, kw_only=True)

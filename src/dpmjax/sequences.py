@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 Unit = Literal["px", "m"]
 BoolArray = NDArray[np.bool_]
+# Start, stop and stride in scans, or the rows to keep, in the order wanted.
 Selection = slice | NDArray[np.integer]
-"""Start, stop and stride in scans, or the rows to keep, in the order wanted."""
 
 
 class InputError(ValueError):
@@ -266,8 +266,8 @@ class Camera:
         return rows, ((np.arange(width) + 0.5) * self.width / width).astype(np.int64)
 
 
+# The camera of the Active Vision Dataset.
 ACTIVE_VISION = Camera(1920, 1080, 1070.0, 1069.126, 927.268, 545.76)
-"""The camera of the Active Vision Dataset."""
 
 
 @dataclass(frozen=True)

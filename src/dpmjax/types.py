@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+# What public functions take: an array of JAX or of NumPy. They return arrays of JAX.
 AnyArray = jax.Array | np.ndarray
-"""What public functions take: an array of JAX or of NumPy. They return arrays of JAX."""
 
 
 @flax.struct.dataclass

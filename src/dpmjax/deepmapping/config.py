@@ -102,6 +102,7 @@ class PhaseConfig:
             require_fields(self, "scans_per_window", low=2)
 
 
+# Cold start: one L-Net for each window, without M-Net, because a map of wrong poses would be a local minimum.
 LOCALIZE = PhaseConfig(
     name="L-Net",
     poses="network",
@@ -115,8 +116,8 @@ LOCALIZE = PhaseConfig(
     max_offset=8,
     scans_per_window=17,
 )
-"""Cold start: one L-Net for each window, without M-Net, because a map of wrong poses would be a local minimum."""
 
+# Free poses and a map that sharpens from coarse to fine.
 REFINE = PhaseConfig(
     name="free poses",
     poses="free",
@@ -128,7 +129,6 @@ REFINE = PhaseConfig(
     num_free=1,
     surface_distance=(0.1, 0.004),
 )
-"""Free poses and a map that sharpens from coarse to fine."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
+# Number of nodes of the raster along each side of the map's frame.
 NUM_NODES = 513
-"""Number of nodes of the raster along each side of the map's frame."""
 # Absolute log odds above which a node is observed, free or occupied; M-Net is zero where no beam has passed.
 _SEEN = 0.3
 # Largest share of unobserved nodes along a rendered beam.

@@ -179,5 +179,5 @@ def _unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
     return np.asarray(poses, np.float64) * [unit, unit, 1.0]
 
 
+# DeepMapping of planar scans; poses are (n, 3) x, y, heading.
 PLANAR = Sensor(_scaled_start, _unscaled, _init, _loss, _poses, _next_phase)
-"""DeepMapping of planar scans; poses are (n, 3) x, y, heading."""

@@ -21,6 +21,7 @@ from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 # M-Net of the fast presets in space.
 _SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
 
+# Phase of the paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4.
 JOINT = PhaseConfig(
     name="L-Net and M-Net",
     poses="network",
@@ -32,13 +33,13 @@ JOINT = PhaseConfig(
     num_free=19,
     is_sampled_as_published=True,
 )
-"""Phase of the paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4."""
 
+# Cold start of depth images.
 LOCALIZE_DEPTH = replace(
     LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None
 )
-"""Cold start of depth images."""
 
+# Free poses of depth images; the decreasing limit of the Chamfer distance removes its bias at low overlap.
 UNROLL_DEPTH = replace(
     LOCALIZE_DEPTH,
     name="free poses, Chamfer",
@@ -48,8 +49,9 @@ UNROLL_DEPTH = replace(
     final_learning_rate=0.02,
     comparison=ChamferComparison(limit=(0.5, 0.05)),
 )
-"""Free poses of depth images; the decreasing limit of the Chamfer distance removes its bias at low overlap."""
 
+# Free poses and a map that sharpens from coarse to fine. The Chamfer distance is biased by the spacing of the pixels
+# and by points that only one image has observed; the comparison by projection is not.
 REFINE_DEPTH = replace(
     REFINE,
     name="free poses and map",
@@ -62,22 +64,22 @@ REFINE_DEPTH = replace(
     surface_distance=(0.05, 0.01),
     comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
 )
-"""Free poses and a map that sharpens from coarse to fine. The Chamfer distance is biased by the spacing of the pixels
-and by points that only one image has observed; the comparison by projection is not."""
 
+# Phase of the paper for depth images: all pixels, 35 free samples on each ray, gamma 0.9, comparison of neighbours.
 JOINT_DEPTH = replace(
     JOINT, num_steps=3000, occupancy_weight=0.9, scans_per_step=256, num_offsets=1, max_offset=1, num_free=35
 )
-"""Phase of the paper for depth images: all pixels, 35 free samples on each ray, gamma 0.9, comparison of neighbours."""
 
+# Cold start of clouds.
 LOCALIZE_CLOUDS = replace(
     LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3, scans_per_window=None
 )
-"""Cold start of clouds."""
 
+# Free poses of clouds, as `UNROLL_DEPTH`.
 UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)
-"""Free poses of clouds, as `UNROLL_DEPTH`."""
 
+# Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
+# scans; the distance to the plane between the rings does not.
 REFINE_CLOUDS = replace(
     REFINE,
     name="free poses, planes and map",
@@ -92,11 +94,9 @@ REFINE_CLOUDS = replace(
     surface_distance=(0.05, 0.01),
     comparison=PlaneComparison(width=(0.04, 0.002)),
 )
-"""Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
-scans; the distance to the plane between the rings does not."""
 
+# Losses and sampling of the paper, for clouds.
 JOINT_CLOUDS = replace(JOINT, num_steps=3000, scans_per_step=64, beams_per_step=2048)
-"""Losses and sampling of the paper, for clouds."""
 
 
 _FAST: dict[str, DeepMappingConfig] = {
@@ -118,12 +118,12 @@ _FAST: dict[str, DeepMappingConfig] = {
         motion="full",
     ),
 }
+# Phase and L-Net of the paper for each sensor.
 _PAPER = {
     "planar": (JOINT, LocalizationNetConfig()),
     "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)),
     "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point")),
 }
-"""Phase and L-Net of the paper for each sensor."""
 
 
 def preset(

@@ -205,8 +205,8 @@ def _cloud_loss(
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
 
 
+# DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
 DEPTH = Sensor(_scaled_start, _unscaled, _init, _depth_loss, _poses, _next_phase)
-"""DeepMapping of depth images; poses are (n, 4, 4) T_world_camera."""
 
+# DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
 CLOUDS = Sensor(_scaled_start, _unscaled, _init, _cloud_loss, _poses, _next_phase)
-"""DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan."""

@@ -21,8 +21,8 @@ CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
 WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
+# Higher log odds tell nothing more where walls hold one direction only: wrong motions have them, too.
 MAX_SCORE = 3.0
-"""Higher log odds tell nothing more where walls hold one direction only: wrong motions have them, too."""
 RIDGE = 1e-3
 
 

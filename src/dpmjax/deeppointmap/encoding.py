@@ -18,11 +18,11 @@ from dpmjax.geometry.pyramid_host import build_pyramid_on_host
 from dpmjax.scans.preprocess import first_of_each_voxel, preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
 
+# Number of scans, or of pairs, in one call of a compiled program.
 CHUNK = 4
-"""Number of scans, or of pairs, in one call of a compiled program."""
 
+# Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4.
 EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
-"""Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4."""
 
 
 def encode(

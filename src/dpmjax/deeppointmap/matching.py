@@ -25,37 +25,37 @@ from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_su
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
+# Pairs with longer offsets are dropped.
 MAX_OFFSET_M = 2.0
-"""Pairs with longer offsets are dropped."""
 
+# The confidence is the mean score of this many first inliers.
 NUM_CONFIDENT = 30
-"""The confidence is the mean score of this many first inliers."""
 
+# An inlier's error is at most the mean plus this many standard deviations of the inliers before.
 INLIER_SIGMAS = 3.0
-"""An inlier's error is at most the mean plus this many standard deviations of the inliers before."""
 
+# Least number of first inliers; where fewer pairs have such scores, this number of the best pairs is taken.
 MIN_NUM_FIRST = 64
-"""Least number of first inliers; where fewer pairs have such scores, this number of the best pairs is taken."""
 
+# Pairs with higher scores are the first inliers.
 MIN_INLIER_SCORE = 0.5
-"""Pairs with higher scores are the first inliers."""
 
+# A choice of fewer inliers is rejected (published configuration).
 MIN_NUM_INLIERS = 30
-"""A choice of fewer inliers is rejected (published configuration)."""
 
+# Largest number of pairs per direction. More pairs do not make a motion more exact, and the cost of the consensus is
+# cubic.
 MAX_NUM_PAIRS = 512
-"""Largest number of pairs per direction. More pairs do not make a motion more exact, and the cost of the consensus is
-cubic."""
 
+# Maps rows of the source and of the target to the offsets of eq. 1 (source frame) and eq. 2 (target frame), metres.
 PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Array, "k 3"], Float[Array, "k 3"]]]
-"""Maps rows of the source and of the target to the offsets of eq. 1 (source frame) and eq. 2 (target frame), metres."""
 
 
+# Relative tolerance: rounding must not drop pairs whose errors are all equal.
 ERROR_SLACK = 1 + 1e-5
-"""Relative tolerance: rounding must not drop pairs whose errors are all equal."""
 
+# A rigid motion needs three distinct points on both sides.
 MIN_NUM_POINTS = 3
-"""A rigid motion needs three distinct points on both sides."""
 
 
 @dataclass(frozen=True)

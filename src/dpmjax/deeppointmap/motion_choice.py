@@ -41,46 +41,46 @@ from dpmjax.scans.weak_directions import (
 )
 from dpmjax.types import Verification
 
+# Alignment of each hypothesis.
 COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
-"""Alignment of each hypothesis."""
 
+# Alignment of the best `NUM_FINE` hypotheses.
 FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
-"""Alignment of the best `NUM_FINE` hypotheses."""
 
+# Alignment of the chosen hypothesis by `refine_motion`; it starts where `FINE` ended.
 REFINEMENT = AlignmentConfig(levels=(AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10)))
-"""Alignment of the chosen hypothesis by `refine_motion`; it starts where `FINE` ended."""
 
 NUM_FINE = 3
 
+# No further hypothesis is tried after one with higher log odds.
 CLEAR_SCORE = 1.0
-"""No further hypothesis is tried after one with higher log odds."""
 
+# Distance of the motions that are tried along a weak axis.
 SLIDING_STEP_M = 0.7
-"""Distance of the motions that are tried along a weak axis."""
 
+# Number of these motions that are aligned finely.
 NUM_SLID_FINE = 32
-"""Number of these motions that are aligned finely."""
 
+# Number of elements of each scan that face the axis and are compared.
 NUM_FACING = 4000
-"""Number of elements of each scan that face the axis and are compared."""
 
+# Largest number of elements that count at one position along the axis, so that an end wall is one observation; the two
+# ends of a corridor may look alike.
 MAX_FACING = 10.0
-"""Largest number of elements that count at one position along the axis, so that an end wall is one observation; the two
-ends of a corridor may look alike."""
 
+# Penalty of an element that faces the axis and lies in free space; an element that meets a plane adds 1.
 FACING_CONTRADICTED = 3.0
-"""Penalty of an element that faces the axis and lies in free space; an element that meets a plane adds 1."""
 
+# Penalty of a visible element that faces the axis.
 FACING_VISIBLE = 0.2
-"""Penalty of a visible element that faces the axis."""
 
 HYPOTHESES_AT_ONCE = 4
 
+# Motions that differ by less end in the same place.
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
-"""Motions that differ by less end in the same place."""
 
+# Fields of `Verification` that rest on all motions that were tried.
 OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap")
-"""Fields of `Verification` that rest on all motions that were tried."""
 
 
 class VerifiedMotion(NamedTuple):

@@ -27,21 +27,21 @@ from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
 from dpmjax.types import DescriptorCloud
 
+# Scans that are nearer to each other overlap.
 OVERLAP_M = 20.0
-"""Scans that are nearer to each other overlap."""
 
 MATCHING = MatchConfig(pair_ratio=1.0)
+# A quarter of the work of a registration: only the two best motions count.
 CONSENSUS = ConsensusConfig(num_seeds=48, num_rounds=3, num_motions=2)
-"""A quarter of the work of a registration: only the two best motions count."""
 
+# How sharply `near_support` falls at `OVERLAP_M`.
 GATE_M = 2.0
-"""How sharply `near_support` falls at `OVERLAP_M`."""
 
+# Descriptors of two clouds meet where they are nearer than this under the motion.
 MET_M = 2.0
-"""Descriptors of two clouds meet where they are nearer than this under the motion."""
 
+# Quantile of the good pairs.
 HIGH = 0.9
-"""Quantile of the good pairs."""
 
 MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
 

@@ -42,14 +42,14 @@ class PreparedScan(NamedTuple):
     scale: float = 1.0
 
 
+# Points in metres, in the frame of the lidar.
 RawScan = PointCloud | Float[AnyArray, "_n 3"]
-"""Points in metres, in the frame of the lidar."""
 
+# A raw scan; or the same prepared; or descriptors of a scan or of a map.
 ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
-"""A raw scan; or the same prepared; or descriptors of a scan or of a map."""
 
+# Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`.
 Scale = float | Literal["auto"]
-"""Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`."""
 
 
 def descriptors_of(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:

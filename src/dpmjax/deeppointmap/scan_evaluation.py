@@ -29,14 +29,14 @@ from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud
 
+# Of one registration, or of each of several.
 Seconds = float | Float[np.ndarray, " p"]
-"""Of one registration, or of each of several."""
 
+# Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out.
 NO_OVERLAP_M = 40.0
-"""Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out."""
 
+# Scans seen again after so many metres of driving are revisits.
 REVISIT_PATH_M = 100.0
-"""Scans seen again after so many metres of driving are revisits."""
 
 REVISIT_STREAM = 4133
 

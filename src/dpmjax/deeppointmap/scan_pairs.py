@@ -12,8 +12,8 @@ from dpmjax.geometry import se2
 from dpmjax.geometry.rigid import inverse
 from dpmjax.sequences import LidarSequence
 
+# Distances between the scans of a pair; scans of "far" do not overlap.
 DISTANCE_BANDS_M = {"near": (2.0, 10.0), "middle": (10.0, 20.0), "far": (60.0, np.inf)}
-"""Distances between the scans of a pair; scans of "far" do not overlap."""
 
 PAIR_STREAM = 4127
 

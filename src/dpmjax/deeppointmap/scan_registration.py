@@ -34,11 +34,11 @@ from dpmjax.scans.element_alignment import align_elements_on_host
 from dpmjax.scans.weak_directions import WeakDirection
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
+# Number of surface elements of a scan that is refined against a cloud.
 NUM_ELEMENTS = 1024
-"""Number of surface elements of a scan that is refined against a cloud."""
 
+# Fields of `Registration` that are 0 for a motion that no pairs of descriptors support.
 OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
-"""Fields of `Registration` that are 0 for a motion that no pairs of descriptors support."""
 
 
 def register(

@@ -20,18 +20,18 @@ from dpmjax.scans.surfaces import RangeImage, Surface, SurfaceConfig, range_imag
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
 from dpmjax.types import Verification
 
+# A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
+# are near those of the source, so its own points are compared with the planes of the source.
 SPARSE_SHARE = 0.5
-"""A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
-are near those of the source, so its own points are compared with the planes of the source."""
 
+# Surfaces whose normals are nearer to the vertical are level.
 LEVEL_COSINE = 0.8
-"""Surfaces whose normals are nearer to the vertical are level."""
 
+# Largest distance of a point from a plane that it meets.
 PLANE_DISTANCE_M = 0.15
-"""Largest distance of a point from a plane that it meets."""
 
+# Least cosine between the normals of a point and of a plane that it meets.
 MIN_COSINE = 0.7
-"""Least cosine between the normals of a point and of a plane that it meets."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from dpmjax.checks import as_float, as_points, require_shape
 from dpmjax.geometry.rigid import matmul, namespace_of
 from dpmjax.types import AnyArray
 
+# Relative to the largest, how small a singular value (in units of the dtype's epsilon) counts as zero.
 DEGENERATE_IN_EPS = 32
-"""Relative to the largest, how small a singular value (in units of the dtype's epsilon) counts as zero."""
 
 
 def weighted_svd(

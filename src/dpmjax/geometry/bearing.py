@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 
 from dpmjax.types import AnyArray, DescriptorCloud
 
+# Weight of a neighbour at the height of the point, in normalised coordinates: that of 6 mm.
 MIN_HEIGHT_WEIGHT = 1e-8
-"""Weight of a neighbour at the height of the point, in normalised coordinates: that of 6 mm."""
 
+# Weight of the ray beside the spread of the neighbours, which is between 0 and 1.
 RAY_WEIGHT = 1e-2
-"""Weight of the ray beside the spread of the neighbours, which is between 0 and 1."""
 
 
 def ray_directions(positions: Float[AnyArray, "... d"]) -> Float[Array, "... 2"]:

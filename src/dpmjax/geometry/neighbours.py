@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_mask, as_points, require_count, require_positive
 from dpmjax.types import AnyArray, Neighbours
 
+# How many distances are held at once: 64 MB in float32.
 MAX_LIVE_DISTANCES = 1 << 24
-"""How many distances are held at once: 64 MB in float32."""
 
 _POINTS_A_PASS = 4  # Points that one pass over all queries compares on a CPU.
 

@@ -132,8 +132,8 @@ def _smallest_axis_3d(covariance: Float[Array, "n 3 3"]) -> tuple[Float[Array, "
     return eigenvectors[:, :, 0], jnp.clip(flatness, 0, 1)
 
 
+# A plane needs this many neighbours, the point itself among them.
 MIN_NEIGHBOURS = 4
-"""A plane needs this many neighbours, the point itself among them."""
 
 
 def pyramid_elements(pyramid: PointPyramid, num_elements: int) -> SurfaceElements:

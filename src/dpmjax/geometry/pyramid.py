@@ -19,11 +19,11 @@ from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
+# Relative. Scans are quantised: points at exactly the radius are common, and rounding must not decide about them.
 RADIUS_SLACK = 1 + 1e-6
-"""Relative. Scans are quantised: points at exactly the radius are common, and rounding must not decide about them."""
 
+# Added to squared normalised distances before they are inverted; 1e-4 of the unit, 6 mm.
 WEIGHT_EPSILON = 1e-8
-"""Added to squared normalised distances before they are inverted; 1e-4 of the unit, 6 mm."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from dpmjax.types import AnyArray
 
+# Degrees of freedom of a camera: x, z and the angle about y (DeepMapping section 4.2); or a twist in SE(3).
 Motion = Literal["planar", "full"]
-"""Degrees of freedom of a camera: x, z and the angle about y (DeepMapping section 4.2); or a twist in SE(3)."""
 
 
 @jax.jit

@@ -14,10 +14,10 @@ from dpmjax.io.array_files import to_float32
 from dpmjax.io.files import refusing, to_numbers, write_atomically
 from dpmjax.sequences import FloatArray, require
 
+# (n,) values of the points by the name of the field.
 Columns = Mapping[str, NDArray[np.generic]]
-"""(n,) values of the points by the name of the field."""
+# Name of padding fields of the Point Cloud Library.
 PADDING = "_"
-"""Name of padding fields of the Point Cloud Library."""
 # Names of columns of point times of lidar drivers and data sets.
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "time_offset", "offset_time", "gps_time")
 _TYPES = {

@@ -15,11 +15,11 @@ from dpmjax.checks import as_float, as_mask, as_points, require_positive, requir
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
+# A covariance whose determinant is so many epsilons of that of a ball of the same size counts as not invertible.
 SINGULAR_IN_EPS = 8
-"""A covariance whose determinant is so many epsilons of that of a ball of the same size counts as not invertible."""
 
+# A spread of residuals that is so many epsilons of their length is rounding: they are all the same.
 ROUNDING_IN_EPS = 64
-"""A spread of residuals that is so many epsilons of their length is rounding: they are all the same."""
 
 
 def info_nce(

@@ -15,8 +15,8 @@ from dpmjax.nets.layers import ComputeDtype, TwoLayers, layer_norm, linear
 
 EMBEDDING_TEMPERATURE = 10_000.0
 
+# Largest number of logits of one head that a CPU holds at once: 1 MB.
 MAX_LIVE_LOGITS = 1 << 18
-"""Largest number of logits of one head that a CPU holds at once: 1 MB."""
 
 
 def embed_positions(positions: Float[Array, "n 3"], num_channels: int) -> Float[Array, "n c"]:

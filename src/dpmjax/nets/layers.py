@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from dpmjax.checks import require_one_of
 
+# Type of the matrix products. Parameters, normalisation, softmax and geometry are float32 either way.
 ComputeDtype = Literal["float32", "bfloat16"]
-"""Type of the matrix products. Parameters, normalisation, softmax and geometry are float32 either way."""
 
 NORM_EPSILON = 1e-5
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+# Xavier-uniform with the gain of ReLU, as in the published networks.
 HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
-"""Xavier-uniform with the gain of ReLU, as in the published networks."""
 
 
 @dataclass(frozen=True)

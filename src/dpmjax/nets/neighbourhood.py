@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, Int
 from dpmjax.nets.layers import NORM_EPSILON
 from dpmjax.types import AnyArray
 
+# Name of what `jax.checkpoint` should keep: (m, f) and (m, k) numbers, which spare the loop over the neighbours.
 WINNERS = "winners"
-"""Name of what `jax.checkpoint` should keep: (m, f) and (m, k) numbers, which spare the loop over the neighbours."""
 
 _UNROLL = 4
 

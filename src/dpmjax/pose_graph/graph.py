@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+# Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space.
 _TANGENT_SIZE = {(3,): 3, (4, 4): 6}
-"""Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space."""
+# How far, relative to the largest entry, an information matrix may be off for having been computed in float32.
 _ROUNDING = 1e-5
-"""How far, relative to the largest entry, an information matrix may be off for having been computed in float32."""
 
 
 class Edges(NamedTuple):

@@ -50,8 +50,8 @@ class PoseGraphConfig:
             require_positive("outlier_chi2", self.outlier_chi2)
 
 
+# Wrong edges lose their weight; the given poses are the only start.
 ROBUST = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-8, is_chordal_start=False)
-"""Wrong edges lose their weight; the given poses are the only start."""
 
 
 class OptimizedPoseGraph(NamedTuple):

@@ -22,23 +22,23 @@ Precision = Literal["float32", "int8"]
 KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
 TRIANGLE = np.triu_indices(6)
 MAX_ROTATION_ERROR = 1e-4
+# Numbers of a keyframe, and their types in the file.
 NUMBERS = {"scan": np.int64, "segment": np.int32, "path_m": np.float64, "extent_m": np.float64}
-"""Numbers of a keyframe, and their types in the file."""
 
+# Largest number of principal components.
 MAX_RANK = 16
-"""Largest number of principal components."""
 
+# Step of the coefficients, as a share of the standard deviation of a channel.
 STEP_SHARE = 0.7
-"""Step of the coefficients, as a share of the standard deviation of a channel."""
 
+# Number of surface elements of a keyframe, if it has no more descriptors: localisation needs keyframes more.
 NUM_ELEMENTS = 256
-"""Number of surface elements of a keyframe, if it has no more descriptors: localisation needs keyframes more."""
 
 POSITION_STEP_M = 0.02
 PLANARITY_STEP = 17
 MAX_CODE = np.iinfo(np.int8).max
+# Coarse codes of ranges, as multiples of those of a `CompactImage`: 4 %, where free space has a margin of 10 %.
 IMAGE_STEP = 2
-"""Coarse codes of ranges, as multiples of those of a `CompactImage`: 4 %, where free space has a margin of 10 %."""
 
 MAX_IMAGE_ROWS = 1 << 16
 

@@ -25,8 +25,8 @@ from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3
+# Below the distance of consecutive keyframes: only those of other laps are left out.
 SPACING_SHARE = 0.2
-"""Below the distance of consecutive keyframes: only those of other laps are left out."""
 
 ADVICE = "save it again with dpmjax.save_map"
 

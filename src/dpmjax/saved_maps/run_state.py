@@ -93,8 +93,8 @@ def prefixed(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
 
 ADVICE = "start the run again without --resume"
 OF_LOOPS = ("loops",)
+# Fields that are written apart, or made again from the map.
 OF_FRONT_END = ("local_map", "recent", "scores")
-"""Fields that are written apart, or made again from the map."""
 
 
 class RunState(NamedTuple):

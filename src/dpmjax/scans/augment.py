@@ -21,39 +21,39 @@ from dpmjax.geometry.rigid import namespace_of
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud
 
+# Lower and upper bound of a uniform draw.
 Interval = tuple[float, float]
-"""Lower and upper bound of a uniform draw."""
 
+# Largest number of azimuth sectors that are empty from some range on; each number from 1 to it is equally likely.
 MAX_SECTORS = 3
-"""Largest number of azimuth sectors that are empty from some range on; each number from 1 to it is equally likely."""
 
+# Width of the first sector; the width of the i-th sector is divided by i (DeepPointMap's published configuration).
 SECTOR_WIDTH_DEG = (10.0, 150.0)
-"""Width of the first sector; the width of the i-th sector is divided by i (DeepPointMap's published configuration)."""
 
+# Range beyond which a sector hides its points (DeepPointMap's published configuration).
 SECTOR_MIN_RANGE_M = (2.0, 10.0)
-"""Range beyond which a sector hides its points (DeepPointMap's published configuration)."""
 
+# Largest number of upright boxes around the sensor, from the size of a car to that of a truck; the paper has no
+# numbers.
 MAX_BOXES = 3
-"""Largest number of upright boxes around the sensor, from the size of a car to that of a truck; the paper has no
-numbers."""
 
+# Free space between the sensor and the circle around a box.
 BOX_GAP_M = (1.0, 10.0)
-"""Free space between the sensor and the circle around a box."""
 
+# Height of the centre of the box, in the frame of the lidar.
 BOX_CENTRE_Z_M = (-1.5, 0.5)
-"""Height of the centre of the box, in the frame of the lidar."""
 
+# Height of the box.
 BOX_HEIGHT_M = (1.0, 3.5)
-"""Height of the box."""
 
+# Shorter side on the ground.
 BOX_WIDTH_M = (0.5, 2.5)
-"""Shorter side on the ground."""
 
+# Longer side on the ground.
 BOX_LENGTH_M = (2.0, 10.0)
-"""Longer side on the ground."""
 
+# The noise is clipped at this many standard deviations.
 JITTER_CLIP_SIGMAS = 3.0
-"""The noise is clipped at this many standard deviations."""
 
 TURN = (-math.pi, math.pi)
 

@@ -13,8 +13,8 @@ from dpmjax.types import SurfaceElements
 MAX_COORDINATE = np.iinfo(np.int16).max
 MAX_COMPONENT = np.iinfo(np.int8).max
 MAX_CODE = np.iinfo(np.uint8).max
+# Ranges of the codes, 2.3 % apart.
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 150.0
-"""Ranges of the codes, 2.3 % apart."""
 
 
 class CompactElements(NamedTuple):

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.types import AnyArray
 
+# By so much the beams of KITTI's HDL-64E point higher than its points say (KISS-ICP corrects it by the same angle).
 KITTI_ELEVATION_DEG = 0.205
-"""By so much the beams of KITTI's HDL-64E point higher than its points say (KISS-ICP corrects it by the same angle)."""
 
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 # Shortest and longest turn of a lidar.

@@ -28,6 +28,7 @@ from dpmjax.types import AnyArray, SurfaceElements
 
 ALL = 1 << 20
 
+# Elements are metres apart and their planes reach far: the kernel shrinks, and the radius hardly.
 ELEMENT_ALIGNMENT = AlignmentConfig(
     levels=(
         AlignmentLevel(3.0, ALL, 3, kernel_m=0.5),
@@ -36,7 +37,6 @@ ELEMENT_ALIGNMENT = AlignmentConfig(
         AlignmentLevel(2.0, ALL, 4, kernel_m=0.1),
     )
 )
-"""Elements are metres apart and their planes reach far: the kernel shrinks, and the radius hardly."""
 
 
 class ElementAlignment(NamedTuple):

@@ -21,17 +21,17 @@ from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import voxel_sample
 from dpmjax.types import AnyArray, PointCloud
 
+# A point is an outlier if its mean distance to its neighbours exceeds the mean over all points by more than this number
+# of standard deviations.
 OUTLIER_SIGMAS = 3.0
-"""A point is an outlier if its mean distance to its neighbours exceeds the mean over all points by more than this
-number of standard deviations."""
 
 MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
+# Relative tolerance: rounding must not drop points that are all equally far from their neighbours.
 OUTLIER_SLACK = 1 + 1e-5
-"""Relative tolerance: rounding must not drop points that are all equally far from their neighbours."""
 
+# A table of 2 MB; a fortieth of the voxels of a large scan share a slot. The factor spreads them (Knuth).
 HASH_FACTOR, TABLE_BITS = np.uint64(0x9E3779B97F4A7C15), 18
-"""A table of 2 MB; a fortieth of the voxels of a large scan share a slot. The factor spreads them (Knuth)."""
 
 SORTED_BY_M = 2.0
 

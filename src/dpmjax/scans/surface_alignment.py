@@ -16,20 +16,18 @@ from dpmjax.checks import require_count, require_fields, require_positive
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
 
+# A level ends after a step that turns less, radians, and is shorter, metres.
 CONVERGED_RAD = 1e-4
-"""The same for the rotation."""
-
 CONVERGED_M = 2e-3
-"""A level ends after a shorter step."""
 
+# Least width of the kernel.
 MIN_KERNEL_M = 0.05
-"""Least width of the kernel."""
 
+# Width of the Geman-McClure kernel, as a share of the radius.
 KERNEL_SHARE = 1 / 6
-"""Width of the Geman-McClure kernel, as a share of the radius."""
 
+# Fewer pairs tell nothing about a motion.
 MIN_PAIRS = 20
-"""Fewer pairs tell nothing about a motion."""
 
 
 @dataclass(frozen=True)

@@ -19,20 +19,20 @@ from dpmjax.geometry.planes import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.types import SurfaceElements
 
+# A normal needs this many neighbours, the point itself among them.
 MIN_NEIGHBOURS = 4
-"""A normal needs this many neighbours, the point itself among them."""
 
+# Points by which the density of a scan is judged.
 NUM_PROBED = 200
-"""Points by which the density of a scan is judged."""
 
+# Less flat neighbourhoods are no part of a surface: foliage, wires, edges.
 MIN_FLATNESS = 0.1
-"""Less flat neighbourhoods are no part of a surface: foliage, wires, edges."""
 
+# Pixels of 2 degrees, in elevation and azimuth.
 NUM_ROWS, NUM_COLUMNS = 90, 180
-"""Pixels of 2 degrees, in elevation and azimuth."""
 
+# A point contradicts a measurement if it is nearer by more than both: a distance, and a share of its range.
 MARGIN_M, MARGIN_SHARE = 1.0, 0.1
-"""A point contradicts a measurement if it is nearer by more than both: a distance, and a share of its range."""
 
 
 @dataclass(frozen=True)

@@ -19,32 +19,32 @@ from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 
+# Two motions are also distinct if they differ by more steps of the turn than this.
 DISTINCT_TURNS = 1.5
-"""Two motions are also distinct if they differ by more steps of the turn than this."""
 
+# Two motions are distinct if they differ by more cells than this.
 DISTINCT_CELLS = 2.0
-"""Two motions are distinct if they differ by more cells than this."""
 
+# Side of a cell; down to half of it where scans reach less than `FULL_EXTENT_M`, as in rooms.
 CELL_M = 1.0
-"""Side of a cell; down to half of it where scans reach less than `FULL_EXTENT_M`, as in rooms."""
 
+# Cells along a side, and turns of a circle.
 NUM_CELLS, NUM_TURNS = 96, 60
-"""Cells along a side, and turns of a circle."""
 
+# Points within these shares of a side, and shifts up to them, do not wrap around; others are left out.
 RANGE_SHARE, SHIFT_SHARE = 0.36, 0.27
-"""Points within these shares of a side, and shifts up to them, do not wrap around; others are left out."""
 
+# Images by the direction of the normals; one more image holds points without a surface.
 NUM_DIRECTIONS = 4
-"""Images by the direction of the normals; one more image holds points without a surface."""
 
+# Horizontal range of a tenth of the points of a scan that needs whole cells.
 FULL_EXTENT_M = 25.0
-"""Horizontal range of a tenth of the points of a scan that needs whole cells."""
 
+# Normals with a smaller vertical component belong to upright surfaces.
 STEEP_COSINE = 0.5
-"""Normals with a smaller vertical component belong to upright surfaces."""
 
+# Normals this near to the vertical belong to the ground, in each of `LEVEL_ROUNDS` rounds.
 LEVEL_COSINE = 0.9
-"""Normals this near to the vertical belong to the ground, in each of `LEVEL_ROUNDS` rounds."""
 
 LEVEL_ROUNDS = 3
 MIN_LEVEL_POINTS = 50

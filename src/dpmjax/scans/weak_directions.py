@@ -18,25 +18,25 @@ from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 
+# Information without any plane: standard deviations of 10 m and 1 rad.
 UNKNOWN = np.diag(np.repeat([10.0**-2, 1.0**-2], 3))
-"""Information without any plane: standard deviations of 10 m and 1 rad."""
 
+# The pairs count as that many independent ones, for their residuals are correlated.
 NUM_INDEPENDENT = 200
-"""The pairs count as that many independent ones, for their residuals are correlated."""
 
 MIN_SIGMA_M = 0.01
 MIN_FACING_COSINE = 0.6
 
+# One normal of each voxel counts, so that many points of a near wall do not outweigh a far one.
 VOXEL_M = 1.0
-"""One normal of each voxel counts, so that many points of a near wall do not outweigh a far one."""
 
+# Walls are parallel to an axis if the cosine between their normal and the horizontal direction across it is larger.
+# Elements face the axis if the cosine between their normal and the axis is larger.
 PARALLEL_COSINE, FACING_COSINE = 0.9, 0.6
-"""Walls are parallel to an axis if the cosine between their normal and the horizontal direction across it is larger.
-Elements face the axis if the cosine between their normal and the axis is larger."""
 
 BIN_M, NUM_BINS, MAX_COUNT = 0.2, 301, 20.0
+# Elements nearer to each other along the axis have one position.
 POSITION_M = 0.5
-"""Elements nearer to each other along the axis have one position."""
 
 EXTENT_PERCENT, MAX_REACH_M = 90.0, 25.0
 

@@ -23,13 +23,13 @@ _KINDS, _KIND_SHARES = ("cupboard", "table", "picture", "shelf", "bench"), (0.26
 _Box = tuple[list[float], list[float], float]  # centre, half sizes, yaw
 # DeepMapping section 4.2: distance of places, angle between views, share of the steps that are moves instead of turns.
 _GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
+# Share of the turns with the opposite sign of the turn before.
 _REVERSAL_SHARE = 0.2
-"""Share of the turns with the opposite sign of the turn before."""
 
 _CLEARANCE_M, _FREE_CLEARANCE_M = 0.2, 0.1  # Places keep these distances from walls and furniture; after jitter.
 _FARTHEST_M = 6.0  # Deeper pixels are masked.
+# Walks that move and turn at once: share of the steps with a move, and with a turn; standard deviations.
 _BOTH_SHARE, _JITTER_M, _JITTER_DEG = 0.8, 0.05, 5.0
-"""Walks that move and turn at once: share of the steps with a move, and with a turn; standard deviations."""
 
 _MAX_WALKS = 1000
 
@@ -236,9 +236,9 @@ class DepthWalkConfig:
         require_fields(self, "dropout_share", low=0, high=1)
 
 
+# Walks for which a constant position exceeds the paper's threshold of 450 mm, with noise of a structured-light camera
+# (Khoshelham and Elberink 2012: 1.4 mm at one metre).
 HARD_WALK = DepthWalkConfig(depth_noise_m=0.0015, dropout_share=0.1, steps="both", min_spread_m=0.45)
-"""Walks for which a constant position exceeds the paper's threshold of 450 mm, with noise of a structured-light camera
-(Khoshelham and Elberink 2012: 1.4 mm at one metre)."""
 
 
 def simulate_depth_sequence(

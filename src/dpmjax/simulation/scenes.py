@@ -98,6 +98,7 @@ class Scene:
             raise ValueError("motion must be a WalkConfig in a building and a DriveConfig in a town")
 
 
+# Mixture for training: a third of the scenes are indoors, and some drives alternate between two lidars.
 TRAINING_MIXTURE = SceneMixture(
     kinds=(
         ("suburb", 0.19), ("canyon", 0.09), ("country", 0.08), ("car_park", 0.07), ("campus", 0.09), ("wood", 0.06),
@@ -110,7 +111,6 @@ TRAINING_MIXTURE = SceneMixture(
     ),
     other_lidar_rate=0.7,
 )  # fmt: skip
-"""Mixture for training: a third of the scenes are indoors, and some drives alternate between two lidars."""
 
 
 def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:

@@ -193,6 +193,7 @@ def _paint_outline(grid: BoolArray, centre: FloatArray, radius: float, waves: Fl
     grid[box] |= np.hypot(u, v) < np.interp(np.arctan2(v, u), turn, outline)
 
 
+# Builders of the kinds; the first three are those of numbers.
 _KINDS: dict[str, Callable[[BoolArray, np.random.Generator], None]] = {
     "office": _build_office,
     "yard": _build_yard,
@@ -200,4 +201,3 @@ _KINDS: dict[str, Callable[[BoolArray, np.random.Generator], None]] = {
     "grove": _build_grove,
     "crowd": _build_office,
 }
-"""Builders of the kinds; the first three are those of numbers."""

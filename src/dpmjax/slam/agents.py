@@ -26,11 +26,11 @@ from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
 
+# Three float32 numbers.
 BYTES_A_POINT = 12
-"""Three float32 numbers."""
 
+# Called with the number of keyframes that were compared, and with that of all to be compared.
 OnKeyframe = Callable[[int, int], None]
-"""Called with the number of keyframes that were compared, and with that of all to be compared."""
 
 
 class JoinedMaps(NamedTuple):

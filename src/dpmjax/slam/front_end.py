@@ -39,51 +39,49 @@ from dpmjax.slam.local_map import (
 )
 from dpmjax.types import AnyArray
 
+# Turn between keyframes at a smaller distance.
 KEYFRAME_RAD = 0.6
-"""Turn between keyframes at a smaller distance."""
 
+# Smallest accepted score.
 MIN_SCORE = 0.2
-"""Smallest accepted score."""
 
+# Smallest accepted share of the usual score.
 MIN_SCORE_SHARE = 0.4
-"""Smallest accepted share of the usual score."""
 
+# Number of motions that the decoder proposes.
 NUM_HYPOTHESES = 3
-"""Number of motions that the decoder proposes."""
 
+# Share of the usual score from which on no other start is tried.
 GOOD_SHARE = 0.85
-"""Share of the usual score from which on no other start is tried."""
 
+# Poses farther apart are of other places.
 NEAR_M = 2.0
-"""Poses farther apart are of other places."""
 
+# Largest turn between the decoder's motion and the pose that it confirms.
 NEAR_RAD = 0.087
-"""Largest turn between the decoder's motion and the pose that it confirms."""
 
+# Difference of the scores from which on the decoder's motion replaces another one.
 MIN_MARGIN = 0.1
-"""Difference of the scores from which on the decoder's motion replaces another one."""
 
+# Number of scans whose median is the usual score.
 USUAL_WINDOW = 20
-"""Number of scans whose median is the usual score."""
 
+# Standard deviation of a predicted translation.
 GUESS_M = 1.0
-"""Standard deviation of a predicted translation."""
 
+# Standard deviation of a predicted rotation.
 GUESS_RAD = 0.2
-"""Standard deviation of a predicted rotation."""
 
+# Standard deviation of a place that nothing is known of.
 UNKNOWN_M = 1000.0
-"""Standard deviation of a place that nothing is known of."""
 
 
+# How the pose of a scan was found.  "first": the scan starts the map, or a new part of a loaded one. "tracked":
+# geometry, from the predicted pose. "network": geometry failed there, and agreed from the network's pose, or both agree
+# on a pose of a low score. "predicted": nothing agreed, the pose is a guess: what geometry prefers, or the motion of
+# before. "empty": the scan has too few points. "restarted": nothing agreed for a while, a new part of the map begins
+# here, and loops may join it.
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
-"""How the pose of a scan was found.
-
-"first": the scan starts the map, or a new part of a loaded one. "tracked": geometry, from the predicted pose.
-"network": geometry failed there, and agreed from the network's pose, or both agree on a pose of a low score.
-"predicted": nothing agreed, the pose is a guess: what geometry prefers, or the motion of before. "empty": the scan has
-too few points. "restarted": nothing agreed for a while, a new part of the map begins here, and loops may join it.
-"""
 
 
 class ScanReport(NamedTuple):

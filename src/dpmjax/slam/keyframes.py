@@ -17,8 +17,8 @@ from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
 from dpmjax.slam.config import MapOrigin
 
+# Largest distance of the keyframes of a submap (DeepPointMap's published configuration).
 SUBMAP_RADIUS_M = 20.0
-"""Largest distance of the keyframes of a submap (DeepPointMap's published configuration)."""
 
 Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]

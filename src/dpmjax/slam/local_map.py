@@ -20,11 +20,11 @@ from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframes import KeyframeMap, Pose, nearest_in_graph, turn_rad
 from dpmjax.types import AnyArray
 
+# Smallest distance between the last scans, as a share of the extent.
 RECENT_SHARE = 0.08
-"""Smallest distance between the last scans, as a share of the extent."""
 
+# Turn from which on a scan joins the local map at a smaller distance.
 RECENT_RAD = 0.17
-"""Turn from which on a scan joins the local map at a smaller distance."""
 
 
 class PlacedElements(NamedTuple):

@@ -23,23 +23,23 @@ from dpmjax.slam.loops import scans_agree
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray
 
+# Largest sum of probabilities of a second place, as a share of that of the best one.
 MAX_RIVAL_SHARE = 0.5
-"""Largest sum of probabilities of a second place, as a share of that of the best one."""
 
+# Largest turn between registrations that agree.
 SAME_PLACE_RAD = 0.06
-"""Largest turn between registrations that agree."""
 
+# Largest distance between registrations that agree.
 SAME_PLACE_M = 1.5
-"""Largest distance between registrations that agree."""
 
+# Number of registrations at a time; the next ones follow only where the place is not clear.
 NUM_AT_ONCE = 2
-"""Number of registrations at a time; the next ones follow only where the place is not clear."""
 
+# Number of further keyframes near the best place that are registered.
 NUM_NEIGHBOURS = 2
-"""Number of further keyframes near the best place that are registered."""
 
+# A registration supports a place from this P(correct) on, if the scans agree.
 MIN_PROBABILITY = 0.2
-"""A registration supports a place from this P(correct) on, if the scans agree."""
 
 LocalizationStatus = Literal["found", "not in this map", "empty"]
 
@@ -160,8 +160,8 @@ def localize_each(
         yield _Search(methods, slam_map, config or LocalizationConfig()).localized(np.asarray(scan))
 
 
+# Registrations that agree, the most probable first.
 Place = tuple[KeyframeMatch, ...]
-"""Registrations that agree, the most probable first."""
 
 
 class _Search(NamedTuple):

@@ -11,23 +11,23 @@ from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.keyframes import KeyframeMap
 from dpmjax.slam.loops import Loop
 
+# Upper bound of the radius (DeepPointMap: 100 m).
 MAX_RADIUS_M = 100.0
-"""Upper bound of the radius (DeepPointMap: 100 m)."""
 
+# Smallest distance of a candidate along the path, in extents.
 MIN_PATH_SHARE = 4.0
-"""Smallest distance of a candidate along the path, in extents."""
 
+# Radius of the candidates by distance, in extents.
 RADIUS_SHARE = 1.5
-"""Radius of the candidates by distance, in extents."""
 
+# Share of the path since a candidate that is added to the radius.
 DRIFT_SHARE = 0.03
-"""Share of the path since a candidate that is added to the radius."""
 
+# Smallest similarity of a candidate by retrieval.
 MIN_COSINE = 0.8
-"""Smallest similarity of a candidate by retrieval."""
 
+# The mean of fewer vectors is no background.
 MIN_NUM_CENTRED = 20
-"""The mean of fewer vectors is no background."""
 
 
 def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[Loop]:

@@ -19,26 +19,26 @@ from dpmjax.slam.loop_candidates import find_loop_candidates, nearest_pairs
 from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, loop_status, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 
+# Overlap probability from which on no further candidate is looked at.
 SURE_OVERLAP = 0.9
-"""Overlap probability from which on no further candidate is looked at."""
 
+# Lower bound of the standard deviation of an aligned loop: scans hold walkers and motion.
 FLOOR_M = 0.05
-"""Lower bound of the standard deviation of an aligned loop: scans hold walkers and motion."""
 
+# Lower bound of the standard deviation of the rotation of an aligned loop.
 FLOOR_RAD = 0.005
-"""Lower bound of the standard deviation of the rotation of an aligned loop."""
 
+# Path after an accepted loop on which no other is looked for, in extents.
 REST_SHARE = 0.3
-"""Path after an accepted loop on which no other is looked for, in extents."""
 
+# Smallest number of keyframes between two optimisations.
 EVERY_KEYFRAMES = 8
-"""Smallest number of keyframes between two optimisations."""
 
+# Share of all keyframes between two optimisations: the cost of a scan does not grow with the map.
 EVERY_SHARE = 0.05
-"""Share of all keyframes between two optimisations: the cost of a scan does not grow with the map."""
 
+# Number of registrations after an optimisation.
 MAX_AGAIN = 4
-"""Number of registrations after an optimisation."""
 
 
 def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:

@@ -17,30 +17,31 @@ from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near
 
+# Largest share of points in free space.
 MAX_CONTRADICTED_SHARE = 0.1
-"""Largest share of points in free space."""
 
+# Smallest share of points that meet planes, where the scans verify a registration.
 MIN_MATCHED_SHARE = 0.35
-"""Smallest share of points that meet planes, where the scans verify a registration."""
 
+# Standard deviation of odometry over one metre; it grows with the root of the path.
 DRIFT_M = 0.05
-"""Standard deviation of odometry over one metre; it grows with the root of the path."""
 
+# Largest distance along the path between the ends of registrations that support each other.
 PENDING_PATH_M = 40.0
-"""Largest distance along the path between the ends of registrations that support each other."""
 
+# Standard deviation of the rotation of odometry over one metre.
 DRIFT_RAD = 0.004
-"""Standard deviation of the rotation of odometry over one metre."""
 
+# Number of standard deviations within which a cycle closes.
 CONSISTENT_SIGMAS = 3.0
-"""Number of standard deviations within which a cycle closes."""
 
+# Share of the path by which a loop may contradict odometry in any case.
 MIN_DRIFT_SHARE = 0.1
-"""Share of the path by which a loop may contradict odometry in any case."""
 
+# Largest number of accepted loops that are compared with a new one.
 MAX_WITNESSES = 6
-"""Largest number of accepted loops that are compared with a new one."""
 
+# What became of a loop candidate; all but "accepted" are reasons why it is no edge.
 LoopStatus = Literal[
     "not asked",
     "no overlap",
@@ -52,7 +53,6 @@ LoopStatus = Literal[
     "accepted",
     "taken back",
 ]
-"""What became of a loop candidate; all but "accepted" are reasons why it is no edge."""
 
 
 class Loop(NamedTuple):

@@ -17,20 +17,20 @@ from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, as_pose_graph, con
 from dpmjax.slam.loops import LoopState
 from dpmjax.types import AnyArray
 
+# Cost from which on the optimisation reduces the weight of a loop edge.
 OUTLIER_CHI2 = 25.0
-"""Cost from which on the optimisation reduces the weight of a loop edge."""
 
+# Smallest weight of a loop edge that stays after the optimisation.
 TAKEN_BACK_WEIGHT = 0.25
-"""Smallest weight of a loop edge that stays after the optimisation."""
 
+# Number of contradicting loops that would remove an edge of odometry.
 CERTAIN = 1e9
-"""Number of contradicting loops that would remove an edge of odometry."""
 
+# Number of keyframes of a window of the refinement, and of those that it shares with the next window.
 WINDOW, OVERLAP = 32, 8
-"""Number of keyframes of a window of the refinement, and of those that it shares with the next window."""
 
+# Called with the number of windows that are done and the number of all windows.
 OnWindow = Callable[[int, int], None]
-"""Called with the number of windows that are done and the number of all windows."""
 
 
 def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:

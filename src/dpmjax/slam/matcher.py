@@ -27,8 +27,8 @@ from dpmjax.slam.keyframes import Submap
 from dpmjax.slam.local_map import joined_surface, placed_keyframe
 from dpmjax.types import DescriptorCloud, Registration
 
+# Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart.
 ELEMENT_RADIUS_M = 2.0
-"""Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart."""
 
 
 class NetworkMatcher:

@@ -20,47 +20,47 @@ from dpmjax.slam.interfaces import Alignment, ThinnedScan, best_of
 from dpmjax.slam.keyframes import Pose, orthonormal
 from dpmjax.slam.local_map import LocalMap
 
+# Turns about the x and y axes among the further starts.
 TILTS_DEG = (-8.0, 8.0)
-"""Turns about the x and y axes among the further starts."""
 
+# Turns about the vertical among the further starts.
 TURNS_DEG = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
-"""Turns about the vertical among the further starts."""
 
+# A scan with fewer flat surface elements counts as empty.
 MIN_NUM_POINTS = 100
-"""A scan with fewer flat surface elements counts as empty."""
 
+# Number of surface elements that the score of a pose compares.
 NUM_SAMPLES = 1000
-"""Number of surface elements that the score of a pose compares."""
 
+# Weight of the share of points in free space in the score.
 CONTRADICTION_WEIGHT = 2.0
-"""Weight of the share of points in free space in the score."""
 
+# Factors of the predicted step among the other starts.
 STEP_FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-"""Factors of the predicted step among the other starts."""
 
+# Steps along the x axis of the lidar among the other starts, as shares of the extent.
 AHEAD_SHARES = (-0.08, 0.08, 0.16)
-"""Steps along the x axis of the lidar among the other starts, as shares of the extent."""
 
+# Lower bound of the standard deviation of a translation.
 FLOOR_M = 0.01
-"""Lower bound of the standard deviation of a translation."""
 
+# Lower bound of the standard deviation of a rotation.
 FLOOR_RAD = 0.001
-"""Lower bound of the standard deviation of a rotation."""
 
+# Number of elements of the local map that are compared with the free space of a scan.
 MAX_VIEWED = 4000
-"""Number of elements of the local map that are compared with the free space of a scan."""
 
+# Largest number of surface elements of a scan: rings of denser scans hold on to each other.
 MAX_ELEMENTS = 3000
-"""Largest number of surface elements of a scan: rings of denser scans hold on to each other."""
 
+# Scans of 1,000 points have neighbours farther away than others.
 NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
-"""Scans of 1,000 points have neighbours farther away than others."""
 
+# One element of each voxel of this size comes first: ground near the lidar is dense.
 SPREAD_M = 1.5
-"""One element of each voxel of this size comes first: ground near the lidar is dense."""
 
+# Number of starts of a search that are aligned finely.
 NUM_FINE = 3
-"""Number of starts of a search that are aligned finely."""
 
 
 class SurfaceGeometry:

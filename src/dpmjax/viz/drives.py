@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OURS, ODOMETRY, LOOP = "#1f4e8c", "#e08a1e", "#2a9d5c"
+# Heights above the lidar that the colours of maps span.
 HEIGHTS_M = (-2.5, 5.5)
-"""Heights above the lidar that the colours of maps span."""
 
 _ROOF_M = 1.0
 # Points and colours of the live viewer.

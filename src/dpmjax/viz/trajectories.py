@@ -130,13 +130,13 @@ def growth_figure(
     return figure
 
 
+# Colours of the agents, in turn.
 COLORS = ("#1f4e8c", "#d1495b", "#2a9d5c", "#e08a1e", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
-"""Colours of the agents, in turn."""
 
 GAP_IN, TITLE_IN, LEGEND_IN, DOTS_PER_IN = 0.2, 0.6, 0.8, 100
 
+# Least height of drawn points relative to the lidar, which excludes the ground.
 MIN_HEIGHT_M = -1.0
-"""Least height of drawn points relative to the lidar, which excludes the ground."""
 
 
 class AgentTrack(NamedTuple):

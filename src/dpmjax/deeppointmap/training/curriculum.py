@@ -20,18 +20,18 @@ from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
+# Probability that a group is one pair of scans, in every stage.
 PAIR_PROBABILITY = 0.34
-"""Probability that a group is one pair of scans, in every stage."""
 
+# Number of scans in the first and in the second map of a group.
 GroupShape = tuple[int, int]
-"""Number of scans in the first and in the second map of a group."""
 
+# The groups of one sample, small ones first.
 Layout = tuple[GroupShape, ...]
-"""The groups of one sample, small ones first."""
 
 NUM_LAYOUTS = 4
+# Its multiples, modulo 1, spread evenly however many there are.
 GOLDEN = 0.6180339887498949
-"""Its multiples, modulo 1, spread evenly however many there are."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,8 @@ class TrainingConfig:
         return replace(self, curriculum=stages, warmup_steps=warmup)
 
 
+# What DeepPointMap's Table 2 leaves out.
 TrainingPart = Literal["offset-head", "coarse-loss", "curriculum", "occlusion"]
-"""What DeepPointMap's Table 2 leaves out."""
 
 
 def without(config: TrainingConfig, part: TrainingPart) -> TrainingConfig:
@@ -206,8 +206,8 @@ def training_preset(name: Preset) -> TrainingConfig:
     return PRESETS[name]
 
 
+# For frames that turn with the scan: large motions put the origin of rays beside the lidar, tilts turn walls over.
 NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
-"""For frames that turn with the scan: large motions put the origin of rays beside the lidar, tilts turn walls over."""
 
 PRESETS = {
     "tiny": TrainingConfig(

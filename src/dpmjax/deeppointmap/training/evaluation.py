@@ -31,9 +31,10 @@ from dpmjax.types import AnyArray, DescriptorCloud, Registration
 TRAINED = ObjectiveConfig()
 
 PAIR_STREAM = 3103
+# A map of an evaluation holds scans so near to its first one.
 MAP_RADIUS_M = 10.0
-"""A map of an evaluation holds scans so near to its first one."""
 
+# Nothing but a random yaw.
 UPRIGHT = AugmentConfig(
     max_drop_ratio=0.0,
     sector_probability=0.0,
@@ -42,7 +43,6 @@ UPRIGHT = AugmentConfig(
     translation_sigma_m=0.0,
     jitter_sigma_m=0.0,
 )
-"""Nothing but a random yaw."""
 
 
 class PairKind(NamedTuple):

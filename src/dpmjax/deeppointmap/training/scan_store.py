@@ -32,8 +32,8 @@ LOGGER = logging.getLogger("dpmjax.training")
 PUBLISHED = SamplingConfig()
 
 VARIANT_STREAM = 3104
+# Raise it when the same scans and settings shall give other files.
 FORMAT = 2
-"""Raise it when the same scans and settings shall give other files."""
 
 
 class PreparedDrive(NamedTuple):

@@ -48,11 +48,11 @@ from dpmjax.geometry.pyramid_storage import moved_pyramid
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
+# Groups of about this many scans are decoded at the same time.
 GROUP_SCANS_AT_ONCE = 16
-"""Groups of about this many scans are decoded at the same time."""
 
+# Weight decay of AdamW.
 WEIGHT_DECAY = 1e-4
-"""Weight decay of AdamW."""
 
 
 @flax.struct.dataclass

@@ -40,8 +40,8 @@ class Crossing(NamedTuple):
     exit: Float[Array, "..."]
 
 
+# Finds where rays cross bodies of one kind.
 Cross = Callable[[Float[Array, "... 3"], Bodies], Crossing]
-"""Finds where rays cross bodies of one kind."""
 
 
 def cross_box(direction: Float[Array, "... 3"], box: Bodies) -> Crossing:

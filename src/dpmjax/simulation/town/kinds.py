@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+# Lowest and highest value of a uniform draw.
 Span = tuple[float, float]
-"""Lowest and highest value of a uniform draw."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,7 @@ _MARKETS = Quarter((16.0, 40.0), (30, 60), (20, 40), (6, 12), (15, 50), 0.45, 0.
 _MEADOW = Quarter((20.0, 40.0), (8, 20), (8, 14), (4, 8), (90, 200), 0.12, 0.15, 0.02, 0.2, 0.0, 0.3)
 _FOREST = Quarter((10.0, 20.0), (7, 12), (6, 10), (3, 6), (60, 150), 0.15, 0.1, 0.03, 2.0, 0.0, 2.0)
 
+# Kinds of place by name.
 KINDS: dict[str, Kind] = {
     "suburb": Kind(
         (_DETACHED, _ROWS, _PARK, _WORKSHOPS), (0.46, 0.26, 0.20, 0.08),
@@ -127,4 +128,3 @@ KINDS: dict[str, Kind] = {
         trees_per_ha=30.0, bushes_per_ha=30.0, cars_per_km=25.0, trucks=0.2, queues_per_km=14.0, bridges_per_km=0.4,
     ),
 }  # fmt: skip
-"""Kinds of place by name."""

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.sequences import FloatArray
 
 LANE_STEP_M = 2.0
+# Distance of the nodes of the ground.
 CELL_M = 0.5
-"""Distance of the nodes of the ground."""
 # Road users nearer to the sensor than this are left out, because the sensor's own car is there.
 _CLEARANCE_M = 4.0
 # Least and largest half length of cars. Shorter road users are people, longer ones are lorries: one box above the
@@ -25,8 +25,8 @@ _CLEARANCE_M = 4.0
 _CAR_LENGTH_M = (0.5, 2.9)
 
 
+# Kinds of surfaces.
 NOTHING, GROUND, SOLID, SOFT, POLE, MOVING = range(6)
-"""Kinds of surfaces."""
 
 
 class Bodies(NamedTuple):

@@ -13,8 +13,8 @@ import numpy as np
 
 from dpmjax.sequences import FloatArray
 
+# From the middle of a street to the middle of a lane.
 LANE_M = 1.7
-"""From the middle of a street to the middle of a lane."""
 _STEP_M = 0.5
 _CORNER_M = 4.0
 
