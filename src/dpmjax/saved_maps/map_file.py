@@ -78,13 +78,15 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
     if spacing_share != 0:
         slam_map = thin_map(slam_map, spacing_share=spacing_share)
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(content, "w") as archive:
         for name, array in map_arrays(slam_map, precision).items():
             # LZMA packs codes smaller by a sixth, slowly; a mask of equal values would look like a harmful archive.
             is_code = precision == "int8" and array.dtype != bool
             stored = io.BytesIO()
             np.save(stored, array, allow_pickle=False)
-            archive.writestr(f"{name}.npy", stored.getvalue(), zipfile.ZIP_LZMA if is_code else None)
+            # A `ZipInfo` has no time of writing: equal maps are equal files.
+            member = zipfile.ZipInfo(f"{name}.npy")
+            archive.writestr(member, stored.getvalue(), zipfile.ZIP_LZMA if is_code else zipfile.ZIP_DEFLATED)
     return content.getvalue()
 
 
