@@ -63,10 +63,8 @@ SCANS_2D = Group("2-D scans", (
         "scans_per_window": ("scans", "shorter windows if scans are far apart; None: one L-Net for the whole set"),
     }),
     Section("RefinementConfig", "dpmjax.registration2d", "`refine(scans, poses, config)`", {
-        "temporal": ("scans", "offsets of the neighbours in time"),
         "num_spatial": ("scans", "more neighbours in space: stiffer maps, slower"),
         "radius": ("typical ranges", "how far apart neighbours in space may be"),
-        "max_turn": ("rad", "smaller for scanners with a narrow field of view"),
         "loops": ("", "None: no search of loops"),
     }),
 ))  # fmt: skip

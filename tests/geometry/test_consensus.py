@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import ConsensusConfig, find_consensus, rigid
+from dpmjax.geometry.consensus import DISTINCT_M
 
 
 def pairs_with_outliers(seed: int, num_right: int, num_wrong: int, noise_m: float = 0.2) -> tuple[np.ndarray, ...]:
@@ -96,7 +97,7 @@ def test_near_equal_motions_are_suppressed() -> None:
     motions = np.asarray(found.T_target_source)[np.asarray(found.support) > 0]
     moved = np.einsum("hij,nj->hni", motions[:, :3, :3], source) + motions[:, None, :3, 3]
     apart = np.linalg.norm(moved[:, None] - moved[None], axis=-1).mean(axis=-1)
-    assert (apart[~np.eye(len(apart), dtype=bool)] > ConsensusConfig().distinct_m - 1e-3).all()
+    assert (apart[~np.eye(len(apart), dtype=bool)] > DISTINCT_M - 1e-3).all()
 
 
 def test_missing_motions_repeat_the_first_without_support() -> None:

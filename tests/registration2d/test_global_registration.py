@@ -17,6 +17,7 @@ from dpmjax.registration2d import GlobalConfig, PlanarScans, nearest_tour, plana
 from dpmjax.registration2d.global_registration import _Task, find_unregistered, place_others
 from dpmjax.registration2d.map_assembly import PoseScorer, add_up, assemble, move_blocks, weakest_cuts
 from dpmjax.registration2d.pair_search import (
+    APART,
     Candidates,
     CorrelativeConfig,
     Hypotheses,
@@ -91,8 +92,8 @@ def test_candidates_of_a_pair_are_different_poses(profiles, found) -> None:
     poses = np.where(np.isfinite(found.scores)[..., None], found.poses, np.nan)
     for first, second in ((0, 1), (0, 2), (1, 2)):
         off = poses[:, first] - poses[:, second]
-        is_near = np.hypot(off[:, 0], off[:, 1]) < COARSE.apart[0] * profiles.scans.typical_range
-        assert not (is_near & (np.abs(se2.wrap_angle(off[:, 2])) < COARSE.apart[1])).any()
+        is_near = np.hypot(off[:, 0], off[:, 1]) < APART * profiles.scans.typical_range
+        assert not (is_near & (np.abs(se2.wrap_angle(off[:, 2])) < APART)).any()
 
 
 def test_only_the_given_turns_are_searched(profiles) -> None:

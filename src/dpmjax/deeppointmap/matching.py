@@ -21,7 +21,7 @@ from dpmjax.checks import as_float, require_fields, require_positive_fields, req
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.bearing import directions_of, turned_directions
-from dpmjax.geometry.consensus import ConsensusConfig, find_consensus, motion_support
+from dpmjax.geometry.consensus import INLIER_M, ConsensusConfig, find_consensus, motion_support
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray, DescriptorCloud, Registration
 
@@ -254,7 +254,7 @@ def _first_inliers(pairs: _PointPairs, config: MatchConfig) -> Bool[Array, "h p"
     half = len(source) // 2
     consensus = find_consensus(source[:half], target[:half], is_used[:half], config=config.consensus)
     moved = jax.vmap(lambda T: rigid.transform_points(T, source))(consensus.T_target_source)
-    is_near = jnp.sum((moved - target) ** 2, axis=2) < config.consensus.inlier_m**2
+    is_near = jnp.sum((moved - target) ** 2, axis=2) < INLIER_M**2
     is_motion = (consensus.support > 0).at[0].set(True)
     return is_used & is_near & is_motion[:, None]
 

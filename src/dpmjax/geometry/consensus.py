@@ -23,6 +23,14 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.types import AnyArray
 
+# A pair farther apart than this under a motion does not support it, metres.
+INLIER_M = 2.0
+# Number of pairs that support each pair.
+NUM_PARTNERS = 8
+# Of two motions that put the source points nearer to each other than this, on average, only the one with more support
+# is returned, metres.
+DISTINCT_M = 2.0
+
 
 @dataclass(frozen=True)
 class ConsensusConfig:
@@ -31,27 +39,19 @@ class ConsensusConfig:
     Attributes:
         agreement_m: two pairs agree if the distances between their points differ by less than this on the two sides.
             Points nearer to each other than this, on either side, are not compared.
-        inlier_m: a pair farther apart than this under a motion does not support it.
         num_seeds: how many pairs propose a motion.
-        num_partners: number of pairs that support each pair.
         num_rounds: how often a motion is fitted again to what supports it.
         num_motions: how many motions are returned.
-        distinct_m: of two motions that put the source points nearer to each other than this, on average, only the one
-            with more support is returned.
     """
 
     agreement_m: float = 1.0
-    inlier_m: float = 2.0
     num_seeds: int = 128
-    num_partners: int = 8
     num_rounds: int = 5
     num_motions: int = 24
-    distinct_m: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("agreement_m", "inlier_m", "distinct_m"):
-            require_positive(name, getattr(self, name))
-        for name in ("num_seeds", "num_partners", "num_rounds", "num_motions"):
+        require_positive("agreement_m", self.agreement_m)
+        for name in ("num_seeds", "num_rounds", "num_motions"):
             require_count(name, getattr(self, name))
 
 
@@ -61,8 +61,8 @@ class Consensus:
 
     Attributes:
         T_target_source: the motions; where there are fewer, the first is repeated with support 0.
-        is_inlier: which pairs are nearer than `inlier_m` under each.
-        support: sum of 1 - error / inlier_m over the inliers; pairs of nearly the same points count as one. Only the
+        is_inlier: which pairs are nearer than `INLIER_M` under each.
+        support: sum of 1 - error / INLIER_M over the inliers; pairs of nearly the same points count as one. Only the
             caller can estimate the support that arises by chance.
     """
 
@@ -112,21 +112,21 @@ def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, co
     _, seeds = lax.top_k(jnp.sum(agreement, axis=1), min(config.num_seeds, len(source)))
 
     def propose(seed: Int[Array, ""]) -> tuple[Array, Array]:
-        strength, partners = lax.top_k(agreement[seed], min(config.num_partners, len(source)))
+        strength, partners = lax.top_k(agreement[seed], min(NUM_PARTNERS, len(source)))
         weights = jnp.zeros(len(source)).at[partners].set(jnp.where(strength > 0, 1.0, 0.0)).at[seed].set(1.0)
         weights = jnp.where(mask, weights, 0)
         T = lax.fori_loop(
             0,
             config.num_rounds,
-            lambda _, T: _refitted(source, target, worth * _closeness(T, source, target, config), T),
+            lambda _, T: _refitted(source, target, worth * _closeness(T, source, target), T),
             weighted_svd(source, target, weights),
         )
-        return T, jnp.sum(worth * _closeness(T, source, target, config))
+        return T, jnp.sum(worth * _closeness(T, source, target))
 
     motions, supports = jax.vmap(propose)(seeds)
     chosen, supports = _distinct(motions, supports, source, mask, config)
     motions = motions[chosen]
-    closeness = jax.vmap(lambda T: _closeness(T, source, target, config))(motions)
+    closeness = jax.vmap(lambda T: _closeness(T, source, target))(motions)
     return Consensus(motions, mask & (closeness > 0) & (supports > 0)[:, None], supports)
 
 
@@ -146,7 +146,7 @@ def _distinct(
         best = jnp.argmax(remaining)
         support = remaining[best]
         apart = jnp.sqrt(jnp.sum((moved - moved[best]) ** 2, axis=2))
-        is_same = jnp.sum(jnp.where(mask, apart, 0), axis=1) <= config.distinct_m * jnp.sum(mask)
+        is_same = jnp.sum(jnp.where(mask, apart, 0), axis=1) <= DISTINCT_M * jnp.sum(mask)
         return jnp.where(is_same, 0, remaining), (jnp.where(support > 0, best, first), support)
 
     _, (rows, kept) = lax.scan(pick, supports, None, length=config.num_motions)
@@ -174,7 +174,7 @@ def motion_support(
         The support.
     """
     worth = _worth(_distances(source), _distances(target), mask, config)
-    return jnp.sum(worth * _closeness(T_target_source, source, target, config))
+    return jnp.sum(worth * _closeness(T_target_source, source, target))
 
 
 def _second_order(
@@ -205,12 +205,10 @@ def _distances(points: Float[Array, "k 3"]) -> Float[Array, "k k"]:
     return jnp.sqrt(squared[0] + squared[1] + squared[2])
 
 
-def _closeness(
-    T: Float[Array, "4 4"], source: Float[Array, "k 3"], target: Float[Array, "k 3"], config: ConsensusConfig
-) -> Float[Array, " k"]:
-    """Returns 1 for a pair that meets under the motion, falling to 0 at `inlier_m`."""
+def _closeness(T: Float[Array, "4 4"], source: Float[Array, "k 3"], target: Float[Array, "k 3"]) -> Float[Array, " k"]:
+    """Returns 1 for a pair that meets under the motion, falling to 0 at `INLIER_M`."""
     errors = jnp.sqrt(jnp.sum((rigid.transform_points(T, source) - target) ** 2, axis=1))
-    return jnp.maximum(1 - errors / config.inlier_m, 0)
+    return jnp.maximum(1 - errors / INLIER_M, 0)
 
 
 def _refitted(

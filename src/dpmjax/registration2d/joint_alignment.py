@@ -35,6 +35,8 @@ _PAIRS_ROUNDED = 1024
 _ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
 # Gauss-Newton steps that restore unconstrained directions after the adjustment to lines.
 _NUM_RESTORATIONS = 3
+# Offsets of the neighbours in time, of ordered scans; largest difference of heading of neighbours in space, radians.
+_TEMPORAL, _MAX_TURN = (1, 2, 3), 2.0
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
@@ -43,17 +45,13 @@ class JointAlignmentConfig:
     """Settings of the joint alignment. Lengths are in typical ranges of the scans.
 
     Attributes:
-        temporal: offsets of the neighbours in time; only of ordered scans.
         num_spatial: largest number of neighbours in space, each from another visit.
         radius: largest distance of neighbours in space.
-        max_turn: largest difference of heading of two neighbours in space, radians.
         refresh: number of rounds after which the neighbours are chosen anew.
     """
 
-    temporal: tuple[int, ...] = (1, 2, 3)
     num_spatial: int = 8
     radius: float = 0.6
-    max_turn: float = 2.0
     refresh: int = 4
 
 
@@ -148,7 +146,7 @@ def _choose_aligned(
         return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
     slides = slide_steps(profiles, later, later - 1, steps, prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
-    is_kept = (crossed[source] == crossed[target]) | (source - target > max(config.temporal, default=0))
+    is_kept = (crossed[source] == crossed[target]) | (source - target > max(_TEMPORAL))
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
     across = open_projections(slide_steps(profiles, source, target, relative), relative)
@@ -178,7 +176,7 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
 def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig) -> tuple[Indices, Indices]:
     """Returns pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
     num_scans = len(poses)
-    temporal = config.temporal if scans.is_ordered else ()
+    temporal = _TEMPORAL if scans.is_ordered else ()
     source = [np.arange(k, num_scans) for k in temporal]
     target = [np.arange(num_scans - k) for k in temporal]
     tree = scipy.spatial.cKDTree(poses[:, :2])
@@ -190,7 +188,7 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig
     for scan in range(num_scans):
         near = rows[scan][np.isfinite(distances[scan])]
         near = near[(np.abs(near - scan) > apart)]
-        near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < config.max_turn]
+        near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < _MAX_TURN]
         chosen: list[int] = []
         while len(near) and len(chosen) < config.num_spatial:
             chosen.append(int(near[0]))

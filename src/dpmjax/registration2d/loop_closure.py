@@ -31,6 +31,8 @@ _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations
 _BATCH = 512
 # Two views that overlap well are nearer than twice this, in typical ranges, in addition to the drift.
 _NEARBY = 0.15
+# Largest distance of a candidate, in typical ranges.
+_MAX_RADIUS = 2.25
 # Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
 # Least robust share of matched beams, and largest share of beams that contradict their partner scan.
@@ -51,14 +53,12 @@ class LoopConfig:
     Attributes:
         num_rounds: number of searches, each from the corrected poses of the search before.
         drift: error of a relative pose as a share of the distance travelled; it bounds the search for loops.
-        max_radius: largest distance of a candidate.
         min_way: least distance travelled between the two scans of a loop.
         max_candidates: largest number of pairs in a round.
     """
 
     num_rounds: int = 3
     drift: float = 0.05
-    max_radius: float = 2.25
     min_way: float = 2.25
     max_candidates: int = 2000
 
@@ -127,7 +127,7 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
 def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
     """Finds pairs of scans that may overlap: a later one (source) and an earlier one (target)."""
     way, nearby = _way_along(poses), 2.0 * _NEARBY * typical_range
-    radius = min(config.max_radius * typical_range, nearby + config.drift * way[-1])
+    radius = min(_MAX_RADIUS * typical_range, nearby + config.drift * way[-1])
     first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
     apart = way[second] - way[first]
     distance = np.hypot(*(poses[second, :2] - poses[first, :2]).T)

@@ -33,6 +33,10 @@ AGREEMENT = (0.06, 0.1)
 _MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
 # Pairs that are searched at a time: their spectra and images take at most 250 MB at 128 cells.
 _SEARCH_BATCH = 512
+# Weight of a cell of free space relative to a cell of surface.
+_FREE_WEIGHT = 0.6
+# Least difference of two candidates of a pair: typical ranges, and radians.
+APART = 0.12
 # Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 2.0
 
@@ -45,11 +49,9 @@ class CorrelativeConfig:
         num_cells: number of cells along a side of the images; a scan fills the inner half, so that no shift wraps.
         cell: side of a cell.
         num_turns: number of turns in a circle.
-        free_weight: weight of a cell of free space relative to a cell of surface.
         num_peaks: number of shifts kept for each turn, from different blocks of cells.
         block: number of cells along a block.
         num_candidates: number of poses kept for each pair.
-        apart: least difference of two candidates of a pair: translation, radians.
         num_levels: number of local grids, each with half the spacing of the one before.
         max_shift: largest shift; None: half the side of the images.
     """
@@ -57,11 +59,9 @@ class CorrelativeConfig:
     num_cells: int = 128
     cell: float = 0.045
     num_turns: int = 120
-    free_weight: float = 0.6
     num_peaks: int = 4
     block: int = 16
     num_candidates: int = 4
-    apart: tuple[float, float] = (0.12, 0.12)
     num_levels: int = 4
     max_shift: float | None = None
 
@@ -169,7 +169,7 @@ def _spectra(
     off = (distance - profiles.surface[:, k]) * slant
     hit = jnp.where(usable, jnp.exp(-0.5 * (off / (0.6 * cell)) ** 2), 0.0)
     is_free = usable & (distance < profiles.near[:, k] - cell / slant)
-    evidence = hit - jnp.where(is_free, config.free_weight, 0.0)
+    evidence = hit - jnp.where(is_free, _FREE_WEIGHT, 0.0)
     # Scans fill the inner half alone, and drawing takes longer than the transform.
     margin = (config.num_cells - inner) // 2
     images = jnp.pad(jnp.stack([hit, evidence]), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
@@ -283,8 +283,8 @@ def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: flo
         first = scores.argmax(axis=1)
         best[:, k], values[:, k] = poses[rows, first], scores[rows, first]
         off = poses - best[:, k][:, None]
-        is_near = np.hypot(off[..., 0], off[..., 1]) < config.apart[0] * typical_range
-        scores[is_near & (np.abs(se2.wrap_angle(off[..., 2])) < config.apart[1])] = -np.inf
+        is_near = np.hypot(off[..., 0], off[..., 1]) < APART * typical_range
+        scores[is_near & (np.abs(se2.wrap_angle(off[..., 2])) < APART)] = -np.inf
     return found._replace(poses=best, scores=values)
 
 

@@ -10,7 +10,6 @@ with the next scan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -51,27 +50,14 @@ _SAME = (0.02, 0.02)
 _NUM_SAME, _SAME_SHAPE = 4, (0.05, 0.05)
 # Score of a scan that is left out; and of one at the pose of the scan before it, after too many were left out.
 _LEFT_OUT, _GUESSED = 0.05, -1.0
+# Number of sequences that are kept from scan to scan, and of the last placed scans that a scan is compared with.
+_NUM_SEQUENCES, _NUM_COMPARED = 6, 8
+# Search of steps that are not clear.
+_SEARCH = CorrelativeConfig(max_shift=0.9, block=8, num_peaks=6, num_candidates=8, num_levels=3)
 # Weight of the motion prior.
 _PRIOR_WEIGHT = 0.1
 # Number of hypotheses of a step that are kept of the alignments from arcs.
 _NUM_ARCS = 3
-
-
-@dataclass(frozen=True)
-class SequenceConfig:
-    """Settings of the sequence search.
-
-    Attributes:
-        num_sequences: number of sequences of poses that are kept from scan to scan.
-        num_compared: number of the last placed scans that a scan is compared with.
-        search: settings of the search of steps that are not clear.
-    """
-
-    num_sequences: int = 6
-    num_compared: int = 8
-    search: CorrelativeConfig = field(
-        default_factory=lambda: CorrelativeConfig(max_shift=0.9, block=8, num_peaks=6, num_candidates=8, num_levels=3)
-    )
 
 
 class SequenceResult(NamedTuple):
@@ -95,28 +81,27 @@ class StepHypotheses(NamedTuple):
     scores: Floats
 
 
-def search_sequence(scans: PlanarScans, steps: PairMatches, config: SequenceConfig | None = None) -> SequenceResult:
+def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
     """Finds the poses of scans in time order.
 
     Args:
         scans: n scans.
         steps: the n - 1 steps T_scan_next that an ICP has found.
-        config: settings.
 
     Returns:
         SequenceResult.
     """
-    config, rows = config or SequenceConfig(), distinct_rows(scans)
+    rows = distinct_rows(scans)
     some, profiles = scans.take(rows), make_profiles(scans.take(rows))
     # The scans between two of these rows are the first of the two.
     matched = PairMatches(*(x[rows[1:] - 1] for x in steps))
-    hypotheses = _find_hypotheses(some, profiles, matched, config)
+    hypotheses = _find_hypotheses(some, profiles, matched)
     is_clear = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
     prior = MotionPrior.of(hypotheses.poses[is_clear], scans.typical_range)
-    found = _Beam(profiles, hypotheses, prior, config).run()
+    found = _Beam(profiles, hypotheses, prior).run()
     kept = np.flatnonzero(found.is_registered)
     kept = kept[~_is_alone(weak_steps(profiles, found.poses, kept))]
-    poses = join_parts(profiles, found.poses, kept, prior, config.search)
+    poses = join_parts(profiles, found.poses, kept, prior, _SEARCH)
     is_registered = np.zeros(len(scans), bool)
     is_registered[rows[kept]] = True
     return SequenceResult(interpolate(len(scans), rows[kept], poses[kept]), is_registered)
@@ -128,9 +113,7 @@ def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
 
 
-def _find_hypotheses(
-    scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches, config: SequenceConfig
-) -> StepHypotheses:
+def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches) -> StepHypotheses:
     """Returns the steps, and candidates of a search for steps that are not clear."""
     num_scans = len(scans)
     later = np.arange(1, num_scans)
@@ -156,7 +139,7 @@ def _find_hypotheses(
         searched |= pairs
         if not len(new):
             break
-        found.append(_search(scans, profiles, new, config))
+        found.append(_search(scans, profiles, new))
         # A step is as good as the best hypothesis across it.
         for source, target, score in zip(found[-1].source, found[-1].target, found[-1].scores, strict=True):
             across = slice(target, source)
@@ -167,14 +150,12 @@ def _find_hypotheses(
     return StepHypotheses(source[order], target[order], poses[order], scores[order])
 
 
-def _search(
-    scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64], config: SequenceConfig
-) -> StepHypotheses:
+def _search(scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64]) -> StepHypotheses:
     """Finds candidates of pairs (p, 2), each aligned by ICP where the score does not fall."""
     source, target = pairs.T.copy()
-    turn = se2.wrap_angle(2 * np.pi * np.arange(config.search.num_turns) / config.search.num_turns)
+    turn = se2.wrap_angle(2 * np.pi * np.arange(_SEARCH.num_turns) / _SEARCH.num_turns)
     turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
-    found = search_pairs(profiles, source, target, config.search, turns=turns)
+    found = search_pairs(profiles, source, target, _SEARCH, turns=turns)
     row, column = np.nonzero(np.isfinite(found.scores))
     source, target, poses = source[row], target[row], found.poses[row, column]
     aligned = match_pairs(scans.take(source), scans.take(target), poses[:, None], FINE).poses
@@ -214,7 +195,7 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     source, poses, scores = source[chosen], poses[chosen], scores[chosen]
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score.
     near = Candidates(source, source - 1, poses[:, None], scores[:, None])
-    shifted = refine_candidates(profiles, near, SequenceConfig().search).poses[:, 0]
+    shifted = refine_candidates(profiles, near, _SEARCH).poses[:, 0]
     after = pair_scores(profiles, source, source - 1, shifted)
     better = after > scores
     return StepHypotheses(source, source - 1, np.where(better[:, None], shifted, poses), np.maximum(scores, after))
@@ -254,11 +235,9 @@ class _Ways(NamedTuple):
 class _Beam:
     """The beam search over the hypotheses of a sequence."""
 
-    def __init__(
-        self, profiles: RangeProfiles, hypotheses: StepHypotheses, prior: MotionPrior, config: SequenceConfig
-    ) -> None:
-        self.profiles, self.hypotheses, self.prior, self.config = profiles, hypotheses, prior, config
-        self.unit, self.width = profiles.scans.typical_range, config.num_compared + _BAD_SPAN
+    def __init__(self, profiles: RangeProfiles, hypotheses: StepHypotheses, prior: MotionPrior) -> None:
+        self.profiles, self.hypotheses, self.prior = profiles, hypotheses, prior
+        self.unit, self.width = profiles.scans.typical_range, _NUM_COMPARED + _BAD_SPAN
         self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
 
     def run(self) -> SequenceResult:
@@ -290,7 +269,7 @@ class _Beam:
         order = np.argsort(-total, kind="stable")
         chosen: list[int] = []
         for row in order.tolist():
-            if len(chosen) == self.config.num_sequences:
+            if len(chosen) == _NUM_SEQUENCES:
                 break
             if not any(self.is_same(now, ways, row, other) for other in chosen):
                 chosen.append(row)
@@ -333,7 +312,7 @@ class _Beam:
     def score(self, now: _Sequences, scan: int, parent: Indices, pose: Floats) -> Floats:
         """Computes the agreement (m,) of a scan with the last placed scans, less the weighted motion prior."""
         rank = np.cumsum(now.is_placed[:, ::-1], axis=1)[:, ::-1]
-        is_used = (now.is_placed & (rank <= self.config.num_compared))[parent]
+        is_used = (now.is_placed & (rank <= _NUM_COMPARED))[parent]
         placed = now.poses[parent]
         relative = np.asarray(se2.relative(placed, np.broadcast_to(pose[:, None], placed.shape)))
         row, column = np.nonzero(is_used)
