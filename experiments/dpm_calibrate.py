@@ -19,16 +19,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, encode, load_model, register, save_model, simulation, viz
+from dpmjax import DescriptorCloud, cli, encode, load_model, register, save_model, simulation, viz
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import area_under_curve, brier_score, registration_recall
 from dpmjax.simulation import HDL32E, OS1_64, VLP16, SceneMixture, draw_scene, simulate_scene
+from dpmjax.slam import most_similar, pooled_vector
 from dpmjax.weights import read_card
 
 EXPERIMENT = "dpm_calibrate"
@@ -228,36 +229,59 @@ def measure_pairs(
     return found
 
 
-def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:
-    """Returns evidence and distance of the pairs of a town.
+class TownPairs(NamedTuple):
+    """Pairs of scans, their distances in metres, and whether they are hard: far apart, but similar by retrieval."""
+
+    sources: list[DescriptorCloud]
+    targets: list[DescriptorCloud]
+    distances_m: np.ndarray
+    is_hard: np.ndarray
+
+
+def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> TownPairs:
+    """Returns encoded pairs of a town.
 
     Half of the pairs are less than 20 m apart, a quarter 20 to 40 m, an eighth farther; an eighth has one scan of
-    another town.
+    another town. A quarter more are hard: a scan, and the most similar one by retrieval that is at least 20 m away.
 
     Args:
         model: encoder and decoder.
         drives: drives through the town, and through a second one.
-        num_pairs: number of pairs, about.
+        num_pairs: number of pairs without the hard ones, about.
         seed: seed of the run.
     """
     rng = np.random.default_rng([TOWN_STREAM, seed])
     rows = [_spread(len(drive), num) for drive, num in zip(drives, (NUM_SCANS, NUM_OTHER_SCANS), strict=True)]
     own, other = (dpm.encode_turned(model, drive, some, rng=rng) for drive, some in zip(drives, rows, strict=True))
+    clouds = [cloud.described for cloud in (*own, *other)]
     distances = dpm.scan_distances(drives[0])[np.ix_(rows[0], rows[0])]
+    distances = np.pad(distances, [(0, 0), (0, len(other))], constant_values=np.inf)
     kinds = (
         (distances < dpm.OVERLAP_M) & (distances > 0),
         (distances >= dpm.OVERLAP_M) & (distances < dpm.NO_OVERLAP_M),
-        distances >= dpm.NO_OVERLAP_M,
+        (distances >= dpm.NO_OVERLAP_M) & (distances < np.inf),
+        distances == np.inf,
     )
-    drawn: list[tuple[Any, Any, float]] = []
-    for kind, share in zip(kinds, (2, 4, 8), strict=True):
-        for a, b in dpm.draw_rows(np.argwhere(kind), num_pairs // share, rng):
-            drawn.append((own[a], own[b], float(distances[a, b])))
-    for a, b in dpm.draw_rows(np.argwhere(np.ones((len(own), len(other)))), num_pairs // 8, rng):
-        drawn.append((own[a], other[b], float("inf")))
-    sources, targets, metres = zip(*drawn, strict=True)
-    evidence = np.asarray(dpm.evidence_pairs(model, list(sources), list(targets)))
-    return {"evidence": evidence.tolist(), "is_overlap": [distance < dpm.OVERLAP_M for distance in metres]}
+    shares = (2, 4, 8, 8)
+    drawn = [dpm.draw_rows(np.argwhere(kind), num_pairs // n, rng) for kind, n in zip(kinds, shares, strict=True)]
+    vectors = np.stack([pooled_vector(cloud) for cloud in clouds])
+    hard = [
+        (row, int(similar[0]))
+        for row in range(len(own))
+        if len(similar := most_similar(vectors, vectors[row], 1, is_allowed=distances[row] >= dpm.OVERLAP_M)[0])
+    ]
+    drawn.append(dpm.draw_rows(np.array(hard, int).reshape(-1, 2), num_pairs // 4, rng))
+    pairs = np.concatenate(drawn)
+    sources, targets = ([clouds[row] for row in side] for side in pairs.T)
+    return TownPairs(sources, targets, distances[tuple(pairs.T)], np.arange(len(pairs)) >= len(pairs) - len(drawn[-1]))
+
+
+def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:
+    """Returns evidence and labels of the pairs of a town, without the hard ones; see `town_pairs`."""
+    pairs = town_pairs(model, drives, num_pairs, seed)
+    num = int(np.sum(~pairs.is_hard))
+    evidence = np.asarray(dpm.evidence_pairs(model, pairs.sources[:num], pairs.targets[:num]))
+    return {"evidence": evidence.tolist(), "is_overlap": (pairs.distances_m[:num] < dpm.OVERLAP_M).tolist()}
 
 
 def fit_overlap(rows: Sequence[dict[str, Any]]) -> tuple[dpm.LogisticModel, dict[str, Any], dict[str, np.ndarray]]:

@@ -42,6 +42,7 @@ from .scan_evaluation import StageSeconds as StageSeconds
 from .scan_evaluation import encode_turned as encode_turned
 from .scan_evaluation import evaluate_overlap as evaluate_overlap
 from .scan_evaluation import evaluate_scan_pairs as evaluate_scan_pairs
+from .scan_evaluation import overlap_candidates as overlap_candidates
 from .scan_evaluation import register_in_stages as register_in_stages
 from .scan_pairs import DISTANCE_BANDS_M as DISTANCE_BANDS_M
 from .scan_pairs import ScanPair as ScanPair

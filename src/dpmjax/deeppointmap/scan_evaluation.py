@@ -225,7 +225,7 @@ def evaluate_overlap(
     Raises:
         ValueError: if the drive has no poses, or a scan cannot be read.
     """
-    near, far, has_revisits = _candidates(drive)
+    near, far, has_revisits = overlap_candidates(drive)
     rng = np.random.default_rng([REVISIT_STREAM, seed])
     if min(len(near), len(far)) == 0:
         return OverlapEvaluation(np.zeros(0), np.zeros(0, bool), has_revisits)
@@ -269,8 +269,19 @@ def encode_turned(
     return clouds
 
 
-def _candidates(drive: LidarSequence) -> tuple[Int[np.ndarray, "k 2"], Int[np.ndarray, "l 2"], bool]:
-    """Returns near pairs, far pairs, and whether the near ones are revisits."""
+def overlap_candidates(drive: LidarSequence) -> tuple[Int[np.ndarray, "k 2"], Int[np.ndarray, "l 2"], bool]:
+    """Finds all pairs of a drive that overlap, and all that surely do not.
+
+    Args:
+        drive: scans with true poses.
+
+    Returns:
+        Pairs nearer than 20 m, which are revisits if there are some; pairs farther than 40 m; whether there are
+        revisits.
+
+    Raises:
+        ValueError: if the drive has no poses.
+    """
     distances = scan_distances(drive)
     steps = np.linalg.norm(np.diff(true_poses(drive)[:, :3, 3], axis=0), axis=1)
     path = np.concatenate([[0], np.cumsum(steps)])

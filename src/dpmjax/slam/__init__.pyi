@@ -29,11 +29,13 @@ from .localization import Localization as Localization
 from .localization import LocalizationConfig as LocalizationConfig
 from .localization import localize as localize
 from .localization import localize_each as localize_each
+from .loop_candidates import most_similar as most_similar
 from .loops import Loop as Loop
 from .map_optimization import RefinedKeyframes as RefinedKeyframes
 from .map_optimization import refine_keyframes as refine_keyframes
 from .map_thinning import thin_map as thin_map
 from .matcher import NetworkMatcher as NetworkMatcher
+from .matcher import pooled_vector as pooled_vector
 from .odometry import SurfaceGeometry as SurfaceGeometry
 from .system import SlamResult as SlamResult
 from .system import SlamState as SlamState
