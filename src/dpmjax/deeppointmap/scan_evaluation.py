@@ -35,7 +35,7 @@ Seconds = float | Float[np.ndarray, " p"]
 # Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out.
 NO_OVERLAP_M = 40.0
 
-# Scans seen again after so many metres of driving are revisits.
+# A revisit is at least this distance of driving after the first visit, metres.
 REVISIT_PATH_M = 100.0
 
 REVISIT_STREAM = 4133

@@ -15,10 +15,10 @@ from dpmjax.checks import as_float, as_mask, as_points, require_positive, requir
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
 
-# A covariance whose determinant is so many epsilons of that of a ball of the same size counts as not invertible.
+# Largest determinant of a covariance that is not invertible, in epsilons of that of a ball of the same size.
 SINGULAR_IN_EPS = 8
 
-# A spread of residuals that is so many epsilons of their length is rounding: they are all the same.
+# Largest spread of equal residuals by rounding, in epsilons of their length.
 ROUNDING_IN_EPS = 64
 
 

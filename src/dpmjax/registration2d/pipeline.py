@@ -102,7 +102,7 @@ class RegistrationHooks(NamedTuple):
     """Functions that `register_scans` calls.
 
     Attributes:
-        on_progress: called with the name of a stage and the share of it that is done: 0 where the stage begins, after
+        on_progress: called with the name of a stage and the share of it that is done, where the stage begins, after
             each call of the step of the fit, and after the parts of a refinement.
         stop: called before each stage that may be left out and before each call of the step of the fit. Where it
             returns True, the fit ends, and the best of the candidates so far is kept.

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.types import AnyArray
 
-# By so much the beams of KITTI's HDL-64E point higher than its points say (KISS-ICP corrects it by the same angle).
+# Elevation of the beams of KITTI's HDL-64E above that of its points (KISS-ICP corrects it by the same angle).
 KITTI_ELEVATION_DEG = 0.205
 
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)

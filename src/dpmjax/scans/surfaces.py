@@ -22,7 +22,7 @@ from dpmjax.types import SurfaceElements
 # A normal needs this many neighbours, the point itself among them.
 MIN_NEIGHBOURS = 4
 
-# Points by which the density of a scan is judged.
+# Number of points whose neighbours measure the density of a scan.
 NUM_PROBED = 200
 
 # Less flat neighbourhoods are no part of a surface: foliage, wires, edges.
