@@ -8,6 +8,7 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.registration2d import assess_trajectory, choose_trajectory, planar_scans, quality
 from dpmjax.registration2d.quality import map_code_length, view_misfit
+from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.simulation import scan_world, simulate_sequence
 
 
@@ -120,6 +121,17 @@ def test_a_torn_map_is_not_trusted(sparse, shift) -> None:
     poses = sequence.reference_poses.copy()
     poses[len(poses) // 2 :] += shift
     assert not assess_trajectory(scans, poses).is_trusted
+
+
+@pytest.mark.parametrize(("num_lost", "is_trusted"), [(2, True), (3, False)])
+def test_a_way_that_is_lost_is_not_trusted(num_lost: int, is_trusted: bool) -> None:
+    sequence = simulate_sequence(0, 41, seed=1)
+    scans, poses = planar_scans(sequence.points, sequence.mask), sequence.reference_poses.copy()
+    prior = StepPrior.of_poses(poses, scans.typical_range)
+    poses[20 : 20 + num_lost, 0] += 1e4 * np.arange(1, 1 + num_lost)
+    found = assess_trajectory(scans, poses, prior=prior)
+    assert found.is_trusted == is_trusted
+    assert found.uncertain_scans == tuple(range(20, 20 + num_lost))
 
 
 def test_collapsed_poses_are_not_trusted(sparse) -> None:

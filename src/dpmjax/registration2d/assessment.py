@@ -41,6 +41,9 @@ _FEW_SCANS = 60
 _CONTRADICTION_FLOOR = 0.02
 _CONTRADICTION_FACTOR = 1.6
 _MAX_CONTRADICTION = 0.055
+# Most consecutive scans that fit no other scan in a trusted map. Lines of another moment and covered lenses are single
+# scans; more of them in sequence are a part of the way that is not registered, and what follows may be displaced.
+_MAX_ALONE = 2
 # Largest standard deviation of a scan's position relative to the map, typical ranges.
 _MAX_DEVIATION = 0.02
 
@@ -84,7 +87,7 @@ def assess_trajectory(
 
     The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts.
     Pairs outside the tree must contradict hardly more than the pairs in it. Few scans that fit no other scan are left
-    out. The position of each other scan relative to the map must be constrained.
+    out, up to two in sequence. The position of each other scan relative to the map must be constrained.
 
     Args:
         scans: n scans, two at least.
@@ -115,6 +118,9 @@ def assess_trajectory(
     is_clear = excess <= limit and scans.noise <= MAX_NOISE * scans.typical_range
     is_whole = num_connected >= _LEAST_REGISTERED * len(poses) and weakest >= _MIN_CONNECTION
     is_alone = best <= _LEAST_SCORE
+    if prior is not None:
+        lost = np.convolve(is_alone, np.ones(_MAX_ALONE + 1))
+        is_whole &= bool(lost.max(initial=0.0) <= _MAX_ALONE)
     steps = None if prior is None else _slide_all(profiles, poses, prior)
     deviations = _deviations(profiles, len(poses), pairs, steps)
     if steps is not None:
