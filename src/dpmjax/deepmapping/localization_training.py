@@ -196,7 +196,7 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
 @partial(jax.jit, static_argnames=("config", "num_steps"))
 def _train(
     params: Any,
-    sources: tuple[tuple[ScanSet, Float[Array, "n 3"]], ...],
+    sources: tuple[tuple[ScanSet, Float[Array, "_n 3"]], ...],
     key: jax.Array,
     *,
     config: DeepMappingConfig,
