@@ -193,12 +193,15 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
         values = np.where(is_same & (np.abs(se2.wrap_angle(apart[..., 2])) < _SAME_SHAPE[1]), -np.inf, values)
     chosen = np.concatenate(kept)
     source, poses, scores = source[chosen], poses[chosen], scores[chosen]
-    # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score.
+    # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
+    # of two scans alone may lie beside the right pose, too: the last placed scans choose.
     near = Candidates(source, source - 1, poses[:, None], scores[:, None])
     shifted = refine_candidates(profiles, near, _SEARCH).poses[:, 0]
     after = pair_scores(profiles, source, source - 1, shifted)
-    better = after > scores
-    return StepHypotheses(source, source - 1, np.where(better[:, None], shifted, poses), np.maximum(scores, after))
+    is_better = after > scores
+    source = np.concatenate([source, source[is_better]])
+    poses, scores = np.concatenate([poses, shifted[is_better]]), np.concatenate([scores, after[is_better]])
+    return StepHypotheses(source, source - 1, poses, scores)
 
 
 class _Sequences(NamedTuple):
