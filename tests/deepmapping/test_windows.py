@@ -75,7 +75,7 @@ def test_windows_with_different_scans_do_not_learn_from_each_other(tiny_data) ->
     def gradient(scans: ScanSet):
         data = tiny_data._replace(scans=scans)
         params = init(problem, data, key=KEY).params
-        return jax.grad(lambda p: problem.loss(config, phase, p, data, 0, KEY)[0])(params).localization
+        return jax.grad(lambda p: problem.loss(config, phase, p, data, jnp.int32(0), KEY)[0])(params).localization
 
     rows = window_rows(20, 8)
     assert rows[:, 0].tolist() == [0, 7, 12]
