@@ -10,10 +10,31 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import SlamConfig, SlamMethods, SlamResult, init_slam, run_slam, slam_preset, step_slam
+from dpmjax.slam import (
+    Alignment,
+    LocalMap,
+    SlamConfig,
+    SlamMethods,
+    SlamResult,
+    ThinnedScan,
+    init_slam,
+    run_slam,
+    slam_preset,
+    step_slam,
+)
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframes import diagonal_information
-from tests.slam.truth import EMPTY, MistakenMatcher, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
+from tests.slam.truth import (
+    EMPTY,
+    MistakenMatcher,
+    TruthGeometry,
+    TruthMatcher,
+    laps,
+    number_of,
+    number_of_scan,
+    pose,
+    scans_of,
+)
 
 CONFIG = SlamConfig()
 
@@ -160,6 +181,34 @@ def test_a_kidnapped_robot_is_found_again() -> None:
     assert apart[:120].max() < 1.0
     # Until it restarts, a lost scan has only the predicted motion; it says so.
     assert all(result.reports[row].status == "predicted" for row in np.flatnonzero(apart > 2.0))
+
+
+@dataclass(frozen=True)
+class DoorwayGeometry(TruthGeometry):
+    """Scans behind a door meet the planes of other scans behind it, and no others."""
+
+    door: int = 0
+
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        number, last = number_of_scan(scan), round(float(local_map.keyframes[0].positions[0, 0]))
+        T_map_before = rigid.inverse(self.T_world_scan[last]) @ self.T_world_scan[number - 1]
+        element = T_map_before[:3, :3] @ [number - 1, 0, 0] + T_map_before[:3, 3]
+        apart_m = np.linalg.norm(local_map.surface.points - element, axis=1).min()
+        found = super().search(local_map, scan, T_map_scan)
+        if number < self.door or last >= self.door or (number > self.door and apart_m < 1.0):
+            return found
+        return Alignment(T_map_scan[0], 0.0, 0.0, 0.0, found.information)
+
+
+def test_lost_scans_that_see_the_same_room_keep_their_relative_poses() -> None:
+    # A robot drives straight through a door, and turns behind it, which no motion of before predicts.
+    headings = 0.12 * np.clip(np.arange(50) - 30, 0, None)
+    positions = np.cumsum(np.column_stack([np.cos(headings), np.sin(headings)]), axis=0)
+    truth = np.array([pose(*position, heading) for position, heading in zip(positions, headings, strict=True)])
+    result = run(truth, geometry=DoorwayGeometry(truth, door=30), matcher=TruthMatcher(truth, gross_share=1.0))
+    assert [report.status for report in result.reports[30:33]] == ["predicted", "restarted", "tracked"]
+    expected = (rigid.inverse(truth[0]) @ truth)[:, :3, 3]
+    assert np.linalg.norm(result.T_world_scan[:, :3, 3] - expected, axis=1).max() < 0.5
 
 
 def test_the_network_helps_where_geometry_fails() -> None:

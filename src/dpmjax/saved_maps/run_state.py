@@ -94,7 +94,7 @@ def prefixed(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
 ADVICE = "start the run again without --resume"
 OF_LOOPS = ("loops",)
 # Fields that are written apart, or made again from the map.
-OF_FRONT_END = ("local_map", "recent", "scores")
+OF_FRONT_END = ("local_map", "recent", "lost", "scores")
 
 
 class RunState(NamedTuple):
@@ -156,6 +156,6 @@ def load_state(path: str | Path) -> RunState:
         (loops,) = from_columns(LoopState, arrays, "loops", without=OF_LOOPS)
         (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=OF_FRONT_END)
         recent = tuple(from_columns(PlacedElements, arrays, "recent"))
-        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent)
+        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent, lost=())
         loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
         return RunState(SlamState(front_end, slam_map, loops), tuple(from_columns(ScanReport, arrays, "report")))

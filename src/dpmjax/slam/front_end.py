@@ -79,8 +79,8 @@ UNKNOWN_M = 1000.0
 # How the pose of a scan was found.  "first": the scan starts the map, or a new part of a loaded one. "tracked":
 # geometry, from the predicted pose. "network": geometry failed there, and agreed from the network's pose, or both agree
 # on a pose of a low score. "predicted": nothing agreed, the pose is a guess: what geometry prefers, or the motion of
-# before. "empty": the scan has too few points. "restarted": nothing agreed for a while, a new part of the map begins
-# here, and loops may join it.
+# before. "empty": the scan has too few points. "restarted": nothing agreed for a while, or the scan met only scans that
+# were lost before; a new part of the map begins here at a predicted pose, and loops may join it.
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 
 
@@ -125,7 +125,7 @@ class FrontEndState(NamedTuple):
         T_keyframe_last: pose of the last scan.
         T_before_last: motion of the last scan since the scan before.
         scores: of recent scans that were accepted.
-        num_lost: number of scans since one was accepted.
+        lost: the scans since one was accepted, at their predicted poses.
     """
 
     num_scans: int = 0
@@ -135,7 +135,7 @@ class FrontEndState(NamedTuple):
     T_keyframe_last: Pose = np.eye(4)
     T_before_last: Pose = np.eye(4)
     scores: tuple[float, ...] = ()
-    num_lost: int = 0
+    lost: tuple[PlacedElements, ...] = ()
 
     @property
     def predicted(self) -> Pose:
@@ -208,8 +208,10 @@ def place_scan(
     if located.report.status == "restarted" or _is_keyframe(methods, located.report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after, report = _advanced(state, located.report), located.report
-    if report.status != "predicted":
-        placed = placed_scan(thinned.measured.surface, report.T_keyframe_scan)
+    placed = placed_scan(thinned.measured.surface, report.T_keyframe_scan)
+    if report.status == "predicted":
+        after = after._replace(lost=(*state.lost, placed))
+    else:
         # Around a lidar that stands still, people move: the map of before fits less and less.
         is_changed = bool(state.scores) and report.score < GOOD_SHARE * state.usual_score
         spacing_m = 0.0 if is_changed else RECENT_SHARE * thinned.extent_m
@@ -252,8 +254,7 @@ def _locate(
     config, usual = methods.config.front_end, state.usual_score
     tried = _attempt(methods, state, local_map, scan)
     best, probability = tried.best, tried.probability
-    # Nothing is usual yet where a part of the map begins: sparse scans never score high.
-    wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
+    wanted = _least_score(state)
     is_far = not are_near(state.predicted, best.T_map_scan, NEAR_M, np.inf)
     if is_far and state.scores and (probability or 0.0) < config.min_probability:
         # A motion that neither the motion of before nor the decoder supports needs the usual score.
@@ -261,16 +262,34 @@ def _locate(
     T, information = best.T_map_scan, best.information
     status: ScanStatus = "tracked" if best is tried.tracked else "network"
     if best.score < wanted and not _is_confirmed(tried, config.min_probability):
-        status = "restarted" if state.num_lost + 1 >= config.num_lost else "predicted"
+        T, is_met = _guess(methods, state, local_map, scan, T)
+        status = "restarted" if is_met or len(state.lost) + 1 >= config.num_lost else "predicted"
         information = diagonal_information(GUESS_M, GUESS_RAD)
-        # The best alignment is the better guess, unless a robot hardly moves like that.
-        T = T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
     reason = f"score {best.score:.2f} of usually {usual:.2f}"
     if probability is not None:
         reason += f", P {probability:.2f} by the network"
     # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
     report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
     return Located(report._replace(score=best.score, probability=probability), information, tried.compact)
+
+
+def _least_score(state: FrontEndState) -> float:
+    # Nothing is usual yet where a part of the map begins: sparse scans never score high.
+    return max(MIN_SCORE, MIN_SCORE_SHARE * state.usual_score if state.scores else 0.0)
+
+
+def _guess(
+    methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, T: Pose
+) -> tuple[Pose, bool]:
+    """Returns the pose of a rejected scan, and whether the scan meets the lost ones: in a doorway the map ends."""
+    # The best alignment is the better guess, unless a robot hardly moves like that.
+    T = T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
+    if not state.lost:
+        return T, False
+    surface = joined_surface((*local_map.keyframes, *state.recent, *state.lost))
+    aligned = methods.geometry.align(local_map._replace(surface=surface), scan, T)
+    is_near = are_near(state.predicted, aligned.T_map_scan, 3 * GUESS_M, 3 * GUESS_RAD)
+    return (aligned.T_map_scan, aligned.score >= _least_score(state)) if is_near else (T, False)
 
 
 def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> _Attempt:
@@ -335,9 +354,9 @@ def _make_keyframe(
         edge = MapEdge(row, row - 1, T, located.information, "guess" if is_guess else "odometry")
     slam_map = with_origin(slam_map, methods.origin)
     slam_map = add_keyframe(slam_map, keyframe, T_world, methods.matcher.vector(compact), edge)
-    # In the frame of the new keyframe; the scans of another segment have no place in it.
-    T_new_old = rigid.inverse(T)
-    moved = () if is_guess else tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in state.recent)
+    # In the frame of the new keyframe; the scans of another segment have no place in it, but the lost ones begin it.
+    T_new_old, before = rigid.inverse(T), state.lost if is_guess else state.recent
+    moved = tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in before)
     placed = placed_scan(scan.measured.surface, np.eye(4))
     spacing_m = RECENT_SHARE * scan.extent_m
     after = _advanced(state, report)._replace(
@@ -352,9 +371,10 @@ def _make_keyframe(
 def _advanced(state: FrontEndState, report: ScanReport) -> FrontEndState:
     """Returns the state after a scan: only an accepted one changes the predicted motion."""
     T = report.T_keyframe_scan
-    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T, num_lost=0)
+    after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T)
     if report.status == "predicted":
-        return after._replace(num_lost=state.num_lost + 1)
+        return after
+    after = after._replace(lost=())
     if report.status in ("first", "restarted"):
         return after._replace(scores=())
     T_before_last = rigid.inverse(state.T_keyframe_last) @ T
