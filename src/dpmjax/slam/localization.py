@@ -19,7 +19,6 @@ from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.slam.interfaces import Match, SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, Pose, Submap, are_near, orthonormal, submap_around, with_origin
 from dpmjax.slam.loop_candidates import most_similar
-from dpmjax.slam.loops import scans_agree
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray
 
@@ -40,6 +39,12 @@ NUM_NEIGHBOURS = 2
 
 # A registration supports a place from this P(correct) on, if the scans agree.
 MIN_PROBABILITY = 0.2
+
+# Scans agree up to this share of points in free space.
+MAX_CONTRADICTED_SHARE = 0.1
+
+# Scans agree from this share of points that meet planes on.
+MIN_MATCHED_SHARE = 0.35
 
 LocalizationStatus = Literal["found", "not in this map", "empty"]
 
@@ -74,7 +79,7 @@ class KeyframeMatch(NamedTuple):
         keyframe: row of the keyframe.
         T_world_scan: where it puts the scan.
         match: the registration.
-        do_scans_agree: whether enough points meet planes, by the limits of loop closure; streets look alike.
+        do_scans_agree: whether enough points meet planes, and few lie in free space; streets look alike.
     """
 
     keyframe: int
@@ -209,7 +214,7 @@ class _Search(NamedTuple):
         matches = self.methods.matcher.register([(source, target) for target in targets]) if rows else []
         T_world = self.slam_map.T_world_keyframe
         return [
-            KeyframeMatch(row, orthonormal(T_world[row] @ match.T_target_source), match, scans_agree(match))
+            KeyframeMatch(row, orthonormal(T_world[row] @ match.T_target_source), match, _do_scans_agree(match))
             for row, match in zip(rows, matches, strict=True)
         ]
 
@@ -241,6 +246,13 @@ class _Search(NamedTuple):
         if not is_supported or rival > MAX_RIVAL_SHARE * total:
             return Localization("not in this map", None, 0.0, None, numbers, evidence)
         return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)
+
+
+def _do_scans_agree(match: Match) -> bool:
+    shares = match.verification
+    return shares is None or (
+        shares.matched_share >= MIN_MATCHED_SHARE and shares.contradicted_share <= MAX_CONTRADICTED_SHARE
+    )
 
 
 def _agree(one: KeyframeMatch, other: KeyframeMatch) -> bool:

@@ -17,12 +17,6 @@ from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near
 
-# Largest share of points in free space.
-MAX_CONTRADICTED_SHARE = 0.1
-
-# Smallest share of points that meet planes, where the scans verify a registration.
-MIN_MATCHED_SHARE = 0.35
-
 # Standard deviation of odometry over one metre; it grows with the root of the path.
 DRIFT_M = 0.05
 
@@ -47,7 +41,6 @@ LoopStatus = Literal[
     "no overlap",
     "not registered",
     "improbable",
-    "scans disagree",
     "against odometry",
     "waits for support",
     "accepted",
@@ -130,7 +123,7 @@ def num_accepted(loops: Iterable[Loop]) -> int:
 
 
 def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
-    """Tests a registration of a loop against its probability, the agreement of the scans, and odometry.
+    """Tests a registration of a loop against its probability and odometry.
 
     Args:
         slam_map: the map.
@@ -143,8 +136,6 @@ def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClo
     """
     if match.probability < config.min_probability:
         return "improbable"
-    if not scans_agree(match):
-        return "scans disagree"
     source, target = slam_map.keyframes[loop.source], slam_map.keyframes[loop.target]
     if source.segment == target.segment:
         path_m = abs(source.path_m - target.path_m)
@@ -156,21 +147,6 @@ def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClo
         if not are_near(predicted, match.T_target_source, most_m, most_rad):
             return "against odometry"
     return "waits for support"
-
-
-def scans_agree(match: Match) -> bool:
-    """Returns True if enough points of the scans meet planes under a registration, and few lie in free space.
-
-    Args:
-        match: the registration.
-
-    Returns:
-        True also where the matcher has no scans.
-    """
-    shares = match.verification
-    return shares is None or (
-        shares.matched_share >= MIN_MATCHED_SHARE and shares.contradicted_share <= MAX_CONTRADICTED_SHARE
-    )
 
 
 def accept_consistent(
