@@ -1,4 +1,4 @@
-"""The whole system: scans in, one map out. Front end, loop closure and optimisation, scan by scan."""
+"""The whole system: scan by scan, front end, loop closure and optimisation make one map."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from dpmjax.slam.odometry import SurfaceGeometry
 
 
 class SlamState(NamedTuple):
-    """All that the next scan needs.
+    """State of SLAM between two scans.
 
     Attributes:
-        front_end: the last scan and the local map.
+        front_end: state of odometry, with the local map.
         slam_map: keyframes and edges.
         loops: candidates of loops.
     """
@@ -44,10 +44,10 @@ class SlamResult(NamedTuple):
         T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one, or of the map that was
             extended.
         keyframes: (k,) numbers of the scans that are keyframes.
-        loops: every candidate and what became of it; rows are those of `keyframes`.
+        loops: every candidate and its outcome; rows are those of `keyframes`.
         graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
-        reports: how each scan was placed.
-        state: goes on with `step_slam`.
+        reports: report of each scan.
+        state: state after the last scan, from which `step_slam` continues.
         T_odometry_scan: (n, 4, 4) every scan by odometry alone, without any loop.
     """
 
@@ -103,7 +103,8 @@ def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMet
 def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
     """Begins an empty map, or a new part of an earlier one.
 
-    Scans are numbered on from those of the map. The new part has no known place in the map until a loop joins it.
+    The numbers of scans continue those of the map. The pose of the new part in the map is unknown until a loop
+    joins it.
 
     Args:
         slam_map: from `load_map` or of an earlier run; None for an empty one.
@@ -117,7 +118,7 @@ def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
 
 
 def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[SlamState, ScanReport]:
-    """Places a scan; a new keyframe is compared with the map.
+    """Estimates the pose of a scan, and searches loops of a new keyframe.
 
     Args:
         methods: from `make_methods`.
@@ -126,7 +127,7 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
             motion; points that are not finite are dropped.
 
     Returns:
-        The state after, and how the scan was placed.
+        The state after the scan, and its report.
 
     Raises:
         ValueError: if the shape is not (n, 3).
@@ -193,7 +194,7 @@ def run_slam(
     *,
     slam_map: KeyframeMap | None = None,
 ) -> SlamResult:
-    """Makes one map of a drive: odometry, loops, and a graph that agrees with both (DeepPointMap section 4).
+    """Makes one map of a drive by odometry, loop closure and optimisation of the pose graph (DeepPointMap section 4).
 
     Every scan gets a pose, also an empty one. `reports` has how each pose was found, and flags uncertain ones.
 
