@@ -21,7 +21,7 @@ from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
 # Number of scans, or of pairs, in one call of a compiled program.
 CHUNK = 4
 
-# Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4.
+# A scan whose extent is nearest to a half or a quarter of the full one is enlarged by 2 or 4.
 EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 
 
@@ -77,7 +77,7 @@ def encode_scans(
     require_some("scans", scans)
     parts = []
     for start in range(0, len(scans), CHUNK):
-        # JAX still encodes the chunk before.
+        # JAX encodes the chunk before at the same time.
         pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
         parts.append(_encode_chunk(model, stack_chunk(pyramids), num_elements=num_elements))
     return join_chunks(parts, len(scans))
@@ -140,7 +140,7 @@ def thin_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, 
         scale: factor by which the points are enlarged first.
 
     Returns:
-        The points that are left, metres times the scale; arrays of NumPy.
+        The remaining points, metres times the scale; arrays of NumPy.
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), or if the scale is not positive.

@@ -31,10 +31,10 @@ from dpmjax.types import AnyArray, DescriptorCloud, Registration
 TRAINED = ObjectiveConfig()
 
 PAIR_STREAM = 3103
-# A map of an evaluation holds scans so near to its first one.
+# Largest distance of the scans of an evaluated map from its first scan.
 MAP_RADIUS_M = 10.0
 
-# Nothing but a random yaw.
+# No augmentation but a random yaw.
 UPRIGHT = AugmentConfig(
     max_drop_ratio=0.0,
     sector_probability=0.0,
@@ -105,7 +105,7 @@ class EvaluationPairs(NamedTuple):
         """Computes the true motions of pairs.
 
         Args:
-            pairs: of these.
+            pairs: pairs of these scans.
 
         Returns:
             Target from source, metres.
@@ -129,7 +129,7 @@ class Evaluation(NamedTuple):
 
     @property
     def mean_recall(self) -> float:
-        """The mean over the kinds."""
+        """Mean recall over the kinds."""
         return float(np.mean([recall.recall for recall in self.recalls]))
 
 

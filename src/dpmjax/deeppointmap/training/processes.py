@@ -30,7 +30,7 @@ def join_processes(coordinator: str | None, num_processes: int | None, process_i
     """Makes this process one of several; call it before JAX is used. Without any argument it does nothing.
 
     Args:
-        coordinator: HOST:PORT on which process 0 listens; or `auto`, to ask the scheduler that started the processes
+        coordinator: HOST:PORT on which process 0 listens; or `auto`, for the scheduler that started the processes
             (Slurm, Open MPI, a TPU pod).
         num_processes: number of processes.
         process_id: number of this process, from 0.
@@ -82,7 +82,7 @@ def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
 
 
 def is_first() -> bool:
-    """Says if this is the process that writes, prints and shows progress.
+    """Returns True in the one process that writes, prints and shows progress.
 
     Returns:
         True in process 0; True with one process.

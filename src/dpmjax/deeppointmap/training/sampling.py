@@ -96,8 +96,8 @@ def draw_groups(
         rng: source of the draws.
 
     Returns:
-        A group for each entry of the layout; smaller where there are fewer scans, None where no scan was found with
-        another one near it.
+        A group for each entry of the layout; smaller where there are fewer scans, None where no anchor with a
+        scan near it was found.
 
     Raises:
         ValueError: if all are None.
@@ -142,7 +142,7 @@ class MapOfScans:
     """One map of each group.
 
     Attributes:
-        rows: its scans, as rows of the sample; 0 where a map has fewer scans.
+        rows: rows of its scans in the sample; 0 where a map has fewer scans.
         mask: False where a map has fewer scans or descriptors, and where `matching.thinned_mask` removes one.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """

@@ -32,7 +32,7 @@ LOGGER = logging.getLogger("dpmjax.training")
 PUBLISHED = SamplingConfig()
 
 VARIANT_STREAM = 3104
-# Raise it when the same scans and settings shall give other files.
+# Version of the files, to be raised when the same scans and settings give other files.
 FORMAT = 2
 
 
@@ -42,7 +42,7 @@ class PreparedDrive(NamedTuple):
     Attributes:
         T_world_lidar: (n, 4, 4) float64 true poses, metres.
         pyramids: (n, num_variants) records of `record_type`, or the file that holds them.
-        bad: for each bad scan the reason; bad scans count as empty.
+        bad: reason for each bad scan; bad scans count as empty.
     """
 
     T_world_lidar: Float[np.ndarray, "n 4 4"]
@@ -55,7 +55,7 @@ class ScanStore:
 
     Attributes:
         table: poses of all scans.
-        bad: for each bad scan the reason.
+        bad: reason for each bad scan.
     """
 
     def __init__(self, drives: Sequence[PreparedDrive]) -> None:
@@ -207,7 +207,7 @@ def _augmented(cloud: PointCloud, keys: Array, *, config: AugmentConfig) -> Poin
 def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
     model = config.model
     settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
-    # What changes in the step does not change the file.
+    # Motions are drawn in the step, so they do not change the file.
     for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
         del settings[-1][name]
     content = json.dumps([FORMAT, settings, model.scale_m, config.num_variants, seed], sort_keys=True)
@@ -251,7 +251,7 @@ def prepare_drives(
 
 
 def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> str | None:
-    """Finds a reason why nothing can be learned from a drive, or measured on it. Reads scans up to the first good one.
+    """Finds a reason against training or evaluation on a drive. Reads scans up to the first good one.
 
     Args:
         drive: to be checked.
