@@ -71,7 +71,7 @@ def _forward(
 ) -> tuple[jax.Array, Residuals]:
     neighbours, shape = jnp.asarray(neighbours), (len(neighbours), of_points.shape[1])
 
-    def look_at(j: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def visit(j: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         value, winner, of_winner, inverses = best
         x = _with_offsets(of_points[neighbours[:, j]], offsets[:, j], kernel)
         inverse = _inverse_length(x)
@@ -92,13 +92,13 @@ def _forward(
     num = neighbours.shape[1]
     at_once = max(size for size in range(1, _UNROLL + 1) if num % size == 0)
 
-    def look_at_some(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def visit_some(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         first, best = state
         for j in range(at_once):
-            best = look_at(first + j, best)
+            best = visit(first + j, best)
         return first + at_once, best
 
-    _, (_, *found) = lax.while_loop(lambda state: state[0] < num, look_at_some, (jnp.zeros((), jnp.int32), start))
+    _, (_, *found) = lax.while_loop(lambda state: state[0] < num, visit_some, (jnp.zeros((), jnp.int32), start))
     winner, of_winner, inverses = (checkpoint_name(x, WINNERS) for x in found)
     return of_winner * scale, Residuals(of_points, offsets, kernel, neighbours, scale, winner, of_winner, inverses)
 

@@ -26,7 +26,7 @@ def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generato
     """Simulates a walk through a world: repeatedly to new places and back by another route.
 
     Args:
-        world: where to walk.
+        world: the world.
         num_poses: number of poses.
         rng: source of all choices; the same state gives the same walk.
 
@@ -210,9 +210,9 @@ def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, pe
     """Shortens the beams that hit a person before the world.
 
     Args:
-        ranges: (n, b) of the world without people, px.
+        ranges: (n, b) ranges in the world without people, px.
         poses: (n, 3) x, y, heading of the sensor.
-        angles: (b,) of the beams in the sensor frame, radians.
+        angles: (b,) angles of the beams in the sensor frame, radians.
         people: (p, n, 2) centres of the people, px.
 
     Returns:

@@ -180,7 +180,7 @@ def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Ar
     Args:
         traffic: lanes and users.
         sensor: position of the sensor in the world, m; road users within 4 m of it are left out.
-        time: s.
+        time: time, s.
 
     Returns:
         Two boxes for each: body and cabin (masked for people and lorries).

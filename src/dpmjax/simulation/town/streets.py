@@ -25,10 +25,10 @@ class Streets:
 
     Attributes:
         paths: (k, 2) points of each street at steps of half a metre, from side street to side street.
-        half_widths: from the middle to the kerb, m, of each street.
+        half_widths: distance from the middle to the kerb of each street, m.
         lanes: (k, 2) points of the lanes of the traffic, in one direction; traffic drives in both directions.
         route: (k, 2) points of the drive's middle line at steps of half a metre.
-        is_closed: the route ends where it began.
+        is_closed: True for a route that ends where it began.
     """
 
     paths: tuple[FloatArray, ...]
@@ -167,7 +167,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
     """Returns the right lane of the route.
 
     Args:
-        streets: with the route.
+        streets: streets with the route.
         is_reversed: True for the lane of the route in reverse, on the opposite side of the street.
 
     Returns:
@@ -178,7 +178,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
 
 
 def arc_lengths(path: FloatArray) -> FloatArray:
-    """Computes the path length from the start to each point.
+    """Computes the length of a curve from its start to each of its points.
 
     Args:
         path: (k, 2) points, m.
@@ -194,7 +194,7 @@ def at_way(path: FloatArray, way: FloatArray) -> FloatArray:
 
     Args:
         path: (k, d) points; path lengths are those of x and y.
-        way: (m,) m, clipped to the path.
+        way: (m,) path lengths, m, clipped to the path.
 
     Returns:
         (m, d).
@@ -235,7 +235,7 @@ def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
 
     Args:
         path: (k, 2) points.
-        distance: m, one for all or one each; negative for the right.
+        distance: distance in m, one for all points or one for each; negative to the right.
 
     Returns:
         (k, 2).
@@ -245,12 +245,12 @@ def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
 
 
 def smooth(path: FloatArray, sigma: float, *, is_closed: bool) -> FloatArray:
-    """Rounds corners with a Gaussian along the path.
+    """Rounds the corners of a curve with a Gaussian along it.
 
     Args:
         path: (k, d) points at equal steps of `sigma / 6` or less.
-        sigma: in steps.
-        is_closed: the last point is the first one again.
+        sigma: standard deviation in steps.
+        is_closed: True where the last point is the first one again.
 
     Returns:
         (k, d); the ends are unchanged, unless the path is closed.
