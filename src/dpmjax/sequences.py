@@ -306,7 +306,7 @@ class DepthSequence:
 
 @dataclass(frozen=True)
 class LidarSequence:
-    """Scans of one drive, read lazily: `sequence[i]` reads scan i, and a loop reads one scan after the other.
+    """Scans of one drive, read lazily: `sequence[i]` reads scan i, and a loop reads the scans in turn.
 
     Read this way, a scan without points is (0, 3).
 

@@ -128,8 +128,8 @@ class Verification(NamedTuple):
         gap: difference of `score` to that of the best hypothesis for another place, or to 0 if that is more.
         num_tried: number of hypotheses that were tried.
         num_slid: number of further motions along a weak axis; 0 where the walls constrain all directions.
-        facing_gap: difference to the best other motion, or to 0, of the elements that face the weak axis and meet, less
-            a penalty of those that contradict; 0 where no axis is weak.
+        facing_gap: lead over the best other motion, or over 0, in elements that face the weak axis: those that meet,
+            less a penalty of those that contradict. It is 0 where no axis is weak.
     """
 
     visible_share: float

@@ -39,9 +39,9 @@ def save_map(
     Args:
         path: must end in `.npz`; an existing file is replaced.
         slam_map: map of a run, `result.map`, with at least one keyframe.
-        precision: "float32" is exact: a run that goes on from the file equals an unbroken one. "int8" is the smallest,
-            for localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and omits
-            keyframes that those of other laps cover (`slam.thin_map`).
+        precision: with "float32" the file is exact: a run that continues from it equals an unbroken one. With "int8" it
+            is smallest, for localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and
+            omits keyframes that those of other laps cover (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
             0.2 for "int8" and 0 for "float32".
 

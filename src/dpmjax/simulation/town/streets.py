@@ -45,8 +45,9 @@ def make_streets(
 
     Args:
         rng: source of all choices.
-        kind: kind of route. "loop" goes once round some blocks. "there_and_back" goes along a street, round a block,
-            back on the opposite side, and round a block there. "wander" is a random walk and the shortest way back.
+        kind: kind of route. A "loop" goes once round some blocks. A route "there_and_back" goes along a street, round a
+            block, back on the opposite side, and round a block there. A "wander" is a random walk and the shortest
+            way back.
         length: wanted length of the route, m; met within a block or two.
         block: side of a block, m.
         half_width: narrowest and widest street, from the middle to the kerb, m.
