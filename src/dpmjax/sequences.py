@@ -37,7 +37,7 @@ class InputError(ValueError):
 
 
 class EmptyScanError(InputError):
-    """A scan without any point: the lidar measured nothing, or the file is empty. A drive goes on without it."""
+    """A scan without any point: the lidar measured nothing, or the file is empty. A drive continues without it."""
 
 
 class Note(NamedTuple):

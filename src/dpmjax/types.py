@@ -109,7 +109,7 @@ class DescriptorCloud:
 
     @property
     def elements(self) -> SurfaceElements:
-        """All points as surface elements; a `ValueError` says if the cloud has no normals."""
+        """All points as surface elements; raises a `ValueError` if the cloud has no normals."""
         if self.normals is None or self.planarity is None:
             raise ValueError("cloud: expected surface elements, got a cloud without normals and planarity")
         return SurfaceElements(self.positions, self.normals, self.planarity, self.mask)

@@ -34,8 +34,8 @@ def encode(
 ) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
-    A `ValueError` says if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements` is
-    out of range. A warning says if hardly any point is in range: the points are then probably not in metres.
+    Raises a `ValueError` if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements`
+    is out of range. Warns if hardly any point is in range: the points are then probably not in metres.
 
     Args:
         model: its configuration includes the preprocessing.
@@ -63,7 +63,7 @@ def encode_scans(
 ) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
-    A `ValueError` says if there is no scan, or if points are no real numbers (n, 3).
+    Raises a `ValueError` if there is no scan, or if points are no real numbers (n, 3).
 
     Args:
         model: encoder and configuration.
@@ -118,7 +118,7 @@ def pyramid_of_scan(
 ) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
 
     Args:
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.

@@ -55,7 +55,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     high. A model without calibration uses the decoder's head (DeepPointMap section 3.2), which is right for published
     weights only.
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if features have another width than the model.
 
     Args:
         model: encoder and decoder.
@@ -75,7 +75,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 
-    A `ValueError` says if the lengths differ or are 0.
+    Raises a `ValueError` if the lengths differ or are 0.
 
     Args:
         model: encoder and decoder.
@@ -91,7 +91,7 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
 def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
     """Computes the features of the overlap probability of many pairs.
 
-    A `ValueError` says if the lengths differ or are 0.
+    Raises a `ValueError` if the lengths differ or are 0.
 
     Args:
         model: encoder and decoder.
@@ -144,7 +144,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
 def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     """Predicts the probability that two clouds are less than 20 m apart.
 
-    A `ValueError` says if the features have another width than the model.
+    Raises a `ValueError` if the features have another width than the model.
 
     Args:
         model: encoder and decoder.

@@ -67,7 +67,7 @@ def require_pairs(sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]
 def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:
     """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
 
     Args:
         model: encoder and configuration.
@@ -83,7 +83,7 @@ def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Prepar
 def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
     """Prepares scans in their order; threads measure their surfaces while JAX encodes.
 
-    A `ValueError` says if the points of a scan are no real numbers (n, 3).
+    Raises a `ValueError` if the points of a scan are no real numbers (n, 3).
 
     Args:
         model: encoder and configuration.

@@ -94,8 +94,8 @@ def _plan_route(clearance: FloatArray, length_px: float, rng: np.random.Generato
     centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
     visits = np.zeros(len(cells))
     # The most central of three positions, because few places are reachable from a corner.
-    wishes = rng.integers(len(cells), size=3)
-    home = place = int(wishes[np.argmin(np.linalg.norm(centres[wishes] - centres.mean(axis=0), axis=1))])
+    drawn = rng.integers(len(cells), size=3)
+    home = place = int(drawn[np.argmin(np.linalg.norm(centres[drawn] - centres.mean(axis=0), axis=1))])
     route, travelled, leg = [place], 0.0, 0
     while travelled < length_px:
         cost, before = _shortest_paths(cells, coarse, visits, place)

@@ -111,8 +111,8 @@ def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int
     extent, start, other = (width, x, height) if along else (height, y, width)
     cut = start + int(extent * rng.uniform(0.36, 0.64))
     low = y if along else x
-    wishes = low + other * rng.uniform(0.12, 0.88, 2 if other > 600 else 1) - _DOOR_PX / 2
-    doors = np.clip(wishes, low + 20, low + other - 20 - _DOOR_PX).tolist()
+    starts = low + other * rng.uniform(0.12, 0.88, 2 if other > 600 else 1) - _DOOR_PX / 2
+    doors = np.clip(starts, low + 20, low + other - 20 - _DOOR_PX).tolist()
     _paint_span(grid, along, cut, (low, low + other), doors)
     first = (x, y, cut - x, height) if along else (x, y, width, cut - y)
     second = (cut, y, x + width - cut, height) if along else (x, cut, width, y + height - cut)

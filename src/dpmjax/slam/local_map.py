@@ -23,7 +23,7 @@ from dpmjax.types import AnyArray
 # Smallest distance between the last scans, as a share of the extent.
 RECENT_SHARE = 0.08
 
-# Turn from which on a scan joins the local map at a smaller distance.
+# Turn above which a scan joins the local map at a smaller distance.
 RECENT_RAD = 0.17
 
 

@@ -194,8 +194,8 @@ def accept_consistent(
         return are_consistent(slam_map, loops[one], loops[other], config)
 
     near = list(_near_along(slam_map, loops, number))
-    witnesses = [other for other in near if loops[other].status == "accepted"][:MAX_COMPARED]
-    others = [other for other in near if other in witnesses or loops[other].status == "waits for support"]
+    compared = [other for other in near if loops[other].status == "accepted"][:MAX_COMPARED]
+    others = [other for other in near if other in compared or loops[other].status == "waits for support"]
     others = [other for other in others if agree(number, other)]
     members = [number]
     for other in sorted(others, key=lambda other: -(loops[other].probability or 0.0)):

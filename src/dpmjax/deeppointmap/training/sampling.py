@@ -28,7 +28,7 @@ NUM_ATTEMPTS = 100
 
 @dataclass(frozen=True)
 class ScanTable:
-    """True poses of the scans of all drives; a `ValueError` says if there are fewer than two, or one is not finite.
+    """True poses of the scans of all drives; raises a `ValueError` if there are fewer than two, or one is not finite.
 
     Attributes:
         T_world_lidar: (n, 4, 4) float64 true poses, metres.

@@ -151,8 +151,8 @@ def _wander(rng: np.random.Generator, side: int, num_blocks: int) -> list[tuple[
         while route[-1] != (0, 0):
             # Leftwards, but not along the first row, on which the route set out; then down the first column.
             (i, j), steps = route[-1], _neighbours(route, side)
-            wishes = [(i, j - 1), (i - 1, j), (i + 1, j), (i, j + 1)] if i else [(1, j), (0, j - 1), (0, j + 1)]
-            route.append(next(step for step in wishes if step in steps))
+            preferred = [(i, j - 1), (i - 1, j), (i + 1, j), (i, j + 1)] if i else [(1, j), (0, j - 1), (0, j + 1)]
+            route.append(next(step for step in preferred if step in steps))
         if route[-2] == (1, 0):
             return route
 
