@@ -206,7 +206,8 @@ def training_preset(name: Preset) -> TrainingConfig:
     return PRESETS[name]
 
 
-# For frames that turn with the scan: large motions put the origin of rays beside the lidar, tilts turn walls over.
+# For frames that turn with the scan: after a large motion rays do not start at the lidar, and after a large tilt
+# normals of walls are not horizontal.
 NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
 
 PRESETS = {
