@@ -179,7 +179,7 @@ def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f
 
     Args:
         model: fitted weights.
-        features: in the order of `model.features`.
+        features: features in the order of `model.features`.
 
     Returns:
         In [0, 1].

@@ -138,7 +138,7 @@ def dual_softmax(
     Args:
         similarity: cosine of each pair of descriptors.
         is_pair: False for pairs that are not there.
-        temperature: of both softmaxes.
+        temperature: temperature of both softmaxes.
 
     Returns:
         In [0, 1]; 0 for pairs that are not there.
@@ -323,7 +323,7 @@ def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
     """Removes descriptors of a union near those of earlier clouds, on the host; see `thinned_mask`.
 
     Args:
-        merged: from `merge_clouds`, without further surface elements.
+        merged: union from `merge_clouds`, without further surface elements.
         num_a_cloud: number of descriptors of each cloud.
 
     Returns:
@@ -342,7 +342,7 @@ def thinned_mask(
     cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.
 
     Args:
-        positions: of the clouds of the union, cloud by cloud, in one frame, metres.
+        positions: positions of the clouds of the union, cloud by cloud, in one frame, metres.
         mask: False for descriptors that are not there.
         num_a_cloud: number of descriptors of each cloud.
 

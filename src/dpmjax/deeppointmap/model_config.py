@@ -31,7 +31,7 @@ class ModelConfig:
         preprocess: filters of raw scans, in training and inference alike.
         matching: choice of descriptor pairs and inliers.
         verification: verification of hypotheses by the scans, and the final alignment.
-        calibration: of the confidence; None where it was not fitted.
+        calibration: calibration of the confidence; None where it was not fitted.
         overlap: model of the overlap probability; None where it was not fitted: the decoder's head predicts it.
     """
 

@@ -208,7 +208,7 @@ def refine_motion(
     Args:
         source: a scan.
         target: the second scan.
-        motion: from `choose_motion`.
+        motion: motion from `choose_motion`.
         config: alignment and tolerances.
 
     Returns:

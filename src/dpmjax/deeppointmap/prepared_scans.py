@@ -157,7 +157,7 @@ def round_features(
     """Rounds the features of each descriptor to 127 steps of their largest absolute value.
 
     Args:
-        features: of the descriptors.
+        features: features of the descriptors.
 
     Returns:
         The features in steps, and the steps.
@@ -182,7 +182,7 @@ def expand_scan(compact: CompactScan) -> PreparedScan:
     """Restores a scan for registrations, in a millisecond.
 
     Args:
-        compact: from `compact_scan`.
+        compact: compact form from `compact_scan`.
 
     Returns:
         Descriptors, surface and free space.

@@ -106,7 +106,7 @@ def register_each(
         One registration for each pair.
 
     Raises:
-        ValueError: as `register` says.
+        ValueError: see `register`.
     """
     refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
@@ -182,7 +182,7 @@ def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
     """Returns the motions of the hypotheses that any pair supports; at least one.
 
     Args:
-        hypotheses: from `match_clouds`.
+        hypotheses: hypotheses from `match_clouds`.
 
     Returns:
         T_target_source in float64, best first.

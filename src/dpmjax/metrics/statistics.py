@@ -118,7 +118,7 @@ def expected_calibration_error(
     """Computes the expected calibration error (Naeini et al. 2015).
 
     Args:
-        probability: of each event, in [0, 1].
+        probability: probability of each event, in [0, 1].
         is_true: outcome of each event.
         num_bins: number of bins of equal width.
 

@@ -72,7 +72,7 @@ class NeighbourhoodMaximum(nn.Module):
 
         Args:
             features: features of the level that holds the neighbours.
-            offsets: from each query to its neighbours, as a share of the radius.
+            offsets: offsets from each query to its neighbours, as a share of the radius.
             neighbours: rows of the neighbours of each query.
 
         Returns:
@@ -111,7 +111,7 @@ class InvertedResidual(nn.Module):
 
         Args:
             features: features of the level.
-            offsets: from each point to its neighbours in the same level, as a share of the radius.
+            offsets: offsets from each point to its neighbours in the same level, as a share of the radius.
             neighbours: rows of these neighbours.
 
         Returns:

@@ -50,7 +50,7 @@ def pack_map(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of a map.
 
     Args:
-        slam_map: with at least one keyframe; all scans have one number of descriptors and channels.
+        slam_map: map with at least one keyframe; all scans have one number of descriptors and channels.
         precision: see `save_map`.
 
     Returns:
@@ -65,7 +65,7 @@ def unpack_map(arrays: Arrays, precision: Precision, origin: MapOrigin) -> Keyfr
 
     Args:
         arrays: arrays from `pack_map`; others may be among them.
-        precision: that was given to `pack_map`.
+        precision: precision that was given to `pack_map`.
         origin: matcher and settings that made the map.
 
     Returns:

@@ -57,8 +57,8 @@ def from_columns(
     Args:
         record_type: the named tuple.
         columns: columns from `to_columns`; others may be among them.
-        name: as given there.
-        without: as given there.
+        name: name given there.
+        without: fields that were left out there.
 
     Returns:
         The records: numbers and texts of Python, arrays of NumPy; None for a field that was left out.
@@ -101,7 +101,7 @@ class RunState(NamedTuple):
     """A run after a keyframe.
 
     Attributes:
-        state: after the keyframe.
+        state: state after the keyframe.
         reports: reports of all scans of the run until then.
     """
 
@@ -114,7 +114,7 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
 
     Args:
         path: an existing file is replaced.
-        state: after a keyframe.
+        state: state after a keyframe.
         reports: reports of all scans of the run until then.
 
     Returns:

@@ -76,7 +76,7 @@ def expand_elements(compact: CompactElements) -> SurfaceElements:
     """Restores the surface elements.
 
     Args:
-        compact: from `compact_elements`.
+        compact: compact form from `compact_elements`.
 
     Returns:
         Elements as float32 arrays of NumPy, metres.
@@ -112,7 +112,7 @@ def expand_image(compact: CompactImage) -> RangeImage:
     """Restores the range image.
 
     Args:
-        compact: from `compact_image`.
+        compact: compact form from `compact_image`.
 
     Returns:
         The image.

@@ -219,7 +219,7 @@ def view_points(image: RangeImage, points: Float[np.ndarray, "n 3"]) -> View:
     """Compares points with the ranges that the lidar of an image has measured in their directions.
 
     Args:
-        image: from `range_image`.
+        image: range image from `range_image`.
         points: metres, in the frame of that lidar.
 
     Returns:

@@ -232,7 +232,7 @@ def facing_weights(surface: Surface, axis: Float[np.ndarray, "3"], max_count: fl
     """Weighs samples so that those at one position along an axis count up to a limit together.
 
     Args:
-        surface: from `facing_surface`.
+        surface: surface from `facing_surface`.
         axis: unit vector in the frame of the lidar.
         max_count: largest sum of the weights at one position.
 

@@ -161,7 +161,7 @@ def simulate_scene(scene: Scene) -> LidarSequence:
     """Builds a scene; a scan is simulated when it is read.
 
     Args:
-        scene: from `draw_scene`, or made by hand.
+        scene: scene from `draw_scene`, or made by hand.
 
     Returns:
         The sequence, with exact poses and times.

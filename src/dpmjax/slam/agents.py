@@ -144,9 +144,9 @@ def join_agents(
     """Joins the maps that agents have made alone, the second half of `run_agents`.
 
     Args:
-        methods: of all agents.
+        methods: methods of all agents.
         agents: at least one.
-        on_keyframe: for progress, while keyframes are compared.
+        on_keyframe: callback for progress, while keyframes are compared.
 
     Returns:
         Trajectories, who has met whom, the joined graph, bytes sent.
@@ -200,7 +200,7 @@ def join_maps(
     Args:
         methods: matcher and settings; the matcher that made the maps.
         maps: at least one.
-        on_keyframe: for progress.
+        on_keyframe: callback for progress.
 
     Returns:
         All keyframes, and the components of the joined maps.
@@ -238,7 +238,7 @@ def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
     """Extracts the map of one component.
 
     Args:
-        joined: from `join_maps`.
+        joined: maps from `join_maps`.
         component: its number.
 
     Returns:

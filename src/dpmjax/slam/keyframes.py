@@ -67,7 +67,7 @@ class KeyframeMap:
     """Keyframes (k of them), poses and edges.
 
     Attributes:
-        keyframes: in the order of time.
+        keyframes: keyframes in the order of time.
         T_world_keyframe: (k, 4, 4) float64, corrected by loops.
         vectors: (k, c) unit vectors for retrieval, float32.
         edges: all relative poses.
@@ -175,7 +175,7 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
 
     Args:
         slam_map: the map.
-        origin: of the matcher that reads or extends it.
+        origin: origin of the matcher that reads or extends it.
 
     Returns:
         The map after.
@@ -208,7 +208,7 @@ def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius
 
     Args:
         slam_map: the map.
-        row: of the keyframe.
+        row: row of the keyframe.
         num_keyframes: largest number of keyframes, and of edges between them and the first.
         radius_m: keyframes farther away are left out.
 
@@ -232,7 +232,7 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap
 
     Args:
         slam_map: the map.
-        row: of the central keyframe.
+        row: row of the central keyframe.
         num_keyframes: largest number of keyframes, the central one among them.
 
     Returns:
@@ -247,7 +247,7 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     """Makes the pose graph of a map; the ids of its nodes are numbers of scans.
 
     Args:
-        slam_map: with at least one keyframe.
+        slam_map: map with at least one keyframe.
 
     Returns:
         The graph.
@@ -308,7 +308,7 @@ def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, 
 
     Args:
         sigma_m: standard deviation of each translation.
-        sigma_rad: of each rotation.
+        sigma_rad: standard deviation of each rotation.
 
     Returns:
         The inverse covariance, translation first.

@@ -61,7 +61,7 @@ def local_map_of(slam_map: KeyframeMap, recent: Sequence[PlacedElements], config
     """Builds the local map: recent scans, and the nearest keyframes that the graph joins to the last one.
 
     Args:
-        slam_map: with at least one keyframe.
+        slam_map: map with at least one keyframe.
         recent: the last scans, in the frame of the last keyframe.
         config: number of keyframes.
 

@@ -118,7 +118,7 @@ def localize(
 
     Args:
         model: the model that made the map; or methods of your own.
-        slam_map: from `load_map` or of a run.
+        slam_map: map from `load_map` or of a run.
         scan: points in metres, in the frame of the lidar; points that are not finite are dropped.
         config: number of registrations and limits of acceptance; None takes the defaults.
 

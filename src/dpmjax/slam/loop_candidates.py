@@ -38,7 +38,7 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
 
     Args:
         slam_map: the map.
-        row: of the new keyframe.
+        row: row of the new keyframe.
         config: largest numbers of candidates.
 
     Returns:
@@ -82,7 +82,7 @@ def similar_keyframes(
 
     Args:
         slam_map: the map; or several maps in one record.
-        row: of the keyframe.
+        row: row of the keyframe.
         is_allowed: False for keyframes that are no candidates.
         config: largest number of candidates.
 

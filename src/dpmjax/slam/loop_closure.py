@@ -46,7 +46,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 
     Args:
         methods: matcher and settings.
-        slam_map: with the new keyframe.
+        slam_map: map with the new keyframe.
         state: candidates so far.
 
     Returns:
@@ -70,7 +70,7 @@ def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) 
 
     Args:
         methods: matcher and settings.
-        slam_map: after the optimisation.
+        slam_map: map after the optimisation.
         state: its loops.
 
     Returns:
@@ -97,8 +97,8 @@ def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
 
     Args:
         slam_map: the map.
-        loops: so far.
-        row: of a keyframe.
+        loops: loops so far.
+        row: row of a keyframe.
 
     Returns:
         True where the last accepted loop is near along the path.
@@ -118,7 +118,7 @@ def examine_candidates(
     Args:
         methods: matcher and settings.
         slam_map: the map.
-        loops: so far; in the order of the keyframes of each chain.
+        loops: loops so far; in the order of the keyframes of each chain.
         candidates: pairs of this keyframe and an older one, which may show the same place.
 
     Returns:

@@ -105,7 +105,7 @@ def loops_of_map(slam_map: KeyframeMap) -> LoopState:
     """Lists the loops that an earlier run has accepted; the optimisation may remove them later.
 
     Args:
-        slam_map: of the earlier run.
+        slam_map: map of the earlier run.
 
     Returns:
         The loops.

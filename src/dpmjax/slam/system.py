@@ -107,7 +107,7 @@ def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
     joins it.
 
     Args:
-        slam_map: from `load_map` or of an earlier run; None for an empty one.
+        slam_map: map from `load_map` or of an earlier run; None for an empty one.
 
     Returns:
         The state before the first scan.
@@ -121,8 +121,8 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     """Estimates the pose of a scan, and searches loops of a new keyframe.
 
     Args:
-        methods: from `make_methods`.
-        state: after the scan before.
+        methods: methods from `make_methods`.
+        state: state after the scan before.
         scan: (n, 3) points in metres, in the frame of the lidar, or a `TimedScan`, which is deskewed by the predicted
             motion; points that are not finite are dropped.
 
@@ -147,8 +147,8 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     """Optimises a last time and puts every scan into the world.
 
     Args:
-        state: after the last scan.
-        reports: of all scans.
+        state: state after the last scan.
+        reports: reports of all scans.
         config: settings.
 
     Returns:
@@ -175,7 +175,7 @@ def place_scans(
 
     Args:
         T_world_keyframe: poses of the keyframes; none where all scans were empty.
-        reports: of all scans.
+        reports: reports of all scans.
 
     Returns:
         Poses of the scans; the world is the frame of the first one, or of the map that was extended.
@@ -203,7 +203,7 @@ def run_slam(
         scans: points in metres, each in the frame of the lidar, in the order of time; any iterable. `TimedScan`s are
             deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
-        slam_map: from `load_map`, to be extended; None begins an empty one.
+        slam_map: map from `load_map`, to be extended; None begins an empty one.
 
     Returns:
         `T_world_scan` of every scan, keyframes, loops, graph, map and reports.

@@ -118,8 +118,8 @@ class Evaluation(NamedTuple):
     """Results of a model on evaluation pairs.
 
     Attributes:
-        recalls: for each kind, errors and the share of correct registrations.
-        matches: for each kind, the registrations, stacked.
+        recalls: errors and share of correct registrations of each kind.
+        matches: stacked registrations of each kind.
         clouds: descriptors of all scans, stacked.
     """
 
@@ -187,7 +187,7 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
 
     Args:
         model: a model of the configuration that the pairs were drawn for.
-        pairs: from `draw_evaluation_pairs`.
+        pairs: pairs from `draw_evaluation_pairs`.
 
     Returns:
         Errors, registrations and descriptors.

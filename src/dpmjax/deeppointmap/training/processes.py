@@ -71,7 +71,7 @@ def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
     Args:
         tree: without an axis, the same in every process. With `BATCH_AXIS`, the samples of this process, stacked along
             the first axis. Their number is that of the devices of this process in the mesh, or a multiple.
-        mesh: from `device_mesh`.
+        mesh: mesh from `device_mesh`.
         *axes: `BATCH_AXIS` to spread the first axis over the devices; none to copy the tree to every device.
 
     Returns:
@@ -106,7 +106,7 @@ def from_first(tree: TreeT) -> TreeT:
     """Copies a tree from process 0 to all processes.
 
     Args:
-        tree: the same structure, shapes and types in every process.
+        tree: tree of the same structure, shapes and types in every process.
 
     Returns:
         The tree of process 0.

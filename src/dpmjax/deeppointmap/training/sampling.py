@@ -213,7 +213,7 @@ def arrange_groups(groups: Sequence[Group | None], layout: Layout, placed: Place
     """Arranges groups as NumPy arrays, whose shapes depend on the layout only.
 
     Args:
-        groups: from `draw_groups`.
+        groups: groups from `draw_groups`.
         layout: sizes of the groups.
         placed: the scans of all groups: the source of the first group, its target, the source of the second, ...
 

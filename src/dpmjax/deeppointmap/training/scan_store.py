@@ -62,7 +62,7 @@ class ScanStore:
         """Collects the poses.
 
         Args:
-            drives: from `prepare_drive`, all with the same settings.
+            drives: drives from `prepare_drive`, all with the same settings.
         """
         poses = [drive.T_world_lidar for drive in drives]
         scene = np.concatenate([np.full(len(T), number) for number, T in enumerate(poses)])
@@ -117,9 +117,9 @@ def prepare_drive(
     name until it is whole.
 
     Args:
-        drive: with poses.
+        drive: drive with poses.
         config: settings of training.
-        folder: where files are kept; None keeps the pyramids in memory.
+        folder: folder of the files; None keeps the pyramids in memory.
         seed: seed of the variants.
         on_scan: called after each scan, to show progress.
 
@@ -227,9 +227,9 @@ def prepare_drives(
     """Prepares the scans of all drives, in order.
 
     Args:
-        drives: with poses.
+        drives: drives with poses.
         config: settings of training.
-        folder: where prepared scans are kept for later calls; None keeps them in memory.
+        folder: folder of prepared scans for later calls; None keeps them in memory.
         seed: seed of the variants.
 
     Returns:
@@ -254,7 +254,7 @@ def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> s
     """Finds a reason against training or evaluation on a drive. Reads scans up to the first good one.
 
     Args:
-        drive: to be checked.
+        drive: drive that is checked.
         sampling: distances between the scans of a pair.
 
     Returns:
