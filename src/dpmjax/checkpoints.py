@@ -21,7 +21,7 @@ class Checkpoints:
         """Prepares the folder; the first `save` makes it.
 
         Args:
-            folder: where the checkpoints are.
+            folder: folder of the checkpoints.
         """
         processes = ocp.options.MultiprocessingOptions()
         if jax.process_count() > 1:  # without this, orbax waits for the other processes
@@ -93,5 +93,5 @@ class Checkpoints:
 
 
 def _numbered(state: object) -> dict[str, np.ndarray]:
-    # Plain arrays by number: orbax then never makes a state with leaves that are no arrays.
+    # Plain arrays by number, so that orbax restores arrays for all leaves.
     return {str(number): np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves(state))}

@@ -41,7 +41,7 @@ def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = N
     Args:
         name: name of the argument, for messages.
         value: the array.
-        dimensions: what d may be; anything above 0 for None.
+        dimensions: allowed values of d; None allows any above 0.
 
     Returns:
         (n, d) points.
@@ -123,7 +123,7 @@ def require_shape(name: str, array: jax.Array, shape: tuple[int, ...]) -> None:
 
 
 def require_positive(name: str, value: float | AnyArray) -> None:
-    """Checks that a number is above zero; a traced number is let through.
+    """Checks that a number is above zero; a traced number passes.
 
     Args:
         name: name of the argument, for the message.
@@ -155,7 +155,7 @@ def require_fields(config: object, *names: str, low: float, high: float = math.i
 
     Args:
         config: the configuration.
-        *names: of the fields.
+        *names: names of the fields.
         low: least value.
         high: largest value.
 
@@ -173,19 +173,19 @@ def require_positive_fields(config: object, *names: str) -> None:
 
     Args:
         config: the configuration.
-        *names: of the fields.
+        *names: names of the fields.
     """
     for name in names:
         require_positive(name, getattr(config, name))
 
 
 def require_one_of(name: str, value: str, options: Iterable[str]) -> None:
-    """Checks that a word is one of those that there are.
+    """Checks that a word is one of the options.
 
     Args:
         name: name of the argument, for messages.
         value: the word.
-        options: the words that there are.
+        options: the allowed words.
 
     Raises:
         ValueError: `value` is another word.

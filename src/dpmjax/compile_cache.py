@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 
 CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
-# Hundreds of small programs take seconds together, so nothing is too quick or too small to be kept.
+# Hundreds of small programs take seconds together, so programs of any size and compile time are kept.
 _SETTINGS = {
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
@@ -23,7 +23,7 @@ def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
     `DPMJAX_COMPILATION_CACHE=off` turns the cache off.
 
     Args:
-        folder: where the programs are kept; None takes the environment variables `DPMJAX_COMPILATION_CACHE` and
+        folder: folder of the programs; None takes the environment variables `DPMJAX_COMPILATION_CACHE` and
             `JAX_COMPILATION_CACHE_DIR`, then `$XDG_CACHE_HOME/dpmjax` or the user's folder for caches, where each kind
             of processor has a folder.
 

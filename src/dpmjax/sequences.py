@@ -37,7 +37,7 @@ class InputError(ValueError):
 
 
 class EmptyScanError(InputError):
-    """A scan without any point: the lidar measured nothing, or the file is empty. A drive goes on without it."""
+    """A scan without any point: the lidar measured nothing, or the file is empty. A drive continues without it."""
 
 
 class Note(NamedTuple):
@@ -45,7 +45,7 @@ class Note(NamedTuple):
 
     Attributes:
         text: one line that names the file.
-        is_doubt: the input may be wrong; False for a mere decision.
+        is_doubt: True if the input may be wrong; False for a mere decision.
     """
 
     text: str
@@ -77,7 +77,7 @@ def _require_shapes(record: Any, shapes: dict[str, tuple[int, ...]]) -> None:
 
 
 def _select(record: Any, names: tuple[str, ...], selection: Selection) -> dict[str, Any]:
-    """The selected rows of each field that is present."""
+    """Selects rows of each field that is present."""
     values = {name: getattr(record, name) for name in names}
     return {name: None if value is None else value[selection] for name, value in values.items()}
 
@@ -91,7 +91,7 @@ class ScanSequence:
         points: (n, b, 2) float32 beam end points in the sensor frame (x forward, y left), in `unit`; zero where masked.
         mask: (n, b) bool, True where the beam measured something.
         unit: unit of lengths.
-        is_organised: beams of a scan are ordered by angle, neighbours in the array are neighbours in the world.
+        is_organised: True where beams are ordered by angle: neighbours in the array are neighbours in the world.
         reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
         odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
         times: (n,) float64 seconds, or None.
@@ -124,7 +124,7 @@ class ScanSequence:
         return len(self.points)
 
     def take(self, selection: Selection) -> ScanSequence:
-        """The selected scans with their poses and times; arrays are views where `selection` is a slice."""
+        """Selects scans with their poses and times; arrays are views where `selection` is a slice."""
         names = ("points", "mask", "reference_poses", "odometry_poses", "times")
         return replace(self, **_select(self, names, selection))
 
@@ -135,7 +135,7 @@ class Relations(NamedTuple):
     Attributes:
         times_from: (r,) seconds.
         times_to: (r,) seconds.
-        T_from_to: (r, 3) x, y in metres, heading; where the robot is at `times_to`, seen from `times_from`.
+        T_from_to: (r, 3) x, y in metres and heading at `times_to`, in the frame of the robot at `times_from`.
     """
 
     times_from: FloatArray
@@ -164,8 +164,8 @@ def pad_scans(scans: Sequence[NDArray[np.floating]]) -> tuple[NDArray[np.float32
 def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:
     """Returns True where the beams of scans are ordered by angle, as 1-D convolutions and neighbour normals need it.
 
-    A scan is in order when at least 95 % of the turns from one valid beam to the next have one direction, and their sum
-    is one turn at most (plus 5 % for noise). The sequence is in order when at least 90 % of its scans are. Scans with
+    In an ordered scan at least 95 % of the turns from one valid beam to the next have one direction. Their sum is one
+    turn at most (plus 5 % for noise). The sequence is in order when at least 90 % of its scans are. Scans with
     fewer than three valid beams do not count.
 
     Args:
@@ -211,7 +211,7 @@ class World:
 
 
 def largest_region(is_free: BoolArray) -> BoolArray:
-    """The largest connected region of a raster.
+    """Finds the largest connected region of a raster.
 
     Args:
         is_free: (h, w).
@@ -256,12 +256,12 @@ class Camera:
             raise ValueError(f"camera: expected a size and focal lengths above 0, got {self}")
 
     def rays(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
-        """Directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
+        """Computes directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
         x, y = np.meshgrid((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def sample_pixels(self, height: int, width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows (height,) and columns (width,) spread evenly over the image, in the middles of their cells."""
+        """Chooses rows (height,) and columns (width,) spread evenly over the image, in the middles of their cells."""
         rows = ((np.arange(height) + 0.5) * self.height / height).astype(np.int64)
         return rows, ((np.arange(width) + 0.5) * self.width / width).astype(np.int64)
 
@@ -278,7 +278,7 @@ class DepthSequence:
         name: name for titles and messages.
         points: (n, h, w, 3) float32 metres in the camera frame (x right, y down, z forward); zero where masked.
         mask: (n, h, w) bool.
-        is_planar: the camera moved on a plane: x, z and the angle about y.
+        is_planar: True where the camera moved in a plane: x, z and the angle about y.
         T_world_camera: (n, 4, 4) float64 reference poses, or None.
 
     Raises:
@@ -300,25 +300,25 @@ class DepthSequence:
         return len(self.points)
 
     def take(self, selection: Selection) -> DepthSequence:
-        """The selected images with their poses."""
+        """Selects images with their poses."""
         return replace(self, **_select(self, ("points", "mask", "T_world_camera"), selection))
 
 
 @dataclass(frozen=True)
 class LidarSequence:
-    """Scans of one drive, read lazily: `sequence[i]` reads scan i, and a loop reads one scan after the other.
+    """Scans of one drive, read lazily: `sequence[i]` reads scan i, and a loop reads the scans in turn.
 
     Read this way, a scan without points is (0, 3).
 
     Attributes:
         name: short name of the source, for titles and folders.
-        sources: where each scan comes from: a file, in general.
+        sources: source of each scan, in general a file.
         read_scan: read_scan(i) gives scan i as (n, 3) float32 points in the lidar's frame (x forward, y left, z up), m.
             A bad scan raises an InputError that names the file.
         T_world_lidar: (num_scans, 4, 4) float64 reference poses, NaN for scans without one; or None.
         times: (num_scans,) float64 s, or None.
-        read_times: read_times(i) gives when each point of scan i was measured, (n,) float64 in the unit of its file, or
-            None where the file does not say; the same errors. None: no scan says.
+        read_times: read_times(i) gives the times of the points of scan i, (n,) float64 in the unit of its file, or None
+            where the file has none; it raises the same errors. None: no scan has times.
         notes: decisions of the reader about the input, and doubts.
 
     Raises:
@@ -346,7 +346,7 @@ class LidarSequence:
 
     @property
     def has_reference(self) -> BoolArray:
-        """(num_scans,) whether a scan has a reference pose."""
+        """(num_scans,) True for scans with a reference pose."""
         T = self.T_world_lidar
         return np.zeros(len(self), bool) if T is None else np.asarray(np.isfinite(T.reshape(-1, 16)).all(axis=1))
 
@@ -366,7 +366,7 @@ class LidarSequence:
             return np.zeros((0, 3), np.float32)
 
     def take(self, selection: Selection) -> LidarSequence:
-        """The selected scans with their poses and times, in the same world; nothing is read."""
+        """Selects scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(self.num_scans)[selection]]
         sources, chosen = tuple(self.sources[i] for i in numbers), _select(self, ("T_world_lidar", "times"), selection)
         read_times = self.read_times

@@ -1,7 +1,7 @@
-"""The nouns of the project: frozen pytrees of arrays and masks.
+"""The records of the project: frozen pytrees of arrays and masks.
 
-Ragged things are capacity + mask: an array of fixed size and a boolean of the same leading shape that says which
-entries are real. What is masked out may hold any finite number and never takes part in a result.
+Ragged things are capacity + mask: an array of fixed size and a boolean of the same leading shape, True for
+valid entries. Masked entries may hold any finite number and never take part in a result.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-# What public functions take: an array of JAX or of NumPy. They return arrays of JAX.
+# Input of public functions: an array of JAX or of NumPy. They return arrays of JAX.
 AnyArray = jax.Array | np.ndarray
 
 
@@ -63,7 +63,7 @@ class SurfaceElements:
 
     Attributes:
         positions: metres.
-        normals: unit vectors, either side; any where `planarity` is 0.
+        normals: unit vectors of either sign; undefined where `planarity` is 0.
         planarity: in [0, 1]: (l2 - l1) / l3 of the eigenvalues of the covariance of the neighbourhood, smallest first;
             0 where there is no plane.
         mask: True for valid elements; invalid ones may hold anything.
@@ -89,8 +89,8 @@ class DescriptorCloud:
         directions: cosine and sine of the azimuth of the frame of each descriptor (`EncoderConfig.frame`), in the
             frame of the cloud; a map keeps those of its scans. None for a single scan with frames along its rays, whose
             positions give them.
-        normals: unit normals of the surface at each point, in the frame of the cloud, either side; None in a cloud
-            without surface elements.
+        normals: unit normals of the surface at each point, in the frame of the cloud, of either sign; None in a
+            cloud without surface elements.
         planarity: see `SurfaceElements`; None together with `normals`.
     """
 
@@ -103,13 +103,13 @@ class DescriptorCloud:
 
     @property
     def described(self) -> DescriptorCloud:
-        """The points that have features, without surface elements: what matching reads; of stacked clouds too."""
+        """The points with features, without further surface elements, for matching; also of stacked clouds."""
         num = self.features.shape[-2]
         return DescriptorCloud(self.positions[..., :num, :], self.features, self.mask[..., :num], self.directions)
 
     @property
     def elements(self) -> SurfaceElements:
-        """All points as surface elements; a `ValueError` says if the cloud has no normals."""
+        """All points as surface elements; raises a `ValueError` if the cloud has no normals."""
         if self.normals is None or self.planarity is None:
             raise ValueError("cloud: expected surface elements, got a cloud without normals and planarity")
         return SurfaceElements(self.positions, self.normals, self.planarity, self.mask)
@@ -125,11 +125,11 @@ class Verification(NamedTuple):
             source.
         contradicted_share: share of the visible points that lie in the free space seen by the opposite scan.
         score: log odds that the motion is right, by walls and level ground that meet and by free space.
-        gap: how much more it is than the score of the best other hypothesis that was tried, or than 0.
+        gap: difference of `score` to that of the best hypothesis for another place, or to 0 if that is more.
         num_tried: number of hypotheses that were tried.
-        num_slid: number of further motions along a weak axis; 0 where the walls hold all directions.
-        facing_gap: how many more elements that face the weak axis meet and do not contradict than under the best other
-            motion that was tried; 0 where no axis is weak.
+        num_slid: number of further motions along a weak axis; 0 where the walls constrain all directions.
+        facing_gap: lead over the best other motion, or over 0, in elements that face the weak axis: those that meet,
+            less a penalty of those that contradict. It is 0 where no axis is weak.
     """
 
     visible_share: float
@@ -144,24 +144,25 @@ class Verification(NamedTuple):
 
 @flax.struct.dataclass
 class Registration:
-    """The motion between two descriptor clouds, and how far it can be trusted; failure is data.
+    """The motion between two descriptor clouds, and its confidence; failure is data.
 
     Attributes:
-        T_target_source: maps points of the source to the target; the identity where no pair was left.
-        confidence: in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is right
-            within 2 m and 5 degrees; else it is `mean_score`, which is no probability and 0 without any inlier.
+        T_target_source: motion that maps points of the source to the target; the identity where no pair was left.
+        confidence: number in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is
+            right within 2 m and 5 degrees. Without calibration it is `mean_score`, which is no probability.
         mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
         rmse: root mean square error of the inliers after alignment, metres; infinite without any.
         support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
-        num_inliers: how many pairs the motion rests on, both directions counted.
+        num_inliers: number of pairs that determine the motion, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.
         target_indices: the same in the target.
-        scores: how well the two of a pair match, in [0, 1].
-        is_inlier: True for pairs that the motion rests on.
-        verification: how well the scans themselves agree; None where only descriptors were registered.
-        weak_direction: the horizontal direction in which the translation is known least, as a unit vector in the target
-            frame; in a corridor its axis. None where only descriptors were registered.
-        weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet; None likewise.
+        scores: matching score of each pair, in [0, 1].
+        is_inlier: True for pairs that determine the motion.
+        verification: agreement of the scans themselves; None where only descriptors were registered.
+        weak_direction: the horizontal direction in which the translation is least certain, as a unit vector in the
+            target frame; in a corridor its axis. None where only descriptors were registered.
+        weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet; None in the same
+            case.
     """
 
     T_target_source: Float[Array, "4 4"]
@@ -188,7 +189,7 @@ class PyramidLevel:
         mask: True for points that are there.
         sample_indices: row of each point in the level before.
         neighbours: for each block (m, k) rows, nearest first, those beyond the radius replaced by the nearest. Block 0
-            has neighbours in the level before, every later block in this level. Points that are not there are nobody's
+            has neighbours in the level before, every later block in this level. Points that are not there are no
             neighbours.
     """
 
@@ -204,7 +205,7 @@ class Interpolation:
 
     Attributes:
         indices: the three nearest points of the coarser level.
-        weights: their shares; each row sums to one, or to zero where either side is not there.
+        weights: their weights; each row sums to one, or to zero where either side is masked.
     """
 
     indices: Int[AnyArray, "m 3"]
@@ -213,7 +214,7 @@ class Interpolation:
 
 @flax.struct.dataclass
 class PointPyramid:
-    """All levels, fine to coarse, and the way up again.
+    """All levels, fine to coarse, and the interpolations back to finer levels.
 
     Attributes:
         levels: the input and one level for each stage.

@@ -1,4 +1,4 @@
-"""Registration by training: L-Net and M-Net are optimised on one set of scans (papers/DeepMapping, CVPR 2019)."""
+"""Registration by training: L-Net and M-Net are optimised on one set of scans (DeepMapping, CVPR 2019)."""
 
 import lazy_loader as _lazy
 

@@ -15,8 +15,8 @@ class ChamferComparison:
     """Comparison of pairs of scans by the Chamfer distance (DeepMapping eq. 7).
 
     Attributes:
-        limit: largest distance, to which larger ones are clipped, at the start and at the end of the phase, so that
-            points outside the overlap have no gradient; None: no limit.
+        limit: distance to which larger ones are clipped, at the start and at the end of the phase, so that points
+            outside the overlap have no gradient; None: no limit.
     """
 
     limit: tuple[float, float] | None = None
@@ -50,7 +50,7 @@ CHAMFER = ChamferComparison()
 
 @dataclass(frozen=True)
 class PhaseConfig:
-    """One phase of the fit. Lengths are in typical ranges: the range that nine beams in ten stay below.
+    """One phase of the fit. Lengths are in typical ranges; nine beams in ten are shorter than the typical range.
 
     Attributes:
         name: name in logs and pictures.

@@ -263,7 +263,8 @@ def resume(
     while not is_finished(problem, state) and not (stop is not None and stop()):
         begun = time.perf_counter()
         state = _enter_phase(problem, state, data)
-        # JAX keeps the program of each phase and number of starts.
+        # Compiled ahead, so that compile time is counted apart; JAX keeps the program of each phase and number of
+        # starts.
         program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
         compiled = time.perf_counter()
         state, report = jax.block_until_ready(program(state, data))

@@ -240,7 +240,7 @@ def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..
         return Registered(T, "fit", misfit, None, None, fitted)
     T_start = np.asarray(start, np.float64)
     start_misfit = misfit_of(T_start)
-    # False for a misfit that is not finite.
+    # The comparison is False for a misfit that is not finite, so the start is kept then.
     if misfit < start_misfit:
         return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
     return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)

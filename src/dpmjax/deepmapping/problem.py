@@ -74,10 +74,10 @@ class Sensor(NamedTuple):
     Attributes:
         scaled_start: (start, number of scans, unit) -> checked poses in typical ranges.
         unscaled: (poses, unit) -> float64 poses in the unit of the points.
-        init: as in Problem.
-        loss: as in Problem.
-        poses: as in Problem.
-        next_phase: as in Problem.
+        init: function of `Problem`.
+        loss: function of `Problem`.
+        poses: function of `Problem`.
+        next_phase: function of `Problem`.
     """
 
     scaled_start: Callable[..., Array]
@@ -164,7 +164,7 @@ def _frozen(optimizer: optax.GradientTransformation) -> optax.GradientTransforma
 
 
 def choose_frame(points_world: Float[Array, "... d"], mask: Array, margin: float) -> MapFrame:
-    """Computes the square or cube around points, with a margin.
+    """Computes the frame of M-Net: the square or cube around points, with a margin.
 
     Args:
         points_world: (..., d).

@@ -58,7 +58,7 @@ class ScalarNet(nn.Module):
 
     @nn.compact
     def __call__(self, z: Float[Array, ""]) -> Float[Array, ""]:
-        """The value x that the auxiliary variable z stands for."""
+        """Computes the value x from the auxiliary variable z."""
         x = z[None]
         for features in self.config.features:
             x = nn.elu(self._linear(features, x))

@@ -1,4 +1,4 @@
-"""DeepPointMap: descriptor clouds, how they are matched, and how the networks that make them are trained."""
+"""DeepPointMap: descriptor clouds of scans, their matching and registration, and the training of its networks."""
 
 import lazy_loader as _lazy
 

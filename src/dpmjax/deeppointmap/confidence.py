@@ -1,7 +1,7 @@
 """Confidence of a registration, and of an overlap: probabilities by logistic regression on a few features.
 
-Platt (1999): a score becomes a probability by a logistic function that is fitted on held-out examples. It is fitted by
-`python -m experiments.dpm_calibrate` and stored in the configuration of the model.
+Platt (1999): a score becomes a probability by a logistic function that is fitted on held-out examples. The function is
+fitted by `python -m experiments.dpm_calibrate` and stored in the configuration of the model.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
 SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
 WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
-# Higher log odds tell nothing more where walls hold one direction only: wrong motions have them, too.
+# Where walls constrain one direction only, wrong motions reach higher log odds, too.
 MAX_SCORE = 3.0
 RIDGE = 1e-3
 
@@ -30,22 +30,22 @@ class OverlapEvidence(NamedTuple):
     """Features from which overlap is predicted; similarities are cosines, shares are in [0, 1].
 
     Attributes:
-        scan_similarity: of the mean encoder features of both clouds.
-        similarity_median: median, over descriptors, of the similarity to the best descriptor of the other cloud.
-        similarity_high: a high quantile of the same.
-        score_median: median of the dual softmax with the best descriptor of the other cloud.
-        score_high: a high quantile of the same.
-        mutual_share: share of the descriptors whose best ones choose them in turn.
+        scan_similarity: similarity of the mean encoder features of both clouds.
+        similarity_median: median, over descriptors, of the similarity to the best descriptor of the opposite cloud.
+        similarity_high: a high quantile of the same similarity.
+        score_median: median of the dual softmax with the best descriptor of the opposite cloud.
+        score_high: a high quantile of the same dual softmax.
+        mutual_share: share of the descriptors that are the best match of their own best match.
         support: consensus support of the best motion, as a share of the pairs.
-        near_support: the same where the motion is shorter than 20 m, falling to 0 beyond.
-        support_second: support of the best other motion.
+        near_support: `support` of a motion shorter than 20 m; it falls to 0 beyond.
+        support_second: support of the second motion.
         offset_disagreement_m: mean difference, over inliers, of the two offsets that are predicted from both sides.
         distance_m: length of the motion.
-        met_share: share of the descriptors that meet a descriptor of the other cloud under the motion.
-        met_similarity: mean similarity of those that meet.
+        met_share: share of the descriptors that meet a descriptor of the opposite cloud under the motion.
+        met_similarity: mean similarity of the descriptors that meet.
         spread_m: spread of the inliers in the horizontal plane.
         log_radius: logarithm of the smaller of the mean distances of the descriptors from both origins.
-        log_radius_ratio: logarithm of their ratio.
+        log_radius_ratio: logarithm of the ratio of these two mean distances.
     """
 
     scan_similarity: Float[Array, ""]
@@ -75,7 +75,7 @@ class LogisticModel:
 
     Attributes:
         features: names of the features.
-        weights: one for each.
+        weights: weight of each feature.
         bias: the constant.
     """
 
@@ -95,10 +95,10 @@ class Calibration:
     """Logistic models of P(right within 2 m and 5 degrees).
 
     Attributes:
-        of_clouds: of registrations of descriptor clouds.
-        of_scans: of registrations that the scans have verified.
-        of_weak_scans: of verified scans whose walls hold one direction only, as in corridors; None uses `of_scans` for
-            them.
+        of_clouds: model for descriptor clouds.
+        of_scans: model for motions that the scans have verified.
+        of_weak_scans: model for verified scans whose walls constrain one direction only, as in corridors; None uses
+            `of_scans`.
     """
 
     of_clouds: LogisticModel
@@ -112,7 +112,7 @@ class MatchEvidence(NamedTuple):
     Attributes:
         of_clouds: `CLOUD_FEATURES`.
         of_scans: `SCAN_FEATURES`; None without scans.
-        of_weak_scans: `WEAK_FEATURES`; None where the walls hold all directions, and without scans.
+        of_weak_scans: `WEAK_FEATURES`; None where the walls constrain all directions, and without scans.
     """
 
     of_clouds: Float[np.ndarray, " f"]
@@ -125,8 +125,8 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
 
     Args:
         hypotheses: all hypotheses of a pair, with a leading axis.
-        row: the one that was chosen; None for a motion that no pairs of descriptors support.
-        verification: its verification; None without scans.
+        row: row of the chosen one; None for a motion that no pairs of descriptors support.
+        verification: verification of the chosen motion; None without scans.
 
     Returns:
         The features.
@@ -146,10 +146,10 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
 
 
 def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
-    """Computes `WEAK_FEATURES`; the noise of a count grows with its root.
+    """Computes `WEAK_FEATURES`. A count enters by its root, because its noise grows with the root.
 
     Args:
-        verification: of a motion whose walls hold one direction only.
+        verification: verification of scans whose walls constrain one direction only.
 
     Returns:
         The features.
@@ -179,7 +179,7 @@ def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f
 
     Args:
         model: fitted weights.
-        features: in the order of `model.features`.
+        features: features in the order of `model.features`.
 
     Returns:
         In [0, 1].
@@ -194,8 +194,8 @@ def fit_logistic(
 
     Args:
         names: names of the features.
-        features: of held-out registrations.
-        is_right: which of them are right.
+        features: features of held-out registrations.
+        is_right: True for right registrations.
 
     Returns:
         The model.
@@ -213,8 +213,8 @@ def fit_weights(
     """Fits the weights and the constant of a logistic model; see `fit_logistic`.
 
     Args:
-        features: of examples.
-        is_right: which of them are right.
+        features: features of examples.
+        is_right: True for right examples.
 
     Returns:
         Weights and constant.

@@ -21,7 +21,7 @@ from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
 # Number of scans, or of pairs, in one call of a compiled program.
 CHUNK = 4
 
-# Scans whose extent is nearer to half or a quarter of the full one than to the whole are enlarged by 2 or 4.
+# A scan whose extent is nearest to a half or a quarter of the full one is enlarged by 2 or 4.
 EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 
 
@@ -34,8 +34,8 @@ def encode(
 ) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
-    A `ValueError` says if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements` is
-    out of range. A warning says if hardly any point is in range: the points are then probably not in metres.
+    Raises a `ValueError` if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements`
+    is out of range. Warns if hardly any point is in range: the points are then probably not in metres.
 
     Args:
         model: its configuration includes the preprocessing.
@@ -63,7 +63,7 @@ def encode_scans(
 ) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
-    A `ValueError` says if there is no scan, or if points are no real numbers (n, 3).
+    Raises a `ValueError` if there is no scan, or if points are no real numbers (n, 3).
 
     Args:
         model: encoder and configuration.
@@ -77,7 +77,7 @@ def encode_scans(
     require_some("scans", scans)
     parts = []
     for start in range(0, len(scans), CHUNK):
-        # JAX still encodes the chunk before.
+        # JAX encodes the chunk before at the same time.
         pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
         parts.append(_encode_chunk(model, stack_chunk(pyramids), num_elements=num_elements))
     return join_chunks(parts, len(scans))
@@ -118,7 +118,7 @@ def pyramid_of_scan(
 ) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
 
     Args:
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
@@ -140,7 +140,7 @@ def thin_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, 
         scale: factor by which the points are enlarged first.
 
     Returns:
-        The points that are left, metres times the scale; arrays of NumPy.
+        The remaining points, metres times the scale; arrays of NumPy.
 
     Raises:
         ValueError: if the points are no real numbers (n, 3), or if the scale is not positive.

@@ -34,7 +34,7 @@ NUM_CONFIDENT = 30
 # An inlier's error is at most the mean plus this many standard deviations of the inliers before.
 INLIER_SIGMAS = 3.0
 
-# Least number of first inliers; where fewer pairs have such scores, this number of the best pairs is taken.
+# Least number of first inliers; if fewer pairs have high enough scores, this number of the best pairs is taken.
 MIN_NUM_FIRST = 64
 
 # Pairs with higher scores are the first inliers.
@@ -92,9 +92,9 @@ def match_hypotheses(
     """Estimates the best distinct motions between two descriptor clouds (DeepPointMap section 3.2, eq. 1 to 3).
 
     The pairs with the highest products of both softmaxes of the similarity count twice: as T (p + offset) = q and as
-    T p = q + offset. A weighted SVD over both sets solves eq. 3 with the scores as weights; then the errors decide
-    about the inliers again, in rounds. The number of pairs depends on the number of valid descriptors, so padded clouds
-    give the same result as unpadded ones.
+    T p = q + offset. A weighted SVD over both sets solves eq. 3 with the scores as weights; then the
+    inliers are chosen again by their errors, in rounds. The number of pairs depends on the number of valid descriptors,
+    so padded clouds give the same result as unpadded ones.
 
     Use `vmap` for several pairs of clouds.
 
@@ -138,7 +138,7 @@ def dual_softmax(
     Args:
         similarity: cosine of each pair of descriptors.
         is_pair: False for pairs that are not there.
-        temperature: of both softmaxes.
+        temperature: temperature of both softmaxes.
 
     Returns:
         In [0, 1]; 0 for pairs that are not there.
@@ -245,7 +245,7 @@ class _PointPairs(NamedTuple):
 
 
 def _first_inliers(pairs: _PointPairs, config: MatchConfig) -> Bool[Array, "h p"]:
-    """Returns the first inliers of each hypothesis: the best scores, or what supports each motion of the consensus."""
+    """Returns the first inliers of each hypothesis: pairs of the best scores, or those that support its motion."""
     source, target, scores, is_used = lax.stop_gradient(pairs)
     if config.consensus is None:
         ranks = jnp.argsort(jnp.argsort(jnp.where(is_used, -scores, jnp.inf)))
@@ -310,7 +310,7 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
         normals_map = rigid.transform_points(turn, jnp.where(clouds.mask[..., None], clouds.normals, 0))
 
     def joined(values: Array) -> Array:
-        # Those that have features stand in front, in the map as in each cloud.
+        # Descriptors with features come first, in the map as in each cloud.
         parts = values[:, :num_described], values[:, num_described:]
         return jnp.concatenate([part.reshape(-1, *values.shape[2:]) for part in parts])
 
@@ -320,10 +320,10 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
 
 
 def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
-    """Removes descriptors of places that an earlier cloud of the union describes, on the host; see `thinned_mask`.
+    """Removes descriptors of a union near those of earlier clouds, on the host; see `thinned_mask`.
 
     Args:
-        merged: from `merge_clouds`, without further surface elements.
+        merged: union from `merge_clouds`, without further surface elements.
         num_a_cloud: number of descriptors of each cloud.
 
     Returns:
@@ -342,7 +342,7 @@ def thinned_mask(
     cloud is nearer than the spacing of the first cloud: the median distance between its nearest descriptors.
 
     Args:
-        positions: of the clouds of the union, cloud by cloud, in one frame, metres.
+        positions: positions of the clouds of the union, cloud by cloud, in one frame, metres.
         mask: False for descriptors that are not there.
         num_a_cloud: number of descriptors of each cloud.
 

@@ -102,8 +102,8 @@ def model_fingerprint(model: Model) -> str:
 def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes one scan to descriptors in metres, in the frame of the lidar (DeepPointMap section 3.1).
 
-    Each descriptor is a surface element too: its normal is that of the plane through the neighbours that the encoder
-    looks at first.
+    Each descriptor is a surface element too: its normal is that of the plane through its neighbours in the first
+    block of the encoder.
 
     Args:
         model: a model whose `config.pyramid` built the pyramid.
@@ -167,7 +167,7 @@ def overlap_logit(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float
     Args:
         model: encoder and decoder.
         a: a correlated cloud.
-        b: the other correlated cloud.
+        b: the second correlated cloud.
 
     Returns:
         The logit.
@@ -196,7 +196,7 @@ def descriptor_similarity(model: Model, a: DescriptorCloud, b: DescriptorCloud) 
     Args:
         model: encoder and decoder.
         a: a correlated cloud.
-        b: the other correlated cloud.
+        b: the second correlated cloud.
 
     Returns:
         Cosines in [-1, 1]; 0 for a descriptor whose features are 0.
@@ -248,13 +248,13 @@ def predict_offsets(
         model: encoder and decoder.
         features: correlated features of the first cloud, one row for each pair.
         partners: correlated features of the second cloud, row for row.
-        directions: of the frames of the first cloud, row for row (`geometry.bearing.directions_of`). With None, and
-            in the frame "lidar", offsets stay as the head predicts them.
+        directions: directions of the frames of the first cloud, row for row (`geometry.bearing.directions_of`). With
+            None, and in the frame "lidar", offsets stay as the head predicts them.
         partner_rows: if given, the partners are `partners[partner_rows]`; cheaper where partners are in several pairs.
 
     Returns:
-        Offsets in metres, in the frame of the first cloud; in those of the descriptors without directions. All are 0
-        where the decoder predicts none.
+        Offsets in metres, in the frame of the first cloud; without `directions`, in the frames of the descriptors. All
+        are 0 where the decoder predicts none.
     """
     if not model.config.decoder.predicts_offsets:
         others = partners.shape[:-1] if partner_rows is None else partner_rows.shape

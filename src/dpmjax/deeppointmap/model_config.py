@@ -31,8 +31,8 @@ class ModelConfig:
         preprocess: filters of raw scans, in training and inference alike.
         matching: choice of descriptor pairs and inliers.
         verification: verification of hypotheses by the scans, and the final alignment.
-        calibration: of the confidence; None where it was not fitted.
-        overlap: model of the overlap probability; None where it was not fitted, and the decoder's head answers.
+        calibration: calibration of the confidence; None where it was not fitted.
+        overlap: model of the overlap probability; None where it was not fitted: the decoder's head predicts it.
     """
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
@@ -78,7 +78,7 @@ def model_preset(name: str) -> ModelConfig:
     Returns:
         The configuration.
 
-    A name that no preset has is a `ValueError`.
+    An unknown name raises a `ValueError`.
     """
     require_one_of("name", name, PRESETS)
     return PRESETS[name]

@@ -1,7 +1,7 @@
-"""Choice among motion hypotheses: each is aligned by the surfaces of both scans, and the scans choose.
+"""Choice among motion hypotheses: each is aligned by the surfaces of both scans, and compared by them.
 
 In corridors wrong motions agree with the scans, too. There, motions along the axis and half-turns are tried, and the
-elements that face the axis choose.
+surface elements that face the axis decide.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ NUM_FINE = 3
 # No further hypothesis is tried after one with higher log odds.
 CLEAR_SCORE = 1.0
 
-# Distance of the motions that are tried along a weak axis.
+# Spacing of the motions that are tried along a weak axis.
 SLIDING_STEP_M = 0.7
 
 # Number of these motions that are aligned finely.
@@ -87,10 +87,10 @@ class VerifiedMotion(NamedTuple):
     """A hypothesis after verification.
 
     Attributes:
-        row: the hypothesis of the descriptors that it comes from, or agrees with; None where only the views of the
-            scans have suggested it.
+        row: row of the hypothesis of the descriptors that it comes from, or agrees with; None for a motion of the
+            correlated views alone.
         T_target_source: its motion after the alignment of the surfaces.
-        verification: how well the scans agree under that motion.
+        verification: agreement of the scans under that motion.
     """
 
     row: int | None
@@ -103,12 +103,12 @@ def choose_motion(
 ) -> VerifiedMotion:
     """Chooses the hypothesis under which two scans agree best.
 
-    The walls of a corridor hold one horizontal direction only. There, motions along its axis are tried too, both ways
-    round, and the elements that face the axis choose.
+    The walls of a corridor constrain one horizontal direction only. There, motions along its axis are tried too, with
+    and without a half-turn, and the elements that face the axis decide.
 
     Args:
         source: a scan.
-        target: the other.
+        target: the second scan.
         T_target_source: at least one hypothesis, the most likely first.
         config: alignments and tolerances.
 
@@ -188,7 +188,7 @@ class _Candidate(NamedTuple):
 def _candidates(
     source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
 ) -> Iterator[list[_Candidate]]:
-    """Yields hypotheses, some at a time, from the second time on in turn with motions from the views of the scans."""
+    """Yields hypotheses in batches; from the second batch on, they alternate with motions of the correlated views."""
     hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
     yield hypotheses[:HYPOTHESES_AT_ONCE]
     searched: list[_Candidate] = []
@@ -207,8 +207,8 @@ def refine_motion(
 
     Args:
         source: a scan.
-        target: the other.
-        motion: from `choose_motion`.
+        target: the second scan.
+        motion: motion from `choose_motion`.
         config: alignment and tolerances.
 
     Returns:
@@ -228,14 +228,14 @@ def weak_direction_of(
 
     Args:
         source: a scan.
-        target: the other.
+        target: the second scan.
         T_target_source: the motion.
         config: tolerances.
 
     Returns:
         The direction in the target frame, and the standard deviation of the translation along it.
     """
-    # The first samples are of all directions alike, which would hide that few elements face the weak one.
+    # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
     level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
     pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
     up = T_level_lidar(target.surface)[2, :3]
@@ -243,7 +243,7 @@ def weak_direction_of(
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:
-    """Finds the motions that differ from another one: near-equal ones do not compete."""
+    """Returns True for motions to another place than that of `T_other`; only these compete with it."""
     difference = rigid.inverse(T_other) @ T
     cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     return (np.linalg.norm(difference[:, :3, 3], axis=1) > DISTINCT_M) | (cosine < np.cos(DISTINCT_RAD))

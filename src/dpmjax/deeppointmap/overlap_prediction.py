@@ -1,9 +1,9 @@
 """Overlap: the probability that two scans or maps are less than 20 m apart, from how well their descriptors match.
 
-The published head sees the mean of the correlated features alone. What tells overlap is in the match: how alike the
-best pairs are, and how many of them agree on one motion. These numbers, the evidence, come from descriptors only, so
-that thousands of candidates can be compared. A logistic regression, fitted by `python -m experiments.dpm_calibrate`,
-turns them into a probability. A model without one, as a published one, answers with its head.
+The published head sees the mean of the correlated features alone. Overlap shows in the match: in the
+similarity of the best pairs, and in the number of pairs that agree on one motion. These numbers, the evidence, come
+from descriptors only, so that thousands of candidates can be compared. A logistic regression, fitted by `python -m
+experiments.dpm_calibrate`, turns them into a probability. Published models have no regression and use their head.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
     """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
 
-    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) rests it on the match of the
-    descriptors. It is fitted on simulated towns and buildings. Half of the pairs overlapped, a quarter was 20 to 40 m
-    apart, and a quarter was farther apart or of different places. Where overlap is rarer, the probability is too high.
-    A model without it answers with the decoder's head (DeepPointMap section 3.2), which is right for published weights
-    only.
+    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) predicts it from the match
+    of the descriptors. It is fitted on simulated towns and buildings. Half of the pairs overlapped, a quarter was 20 to
+    40 m apart, and a quarter was farther apart or of different places. Where overlap is rarer, the probability is too
+    high. A model without calibration uses the decoder's head (DeepPointMap section 3.2), which is right for published
+    weights only.
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if features have another width than the model.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if features have another width than the model.
 
     Args:
         model: encoder and decoder.
@@ -75,7 +75,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 
-    A `ValueError` says if the lengths differ or are 0.
+    Raises a `ValueError` if the lengths differ or are 0.
 
     Args:
         model: encoder and decoder.
@@ -91,7 +91,7 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
 def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
     """Computes the features of the overlap probability of many pairs.
 
-    A `ValueError` says if the lengths differ or are 0.
+    Raises a `ValueError` if the lengths differ or are 0.
 
     Args:
         model: encoder and decoder.
@@ -106,7 +106,7 @@ def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequen
 
 @jax.jit
 def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> OverlapEvidence:
-    """Matches two clouds and measures how well that went.
+    """Matches two clouds and computes the features of their overlap probability.
 
     Args:
         model: encoder and decoder.
@@ -114,7 +114,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
         b: the same.
 
     Returns:
-        The numbers; finite for finite features, also where a cloud is empty.
+        The features; finite for finite descriptors, also where a cloud is empty.
     """
     a, b = a.described, b.described
     correlated = correlate(model, a, b)
@@ -144,7 +144,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
 def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     """Predicts the probability that two clouds are less than 20 m apart.
 
-    A `ValueError` says if the features have another width than the model.
+    Raises a `ValueError` if the features have another width than the model.
 
     Args:
         model: encoder and decoder.
@@ -165,7 +165,7 @@ def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) ->
 
 
 def _of_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
-    """Applies the function of a pair to all of them; each scan is encoded once."""
+    """Applies a function of one pair to all pairs; each scan is encoded once."""
     require_pairs(sources, targets)
     clouds: dict[int, DescriptorCloud] = {}
     raw: dict[int, RawScan] = {}
@@ -190,7 +190,7 @@ def _of_chunk(function: Any, model: Model, pairs: Any) -> Any:
 def _best_motion(
     model: Model, correlated: tuple[DescriptorCloud, DescriptorCloud], similarity: Float[Array, "m n"]
 ) -> dict[str, Float[Array, ""]]:
-    # The fields of `OverlapEvidence` that the best motion gives.
+    # The fields of `OverlapEvidence` that depend on the best motion.
     a, b = correlated
     pairs = best_pairs(similarity, a.mask, b.mask, config=MATCHING)
     rows, columns = pairs.source_indices, pairs.target_indices

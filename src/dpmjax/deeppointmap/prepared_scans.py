@@ -1,4 +1,4 @@
-"""A scan that is ready for registrations; and the same in small integers, as maps keep it."""
+"""A scan that is ready for registrations, and its compact form in small integers for maps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PreparedScan(NamedTuple):
     """A scan that is ready for any number of registrations.
 
     Attributes:
-        descriptors: of the scan; positions in metres times `scale`.
+        descriptors: descriptors of the scan; positions in metres times `scale`.
         measured: surface and free space of the scan, metres.
         scale: factor by which the points were enlarged for the encoder.
     """
@@ -45,7 +45,7 @@ class PreparedScan(NamedTuple):
 # Points in metres, in the frame of the lidar.
 RawScan = PointCloud | Float[AnyArray, "_n 3"]
 
-# A raw scan; or the same prepared; or descriptors of a scan or of a map.
+# A raw scan, a prepared scan, or descriptors of a scan or of a map.
 ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
 
 # Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`.
@@ -67,7 +67,7 @@ def require_pairs(sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]
 def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:
     """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
 
-    A `ValueError` says if the points are no real numbers (n, 3), or if the scale is not positive.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
 
     Args:
         model: encoder and configuration.
@@ -83,7 +83,7 @@ def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Prepar
 def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
     """Prepares scans in their order; threads measure their surfaces while JAX encodes.
 
-    A `ValueError` says if the points of a scan are no real numbers (n, 3).
+    Raises a `ValueError` if the points of a scan are no real numbers (n, 3).
 
     Args:
         model: encoder and configuration.
@@ -93,7 +93,7 @@ def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0)
     Returns:
         The prepared scans.
     """
-    # Threads run NumPy only: compiled programs wait for threads of JAX, and may wait for each other.
+    # Threads run NumPy only: compiled programs need threads of JAX, and several may wait for each other.
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         clouds, measured = [], []
         for points in scans:
@@ -110,7 +110,7 @@ class CompactScan(NamedTuple):
         elements: surface elements in the order of farthest points; the first m have features.
         features: (m, c) in steps.
         feature_steps: (m,) step of the features of each descriptor, float32.
-        directions: (m,) azimuths of the frames of the descriptors, pi as 127.
+        directions: (m,) azimuths of the frames of the descriptors, in steps of pi / 127.
         image: range image.
     """
 
@@ -127,14 +127,14 @@ class CompactScan(NamedTuple):
         angles = self.directions * (np.pi / MAX_CODE)
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
         features = self.features * self.feature_steps[:, None]
-        # Arrays of NumPy stand for those of JAX.
+        # `DescriptorCloud` is typed for arrays of JAX, but these stay on the host.
         parts: tuple[Any, ...] = (elements.positions, features, elements.mask, directions)
         parts += elements.normals, elements.planarity
         return DescriptorCloud(*parts)
 
 
 def compact_scan(cloud: DescriptorCloud, image: RangeImage) -> CompactScan:
-    """Rounds what registration and verification need of a scan.
+    """Makes the compact form of a scan.
 
     Args:
         cloud: descriptors of one scan with surface elements and directions.
@@ -157,7 +157,7 @@ def round_features(
     """Rounds the features of each descriptor to 127 steps of their largest absolute value.
 
     Args:
-        features: of the descriptors.
+        features: features of the descriptors.
 
     Returns:
         The features in steps, and the steps.
@@ -173,16 +173,16 @@ def round_directions(directions: Float[np.ndarray, "m 2"]) -> Int8[np.ndarray, "
         directions: unit vectors.
 
     Returns:
-        Azimuths, pi as 127.
+        Azimuths in steps of pi / 127.
     """
     return np.rint(np.arctan2(directions[:, 1], directions[:, 0]) * (MAX_CODE / np.pi)).astype(np.int8)
 
 
 def expand_scan(compact: CompactScan) -> PreparedScan:
-    """Makes a scan ready for registrations, in a millisecond.
+    """Restores a scan for registrations, in a millisecond.
 
     Args:
-        compact: from `compact_scan`.
+        compact: compact form from `compact_scan`.
 
     Returns:
         Descriptors, surface and free space.

@@ -29,7 +29,7 @@ from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud
 
-# Of one registration, or of each of several.
+# Seconds of one registration, or of each of several.
 Seconds = float | Float[np.ndarray, " p"]
 
 # Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out.
@@ -69,10 +69,10 @@ class StagedRegistration(NamedTuple):
 
     Attributes:
         descriptors: `T_target_source` of the best hypothesis of the network alone.
-        verified: the one that the scans agree with best.
-        refined: the same after the final alignment.
-        evidence: numbers that the confidence rests on.
-        seconds: of each stage.
+        verified: motion under which the scans agree best.
+        refined: verified motion after the final alignment.
+        evidence: features of the confidence.
+        seconds: seconds of each stage.
     """
 
     descriptors: Float[np.ndarray, "4 4"]
@@ -89,10 +89,10 @@ class ScanEvaluation(NamedTuple):
         descriptors: errors of the network alone.
         verified: errors after the verification by the scans.
         refined: errors after the final alignment.
-        confidence: of each registration; a probability where the model is calibrated, else the mean score of the pairs
-            of descriptors.
+        confidence: confidence of each registration; a probability where the model is calibrated, else the mean score of
+            the pairs of descriptors.
         T_target_source: refined motions.
-        seconds: of the stages of each registration.
+        seconds: seconds of the stages of each registration.
     """
 
     descriptors: RegistrationRecall
@@ -180,9 +180,9 @@ class OverlapEvaluation(NamedTuple):
     """Overlap probabilities of pairs.
 
     Attributes:
-        probability: of each pair.
-        is_overlap: whether the scans are less than 20 m apart.
-        has_revisits: whether the overlapping pairs are revisits, because the drive comes back to places.
+        probability: overlap probability of each pair.
+        is_overlap: True for scans less than 20 m apart.
+        has_revisits: True if the overlapping pairs are revisits, because the drive comes back to places.
     """
 
     probability: Float[np.ndarray, " p"]
@@ -276,8 +276,8 @@ def overlap_candidates(drive: LidarSequence) -> tuple[Int[np.ndarray, "k 2"], In
         drive: scans with true poses.
 
     Returns:
-        Pairs nearer than 20 m, which are revisits if there are some; pairs farther than 40 m; whether there are
-        revisits.
+        Pairs nearer than 20 m, which are revisits if there are some; pairs farther than 40 m; True if there
+        are revisits.
 
     Raises:
         ValueError: if the drive has no poses.

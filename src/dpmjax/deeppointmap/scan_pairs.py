@@ -117,7 +117,7 @@ def draw_rows_apart(
     """Draws pairs of scans at a distance of each other, without repetition.
 
     Args:
-        distances_m: between all scans, metres.
+        distances_m: distances between all scans, metres.
         least_m: smallest distance of a pair, metres.
         most_m: largest one.
         num_pairs: number of pairs.

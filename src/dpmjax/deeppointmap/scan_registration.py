@@ -63,12 +63,12 @@ def register(
         source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; a scan can be registered with a map.
         config: choice of pairs and inliers; None takes that of the model.
-        refine: whether to end with a fine point-to-plane alignment: of two scans, or else of the surface elements of
-            both clouds, if they have some. Without it, the motion of two scans is that of the short alignment that
-            verified it, and any other that of the descriptors. None refines with a calibrated model: published
-            weights give the published motion.
-        scale: factor by which raw scans are enlarged for the encoder, or by which descriptors were; "auto" chooses 1,
-            2 or 4 from the extent of both scans. Prepared scans know theirs. The result is in metres.
+        refine: True ends with a fine point-to-plane alignment, of two scans or else of the surface elements of both
+            clouds, if they have some. False returns the motion of the short alignment that verified it for two
+            scans, else that of the descriptors. None is True with a calibrated model; published weights give the
+            published motion.
+        scale: factor by which raw scans are enlarged for the encoder, or by which the scans of descriptors were; "auto"
+            chooses 1, 2 or 4 from the extent of both scans. Prepared scans have their own. The result is in metres.
 
     Returns:
         `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
@@ -106,7 +106,7 @@ def register_each(
         One registration for each pair.
 
     Raises:
-        ValueError: as `register` says.
+        ValueError: see `register`.
     """
     refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
@@ -143,7 +143,7 @@ def register_pairs(
 ) -> Registration:
     """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
 
-    A `ValueError` says if the lengths differ or are 0, and what `register` would say of a pair.
+    Raises a `ValueError` if the lengths differ or are 0, or where `register` raises one for a pair.
 
     Args:
         model: encoder and decoder.
@@ -182,7 +182,7 @@ def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
     """Returns the motions of the hypotheses that any pair supports; at least one.
 
     Args:
-        hypotheses: from `match_clouds`.
+        hypotheses: hypotheses from `match_clouds`.
 
     Returns:
         T_target_source in float64, best first.
@@ -229,7 +229,7 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
 def _prepared(
     model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
 ) -> dict[int, DescriptorCloud | PreparedScan]:
-    # By identity; each scan once. Surfaces are measured only where both sides of a pair are scans.
+    # Each scan object once. Surfaces are measured only where both sides of a pair are scans.
     raw: dict[int, RawScan] = {}
     ready: dict[int, DescriptorCloud | PreparedScan] = {}
     for pair in pairs:
@@ -281,7 +281,7 @@ def _finished(model: Model, hypotheses: Registration, motions: _Motions) -> Regi
 
 @functools.partial(jax.jit, static_argnames="config")
 def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig) -> Registration:
-    """Does the work of `match_clouds`; for use in compiled programs.
+    """Matches two clouds as `match_clouds` does, inside a compiled program.
 
     Args:
         model: encoder and decoder.

@@ -94,7 +94,7 @@ class MeasuredScan(NamedTuple):
 
     Attributes:
         surface: points, normals and a tree, in the frame of the lidar.
-        image: ranges by direction.
+        image: range image, the free space.
     """
 
     surface: Surface
@@ -122,7 +122,7 @@ def verify_motions(
 
     Args:
         source: a scan.
-        target: the other.
+        target: the second scan.
         T_target_source: the motions.
         config: tolerances.
 
@@ -194,7 +194,7 @@ def evidence_shares(
 
     Args:
         source: a scan.
-        target: the other.
+        target: the second scan.
         T_target_source: motions.
         config: tolerances.
 

@@ -30,19 +30,19 @@ def info_nce(
     ignore: Bool[AnyArray, "m n"] | None = None,
     mask: Bool[AnyArray, " m"] | None = None,
 ) -> Float[Array, ""]:
-    """InfoNCE with cosine similarities, the mean over all queries that have a positive key.
+    """Computes InfoNCE with cosine similarities, the mean over all queries that have a positive key.
 
-    For query i with positive p: -log( exp(cos(q_i, k_p) / t) / sum_j exp(cos(q_i, k_j) / t) ), the sum over all keys
-    that are not ignored (van den Oord et al. 2018; DeepPointMap's pairing loss).
+    For query i with positive p it is -log( exp(cos(q_i, k_p) / t) / sum_j exp(cos(q_i, k_j) / t) ). The sum runs over
+    all keys that are not ignored (van den Oord et al. 2018; DeepPointMap's pairing loss).
 
     Args:
-        queries: descriptors of any length; only their direction counts. A zero vector is similar to nothing (0).
+        queries: descriptors of any norm; only their direction counts. A zero vector is similar to nothing (0).
         keys: the same.
         positives: row of each query's positive key; outside [0, n), -1 by custom, the query is not counted.
         temperature: t, above 0.
         ignore: True for pairs that are left out of the sum, neither positive nor negative. The positive itself always
             stays in.
-        mask: False for queries that are not counted. Keys that are not there belong into `ignore`.
+        mask: False for queries that are not counted. Keys that are not there are set in `ignore`.
 
     Returns:
         The loss; 0, with zero gradient, when no query counts. Gradients are finite, at zero vectors too.
@@ -103,12 +103,12 @@ def _unit(vectors: Float[Array, "n c"]) -> Float[Array, "n c"]:
 def offset_loss(
     predicted: Float[AnyArray, "n d"], true: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
 ) -> Float[Array, ""]:
-    """Mean Mahalanobis distance between predicted and true offsets (DeepPointMap eq. 6).
+    """Computes the mean Mahalanobis distance between predicted and true offsets (DeepPointMap eq. 6).
 
     The covariance is that of the residuals themselves, with n - 1 in the denominator, and is held constant for the
     derivative: so the loss compares residuals with each other, and the scale of the gradient does not shrink with them.
-        Where it cannot be inverted (too few residuals, or all of them in one plane) it is the identity,
-    and the loss is the mean distance.
+    Where the covariance cannot be inverted (too few residuals, or all of them in one plane) it is the identity, and the
+    loss is the mean distance.
 
     The mean is over all pairs, as in the published configuration, not first over those of each descriptor as in eq. 6.
 

@@ -23,7 +23,7 @@ def chamfer_distance(
     *,
     max_distance: float | Float[AnyArray, ""] | None = None,
 ) -> Float[Array, ""]:
-    """Mean distance from each point of a to the nearest of b, plus the same from b to a (DeepMapping eq. 5).
+    """Computes the mean distance from points of a to the nearest of b, plus that from b to a (DeepMapping eq. 5).
 
     Distances are Euclidean, not squared, in the unit of the points.
 
@@ -71,12 +71,13 @@ def _mean_distance(
 def occupancy_loss(
     logits: Float[AnyArray, "..."], labels: Float[AnyArray, "..."], weights: Float[AnyArray, "..."]
 ) -> Float[Array, ""]:
-    """Weighted binary cross entropy of occupancy logits (DeepMapping eq. 3 and 4).
+    """Computes the weighted binary cross entropy of occupancy logits (DeepMapping eq. 3 and 4).
 
     Args:
         logits: log odds of being occupied, any shape.
         labels: 1 occupied, 0 free; broadcasts against `logits`.
-        weights: of each sample, 0 for samples of invalid beams, which may hold anything; broadcasts against `logits`.
+        weights: weight of each sample, 0 for samples of invalid beams, which may hold anything; broadcasts against
+            `logits`.
 
     Returns:
         sum(weights * cross entropy) / sum(weights), in nats; 0, with zero gradient, when all weights are zero.
@@ -106,7 +107,7 @@ def _occupancy_loss(logits: jax.Array, labels: jax.Array, weights: jax.Array) ->
 
 @jax.custom_jvp
 def _cross_entropy(logits: jax.Array, labels: jax.Array) -> jax.Array:
-    """-y log p - (1 - y) log(1 - p) for p = sigmoid(logit), without the overflow."""
+    """Computes -y log p - (1 - y) log(1 - p) for p = sigmoid(logit), without the overflow."""
     return jnp.maximum(logits, 0) - labels * logits + jnp.log1p(jnp.exp(-jnp.abs(logits)))
 
 

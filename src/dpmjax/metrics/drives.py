@@ -25,7 +25,7 @@ class SegmentError(NamedTuple):
     Attributes:
         translation_percent: error of the translation in percent of the length; NaN without any segment.
         rotation_deg_per_100m: degrees a hundred metres; NaN without any segment.
-        num_segments: how many were compared.
+        num_segments: number of compared segments.
     """
 
     translation_percent: float
@@ -42,14 +42,14 @@ def segment_error(
 ) -> SegmentError:
     """Compares the motion over segments of the reference's path with the reference.
 
-    A segment begins at every `stride`-th pose and ends at the first pose whose way along the reference is longer than
-    its length. Neither trajectory's frame matters.
+    A segment begins at every `stride`-th pose and ends at the first pose that is more than its length farther along the
+    reference. The frames of the two trajectories do not matter.
 
     Args:
         estimated: (n, 4, 4) `T_world_scan`, metres.
         reference: the same poses in another frame.
         lengths_m: lengths of segments.
-        stride: poses between two segments' beginnings; KITTI takes 10.
+        stride: number of poses from the start of a segment to that of the next; KITTI takes 10.
 
     Returns:
         Means over all segments of all lengths.
@@ -75,12 +75,12 @@ def segment_error(
 
 
 class RelationErrors(NamedTuple):
-    """Errors of a trajectory.
+    """Errors of a trajectory at the relations.
 
     Attributes:
         translation_m: (u,) length of the error of each relation that was used.
-        rotation_deg: (u,) and its angle.
-        is_used: (r,) False for relations with a time of which there is no scan.
+        rotation_deg: (u,) angle of the error of each of these relations.
+        is_used: (r,) False for relations without a scan at one of their times.
     """
 
     translation_m: Float[np.ndarray, " u"]
@@ -101,7 +101,7 @@ def relation_errors(
         relations: relations of the same recording.
         times: times of the scans, seconds, of the same clock.
         poses: x, y, heading of T_world_scan, metres.
-        tolerance_s: a scan is that of a relation if its time is so near.
+        tolerance_s: largest difference between the times of a scan and of a relation.
 
     Returns:
         The errors.
@@ -127,11 +127,11 @@ def relation_errors(
 
 
 class Revisits(NamedTuple):
-    """The scans that come back.
+    """Scans at places seen before.
 
     Attributes:
-        is_revisit: (n,) the scan is near an earlier one, after some way.
-        is_opposite: (n,) it is a revisit, turned by more than 120 degrees against the nearest earlier scan.
+        is_revisit: (n,) True for a scan near an earlier one, after a least path.
+        is_opposite: (n,) True for a revisit turned by more than 120 degrees against the nearest earlier scan.
     """
 
     is_revisit: Bool[np.ndarray, " n"]
@@ -159,15 +159,15 @@ class LoopRecall(NamedTuple):
 def find_revisits(
     T_world_scan: Float[AnyArray, "n 4 4"], *, distance_m: float = 5.0, min_path_m: float = 50.0
 ) -> Revisits:
-    """Finds the scans that are near an earlier one, after some way.
+    """Finds the scans that are near an earlier one, after a least path.
 
     Args:
         T_world_scan: true poses; x is forward.
-        distance_m: so near.
-        min_path_m: so long is the way between the two.
+        distance_m: largest distance from the earlier scan.
+        min_path_m: least length of the path between the two.
 
     Returns:
-        Finds the scans at places seen before, and their direction.
+        The scans at places seen before, and their direction.
 
     Raises:
         ValueError: the shape is not (n, 4, 4), or a number is not finite.
@@ -192,7 +192,7 @@ def loop_recall(
     *,
     reach_m: float = 10.0,
 ) -> LoopRecall:
-    """The share of the revisits that have a loop: the newer end of one is within `reach_m` along the path.
+    """Computes the share of the revisits with a loop whose newer end is within `reach_m` along the path.
 
     Pass right loops only. Where no wrong one was accepted, this is the recall at 100 % precision.
 
@@ -200,7 +200,7 @@ def loop_recall(
         T_world_scan: true poses.
         newer_ends: first and last scan of the newer end of each loop; equal where it joins single scans.
         revisits: result of `find_revisits` on the same poses.
-        reach_m: a keyframe every few metres is enough, so loops count for the scans around them.
+        reach_m: largest distance along the path of a scan from the loop that counts for it; keyframes are metres apart.
 
     Returns:
         The recall, also by direction.

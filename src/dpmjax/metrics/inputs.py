@@ -61,7 +61,7 @@ def require_finite(name: str, array: Any) -> None:
 
 
 def is_traced(array: Any) -> bool:
-    """Returns whether the numbers of an array are not known yet."""
+    """Returns True for an array whose numbers are traced."""
     return isinstance(array, jax.core.Tracer)
 
 

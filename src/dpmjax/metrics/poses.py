@@ -1,8 +1,8 @@
 """Errors of poses: rigid alignment, ATE, RPE, point distance, recall of registrations.
 
-Lengths come out in the unit they come in; angles in radians. Poses are `T_world_scan`, (n, d+1, d+1) with d = 2 or 3.
-Arrays of NumPy give float64 numbers of the host. If one array is JAX's, the result is an array of JAX in its dtype,
-and the function is traceable: `jit`, `vmap`, `grad` with a finite gradient everywhere. Only the recall is of NumPy.
+Lengths keep their unit; angles are radians. Poses are `T_world_scan`, (n, d+1, d+1) with d = 2 or 3.
+NumPy arrays give float64 results. If one array is a JAX array, the result is a JAX array of its dtype, and the function
+is traceable: `jit`, `vmap`, `grad` with a finite gradient everywhere. The recall takes NumPy arrays only.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class RelativePoseError(NamedTuple):
 
     Attributes:
         translation_rmse: root mean square error of the translation, in the unit of the poses.
-        rotation_rmse: radians.
-        num_pairs: how many pairs were compared.
+        rotation_rmse: root mean square error of the rotation, radians.
+        num_pairs: number of compared pairs.
     """
 
     translation_rmse: float | jax.Array
@@ -39,9 +39,9 @@ class RegistrationRecall(NamedTuple):
 
     Attributes:
         recall: share of pairs with both errors within the limits.
-        translation_errors_m: (n,) of each pair.
-        rotation_errors_deg: (n,) of each pair, in [0, 180].
-        is_right: (n,) which pairs count; those with a pose that is not finite do not.
+        translation_errors_m: (n,) error of the translation of each pair.
+        rotation_errors_deg: (n,) error of the rotation of each pair, in [0, 180].
+        is_right: (n,) True for right pairs; False for a pose that is not finite.
     """
 
     recall: float
@@ -55,8 +55,8 @@ def align_rigid(
 ) -> Float[AnyArray, "d1 d1"]:
     """Computes the rigid motion, without scale, that brings estimated positions closest to the reference ones.
 
-    Least squares in closed form, as `weighted_svd`. What the positions leave open (n = 1; in 3-D all on one line) is
-    settled by a rotation near the identity, with derivative 0.
+    Least squares in closed form, as `weighted_svd`. Where the positions leave the rotation open (n = 1; in 3-D all on
+    one line), it is one near the identity, with derivative 0.
 
     Args:
         estimated: (n, 2) or (n, 3) positions.
@@ -65,7 +65,7 @@ def align_rigid(
             the identity.
 
     Returns:
-        `T_reference_estimated`, (d+1, d+1): float64, or of JAX where an array is JAX's.
+        `T_reference_estimated`, (d+1, d+1): float64, or a JAX array if an input is one.
 
     Raises:
         ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, a number is not finite, or no position is
@@ -103,7 +103,7 @@ def align_poses(
 def absolute_trajectory_error(
     estimated: Float[AnyArray, "n d"], reference: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
 ) -> float | Float[jax.Array, ""]:
-    """Root mean square distance of positions after the best rigid alignment (DeepMapping section 4; Sturm 2012).
+    """Computes the root mean square distance of positions after rigid alignment (DeepMapping section 4; Sturm 2012).
 
     Args:
         estimated: positions, (n, 2) or (n, 3).
@@ -112,7 +112,8 @@ def absolute_trajectory_error(
             0.
 
     Returns:
-        The error, in the unit of the positions: a float, or of JAX where an array is JAX's. Its gradient at 0 is 0.
+        The error, in the unit of the positions: a float, or a JAX number if an input is a JAX array. Its gradient at 0
+        is 0.
 
     Raises:
         ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, a number is not finite, or no position is
@@ -126,7 +127,7 @@ def absolute_trajectory_error(
 def relative_pose_error(
     estimated: Float[AnyArray, "n d1 d1"], reference: Float[AnyArray, "n d1 d1"], delta: int = 1
 ) -> RelativePoseError:
-    """Errors of the motion from each pose to the one `delta` later (Sturm 2012).
+    """Computes the errors of the motion from each pose to the one `delta` later (Sturm 2012).
 
     The error of a pair is inv(inv(Q_i) Q_j) inv(P_i) P_j with P estimated, Q the reference and j = i + delta. It does
     not depend on the frame of either trajectory.
@@ -134,7 +135,7 @@ def relative_pose_error(
     Args:
         estimated: (n, 3, 3) or (n, 4, 4) `T_world_scan`.
         reference: the same poses in another frame, the same unit.
-        delta: how many poses apart the two of a pair are.
+        delta: number of poses from the first to the second of a pair.
 
     Returns:
         Root mean squares over all pairs.
@@ -161,7 +162,7 @@ def point_distance(
     T_estimated: Float[AnyArray, "n d1 d1"],
     T_reference: Float[AnyArray, "n d1 d1"],
 ) -> float | Float[jax.Array, ""]:
-    """Mean distance of corresponding map points, after the rigid alignment of positions (DeepMapping section 4).
+    """Computes the mean distance of corresponding map points after alignment of positions (DeepMapping section 4).
 
     Args:
         points: points of each scan, in its own frame.
@@ -200,16 +201,16 @@ def registration_recall(
     max_translation_m: float = 2.0,
     max_rotation_deg: float = 5.0,
 ) -> RegistrationRecall:
-    """The share of motions that are right, and how wrong each is.
+    """Computes the share of right motions, and the errors of each motion.
 
     Args:
         T_estimated: (n, 4, 4) `T_target_source`, metres.
         T_true: the same, true.
-        max_translation_m: how far the translations may differ.
-        max_rotation_deg: how far the rotations may.
+        max_translation_m: largest translation error of a right motion.
+        max_rotation_deg: largest rotation error of a right motion.
 
     Returns:
-        The recall is 0 without any pair.
+        Recall and errors; the recall is 0 without any pair.
 
     Raises:
         ValueError: the shapes differ or are not (n, 4, 4).
@@ -227,12 +228,12 @@ def registration_recall(
 
 
 def _number(value: Any) -> Any:
-    """A float of a number of NumPy; a number of JAX stays traceable."""
+    """Converts a NumPy number to a float; a JAX number stays traceable."""
     return value if isinstance(value, jax.Array) else float(value)
 
 
 def _mean(values: Any, mask: Any) -> Any:
-    """Mean of the valid values; 0 without any."""
+    """Computes the mean of the valid values; 0 without any."""
     xp = namespace_of(values)
     return xp.where(mask, values, 0).sum() / xp.maximum(mask.sum(), 1)
 

@@ -118,7 +118,7 @@ def expected_calibration_error(
     """Computes the expected calibration error (Naeini et al. 2015).
 
     Args:
-        probability: of each event, in [0, 1].
+        probability: probability of each event, in [0, 1].
         is_true: outcome of each event.
         num_bins: number of bins of equal width.
 
@@ -141,7 +141,7 @@ def position_bound(
     range_noise: float,
     step: float = 0.5,
 ) -> Float[np.ndarray, " n"]:
-    """The least error of position that an unbiased estimate from one scan can have, with the world known exactly.
+    """Computes the least position error of an unbiased estimate from one scan in a known world (Cramér-Rao bound).
 
     The information of a scan is J^T J / noise^2, where J is the derivative of its ranges by x, y and heading (Kay 1993,
     eq. 3.31). An estimate that must find the world too cannot do better. The root mean square over the scans of a
@@ -159,7 +159,7 @@ def position_bound(
     at = np.asarray(poses, np.float64).reshape(-1, 3)
     steps = np.diag([step, step, 1e-3])
     jacobian = np.stack([(cast_ranges(at + d) - cast_ranges(at - d)) / (2.0 * d.sum()) for d in steps], axis=-1)
-    # A turn moves the end of a beam by its length.
+    # One radian of heading moves the end of a beam by the length of the beam.
     ranges = cast_ranges(at)
     steepness = np.abs(jacobian) / np.stack([np.ones_like(ranges), np.ones_like(ranges), ranges], axis=-1)
     used = jacobian * (steepness < _STEEPEST).all(axis=-1, keepdims=True)

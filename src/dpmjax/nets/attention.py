@@ -22,7 +22,7 @@ MAX_LIVE_LOGITS = 1 << 18
 def embed_positions(positions: Float[Array, "n 3"], num_channels: int) -> Float[Array, "n c"]:
     """Embeds positions by sines and cosines at wavelengths from 2 m to about 20 km (Vaswani et al. 2017).
 
-    Each axis has the largest even number of channels that fits three times: sine and cosine by turns, from the
+    Each axis has the largest even number of channels that fits three times: alternating sine and cosine, from the
     shortest wavelength to the longest. The remaining channels are zero.
 
     Args:

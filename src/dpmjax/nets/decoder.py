@@ -1,4 +1,4 @@
-"""The decoder: attention correlates two descriptor clouds, and four heads predict what registration needs.
+"""The decoder: attention correlates two descriptor clouds; heads give similarity, offsets, overlap, coarse features.
 
 DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": params}, a, b, method="correlate")`.
 """
@@ -26,8 +26,8 @@ class DecoderConfig:
         model_channels: channels of a correlated descriptor; at least 6.
         num_layers: number of attention layers.
         num_heads: heads of each attention; divides `model_channels`.
-        shares_layers: whether all layers have the same weights, as the paper says; the published networks do not.
-        predicts_offsets: whether offsets are predicted; False leaves all at 0, for the ablation of Table 2.
+        shares_layers: True for the same weights in all layers, as in the paper; False for the published networks.
+        predicts_offsets: False leaves all offsets at 0, for the ablation of Table 2.
         compute_dtype: type of the matrix products.
     """
 
@@ -122,7 +122,7 @@ class OffsetHead(Head):
 
 
 class OverlapHead(Head):
-    """Predicts whether two clouds overlap (DeepPointMap section 3.2, figure 2e)."""
+    """Predicts the overlap of two clouds (DeepPointMap section 3.2, figure 2e)."""
 
     @nn.compact
     def __call__(

@@ -22,7 +22,7 @@ def require_compute_dtype(value: str) -> None:
     Args:
         value: one of the names in `ComputeDtype`.
 
-    Another name is a `ValueError`.
+    Another name raises a `ValueError`.
     """
     require_one_of("compute_dtype", value, get_args(ComputeDtype))
 

@@ -59,7 +59,7 @@ class DilatedConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*size c"]) -> Float[Array, "*size_out f"]:
-        """The output has the size of the input divided by the stride.
+        """Convolves; the output has the size of the input divided by the stride.
 
         Args:
             x: channels of the beams (b, c) or of the pixels (h, w, c).
@@ -86,7 +86,7 @@ class LocalizationNet(nn.Module):
 
     @nn.compact
     def __call__(self, points: Float[Array, "*size d"], mask: Bool[Array, "*size"]) -> Float[Array, " o"]:
-        """Pose of the sensor.
+        """Predicts the pose of the sensor.
 
         Args:
             points: (b, 2) or (h, w, 3) in the sensor frame, about -1 to 1.
@@ -152,7 +152,7 @@ class MapMLP(nn.Module):
 
     @nn.compact
     def __call__(self, points: Float[Array, "n d"], level_weights: Float[Array, " l"]) -> Float[Array, " n"]:
-        """Logits at points of the world, about -1 to 1; `level_weights` has no meaning here.
+        """Computes logits at points of the world, about -1 to 1.
 
         Args:
             points: (n, 2) or (n, 3).
@@ -198,7 +198,7 @@ def interpolate_grid(grid: Float[Array, "*size"], points: Float[Array, "n d"]) -
 
 
 def double_resolution(grid: Float[Array, "*size"]) -> Float[Array, "*size_out"]:
-    """The same function on half as large cells.
+    """Represents the same function on cells of half the size.
 
     Args:
         grid: values at the nodes, r + 1 along each axis.
@@ -219,15 +219,15 @@ class MapGrid(nn.Module):
 
     Each level has twice the cells of the one before, so that the sum is one grid of the finest level. It is as
     continuous as the MLP. A sample costs four reads (in 3-D eight) instead of half a million multiplications, and a
-    step changes the map only near the samples. The levels are switched on from coarse to fine: first the basin of the
-    poses is wide, later the map is sharp.
+    step changes the map only near the samples. The levels are switched on from coarse to fine, because
+    coarse levels give the poses a wide basin of convergence, and fine levels a sharp map.
     """
 
     resolutions: tuple[int, ...]
 
     @nn.compact
     def __call__(self, points: Float[Array, "n d"], level_weights: Float[Array, " l"]) -> Float[Array, " n"]:
-        """Logits at points of the world.
+        """Computes logits at points of the world.
 
         Args:
             points: (n, 2) or (n, 3), -1 to 1.
@@ -244,7 +244,7 @@ class MapGrid(nn.Module):
 
 
 def make_map_net(config: OccupancyConfig) -> MapMLP | MapGrid:
-    """The M-Net of a configuration.
+    """Makes the M-Net of a configuration.
 
     Args:
         config: shape of M-Net.
@@ -258,7 +258,7 @@ def make_map_net(config: OccupancyConfig) -> MapMLP | MapGrid:
 
 
 def init_map_net(config: OccupancyConfig, *, key: jax.Array, num_dimensions: int = 2) -> Any:
-    """Fresh parameters.
+    """Makes random parameters of M-Net.
 
     Args:
         config: shape of M-Net.

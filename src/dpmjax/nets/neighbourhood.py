@@ -2,8 +2,8 @@
 
 The automatic derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the value on
 a CPU. The forward pass here visits the neighbours in turn, on (m, f) numbers that stay in the cache. The backward pass
-handles (m, f) winners and (m, k) pairs, never both at once. With the stored length |x| of each pair, the derivative of
-the norm is a multiple of x = of_points + offset kernel, and its sums over the pairs are sums of numbers.
+handles (m, f) winners and (m, k) pairs, never both at once. The length |x| of each pair is stored. The derivative of
+the norm is then a multiple of x = of_points + offset kernel, and its sums over the pairs are sums of numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from dpmjax.nets.layers import NORM_EPSILON
 from dpmjax.types import AnyArray
 
-# Name of what `jax.checkpoint` should keep: (m, f) and (m, k) numbers, which spare the loop over the neighbours.
+# Name of the (m, f) and (m, k) numbers that `jax.checkpoint` stores, to spare a second loop over the neighbours.
 WINNERS = "winners"
 
 _UNROLL = 4
@@ -71,7 +71,7 @@ def _forward(
 ) -> tuple[jax.Array, Residuals]:
     neighbours, shape = jnp.asarray(neighbours), (len(neighbours), of_points.shape[1])
 
-    def look_at(j: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def visit(j: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         value, winner, of_winner, inverses = best
         x = _with_offsets(of_points[neighbours[:, j]], offsets[:, j], kernel)
         inverse = _inverse_length(x)
@@ -88,17 +88,17 @@ def _forward(
     zeros = jnp.zeros(shape, of_points.dtype)
     empty = jnp.zeros(neighbours.shape, of_points.dtype)
     start: tuple[jax.Array, ...] = zeros - jnp.inf, jnp.zeros(shape, jnp.int32), zeros, empty
-    # A while loop: checkpointing takes a loop of known length apart, and keeps something of every turn.
+    # A while loop, because checkpointing splits a loop of known length, and stores values of every iteration.
     num = neighbours.shape[1]
     at_once = max(size for size in range(1, _UNROLL + 1) if num % size == 0)
 
-    def look_at_some(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def visit_some(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         first, best = state
         for j in range(at_once):
-            best = look_at(first + j, best)
+            best = visit(first + j, best)
         return first + at_once, best
 
-    _, (_, *found) = lax.while_loop(lambda state: state[0] < num, look_at_some, (jnp.zeros((), jnp.int32), start))
+    _, (_, *found) = lax.while_loop(lambda state: state[0] < num, visit_some, (jnp.zeros((), jnp.int32), start))
     winner, of_winner, inverses = (checkpoint_name(x, WINNERS) for x in found)
     return of_winner * scale, Residuals(of_points, offsets, kernel, neighbours, scale, winner, of_winner, inverses)
 
@@ -106,7 +106,7 @@ def _forward(
 def _backward(residuals: Residuals, gradient: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, None, jax.Array]:
     # With g = gradient * scale at the winners and 0 elsewhere, the derivative by x of a pair is
     #     inverse * g - weight * x,   weight = inverse^2 * mean over channels of (g * normalised).
-    # Outputs that nobody uses, such as those to the offsets, are removed by the compiler.
+    # The compiler removes unused outputs, such as those to the offsets.
     of_points, offsets, kernel, neighbours, scale, winner, normalised, inverse = residuals
     num_queries, num_channels = winner.shape
     queries, channels = jnp.arange(num_queries)[:, None], jnp.arange(num_channels)

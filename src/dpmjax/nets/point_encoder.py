@@ -33,11 +33,11 @@ class EncoderConfig:
         stem_channels: channels of the input level; each stage down doubles them.
         expansion: width of the hidden layer in inverted residual blocks, relative to its input.
         output_channels: channels of a descriptor.
-        frame: frame of the offsets between points. "lidar": the axes of the lidar, as in the published networks, which
-            learn rotations by augmentation. "bearing": along and across the ray from the lidar to each point. "local":
-            along and across the normal of the wall at each point. With the last two, descriptors are invariant to
-            rotations of the scan about the vertical, and the offsets between descriptors are predicted in these frames,
-            too. Local frames do not turn where the lidar moves past a wall.
+        frame: frame of the offsets between points. With "lidar" it has the axes of the lidar, as in the published
+            networks, which learn rotations by augmentation. With "bearing" it lies along and across the ray from the
+            lidar to each point, with "local" along and across the normal of the wall there. In both, descriptors are
+            invariant to rotations of the scan about the vertical, and the offsets between descriptors are predicted in
+            these frames, too. Local frames do not turn where the lidar moves past a wall.
         compute_dtype: type of the matrix products over features.
     """
 
@@ -72,7 +72,7 @@ class NeighbourhoodMaximum(nn.Module):
 
         Args:
             features: features of the level that holds the neighbours.
-            offsets: from each query to its neighbours, as a share of the radius.
+            offsets: offsets from each query to its neighbours, as a share of the radius.
             neighbours: rows of the neighbours of each query.
 
         Returns:
@@ -111,7 +111,7 @@ class InvertedResidual(nn.Module):
 
         Args:
             features: features of the level.
-            offsets: from each point to its neighbours in the same level, as a share of the radius.
+            offsets: offsets from each point to its neighbours in the same level, as a share of the radius.
             neighbours: rows of these neighbours.
 
         Returns:

@@ -52,7 +52,7 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
 
 
 def chordal_poses(graph: PoseGraph, pattern: BlockPattern) -> Floats:
-    """Poses from the measurements alone; only the held nodes keep theirs.
+    """Computes poses from the measurements alone; only held nodes keep their poses.
 
     Args:
         graph: the graph; poses of nodes that are not held may be anything.
@@ -92,7 +92,7 @@ def _solve_linear(
     weight: NDArray[np.float64],
     constant: Float[np.ndarray, "e d k"] | float = 0.0,
 ) -> Float[np.ndarray, "n d k"]:
-    """Returns what minimises |jacobian @ unknowns - constant|, zero for held nodes; k right sides at once."""
+    """Returns unknowns that minimise |jacobian @ unknowns - constant|, zero for held nodes; k right sides at once."""
     weighted = weight[:, None, None, None] * np.swapaxes(jacobian, 2, 3)
     blocks = weighted[:, :, None] @ jacobian[:, None]
     residual = (jacobian @ held[pattern.nodes]).sum(axis=1) - constant

@@ -1,4 +1,4 @@
-"""The nouns of pose graphs: edges are measured relative poses, a graph is poses and edges."""
+"""The records of pose graphs: edges are measured relative poses, a graph is poses and edges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Indices = NDArray[np.int64]
 
 # Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space.
 _TANGENT_SIZE = {(3,): 3, (4, 4): 6}
-# How far, relative to the largest entry, an information matrix may be off for having been computed in float32.
+# Largest error of an information matrix that was computed in float32, relative to its largest entry.
 _ROUNDING = 1e-5
 
 
@@ -95,7 +95,7 @@ class PoseGraph:
         return _TANGENT_SIZE[self.poses.shape[1:]]
 
     def held_nodes(self) -> NDArray[np.bool_]:
-        """The nodes that an optimisation holds.
+        """Finds the nodes that an optimisation does not move.
 
         Returns:
             (n,) True for fixed nodes, and for the first node of each connected part without any.
@@ -139,7 +139,7 @@ def _check(graph: PoseGraph) -> None:
 
 
 def is_semidefinite(information: Floats) -> NDArray[np.bool_]:
-    """Tells which matrices are symmetric and positive semidefinite, up to the rounding of float32.
+    """Returns True for matrices that are symmetric and positive semidefinite, up to the rounding of float32.
 
     Args:
         information: (e, d, d), finite.

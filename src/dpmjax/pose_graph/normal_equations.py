@@ -4,8 +4,8 @@ A term of a least-squares problem touches a few nodes (two for an edge of a pose
 block for every pair of them, its share of J^T W r a vector for each.
 
 The residuals of edges and their derivatives are in JAX with 64-bit floats. Poses move on the right, T_world_node @
-exp(delta). The residual of an edge is the logarithm of the motion from the measured to the present relative pose,
-translation first, in the tangent of the source frame, as in GTSAM.
+exp(delta). The residual of an edge is the logarithm of the motion from the measured to the present relative pose. It is
+in the tangent of the source frame, translation first, as in GTSAM.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ class BlockPattern:
         num_nodes: n.
         free_nodes: (f,) the free node of each block row, in the order of elimination.
         order: the blocks between free nodes, of m * s * s in all, sorted by their place.
-        starts: where in `order` each place of the matrix begins.
+        starts: index in `order` at which each place of the matrix begins.
         columns: block column of each place.
-        row_starts: where in `columns` each block row begins.
+        row_starts: index in `columns` at which each block row begins.
     """
 
     nodes: Indices
@@ -141,7 +141,7 @@ class BlockPattern:
         return cls(nodes, len(is_held), free[np.argsort(rank)], used[sorting], starts, columns, row_starts)
 
     def matrix(self, blocks: Float[np.ndarray, "m s s d d"]) -> sp.csc_matrix:
-        """The sum of all blocks over the free nodes.
+        """Sums all blocks over the free nodes.
 
         Args:
             blocks: J^T W J of each term, symmetric as a whole.
@@ -158,7 +158,7 @@ class BlockPattern:
         return sp.csc_matrix((by_rows.data, by_rows.indices, by_rows.indptr), shape=shape)
 
     def vector(self, parts: Float[np.ndarray, "m s *k"]) -> Floats:
-        """The sum of all vectors over the free nodes.
+        """Sums all vectors over the free nodes.
 
         Args:
             parts: (m, s, d) or (m, s, d, k), J^T W r of each term.
@@ -187,7 +187,7 @@ class BlockPattern:
 
 
 def _free_blocks(rows: Indices) -> tuple[Indices, Indices, Indices]:
-    """Returns which of the m * s * s blocks are between free nodes, and their block rows and columns."""
+    """Returns the indices of the blocks, of m * s * s in all, between free nodes, and their block rows and columns."""
     block_row, block_column = (x.ravel() for x in np.broadcast_arrays(rows[:, :, None], rows[:, None, :]))
     used = np.flatnonzero((block_row >= 0) & (block_column >= 0))
     return used, block_row[used], block_column[used]
@@ -234,7 +234,7 @@ def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float 
 def solve_blocks(
     nodes: Indices, blocks: Float[np.ndarray, "m s s d d"], gradient: Float[np.ndarray, "m s d"], num_nodes: int
 ) -> Floats:
-    """One Gauss-Newton step of all nodes; the first one is held.
+    """Computes one Gauss-Newton step of all nodes; the first one is held.
 
     Args:
         nodes: (m, s) the nodes of each term.
@@ -248,6 +248,6 @@ def solve_blocks(
     pattern = BlockPattern.create(nodes, np.arange(num_nodes) == 0)
     matrix = pattern.matrix(blocks)
     diagonal = matrix.diagonal()
-    # A little damping: nodes without a sharp term stay where they are.
+    # A little damping, so that nodes without a sharp term stay where they are.
     extra = 1e-6 * diagonal + 1e-9 * max(diagonal.max(initial=0.0), 1e-300)
     return pattern.to_nodes(solve_symmetric(matrix, -pattern.vector(gradient), extra), gradient.shape[-1])

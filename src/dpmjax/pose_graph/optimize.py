@@ -30,11 +30,11 @@ class PoseGraphConfig:
     """Settings of the optimisation.
 
     Attributes:
-        outlier_chi2: the most that a contradicted edge costs (squared Mahalanobis distance; 10 is about the 98 %
+        outlier_chi2: largest cost of a contradicted edge (squared Mahalanobis distance; 10 is about the 98 %
             quantile in the plane). None for plain least squares.
         max_iterations: the largest number of linear solves.
-        tolerance: the optimisation ends when a step lowers the cost by less than this share.
-        is_chordal_start: also try the chordal relaxation as a start; it is taken where its cost is lower.
+        tolerance: share of the cost below which a decrease ends the optimisation.
+        is_chordal_start: True also tries the chordal relaxation as a start, and takes it where its cost is lower.
     """
 
     outlier_chi2: float | None = None
@@ -60,8 +60,8 @@ class OptimizedPoseGraph(NamedTuple):
     Attributes:
         graph: the graph at the new poses.
         chi2: sum of r^T W r over all edges, each times its weight.
-        chi2_initial: the same at the poses that were given, all weights one.
-        iterations: linear solves, rejected ones included.
+        chi2_initial: the same sum at the given poses, all weights one.
+        iterations: number of linear solves, rejected ones included.
         weights: (e,) final weight of each edge, 0 (rejected) to 1; all one without a kernel.
         is_converged: False where the iterations ran out, or no step lowered the cost.
     """
@@ -75,7 +75,7 @@ class OptimizedPoseGraph(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The optimisation between two solves; `widening` is how many times the kernel is wider than in the end."""
+    """The optimisation between two solves; `widening` is the width of the kernel in final widths."""
 
     at: Linearisation
     damping: float
@@ -94,7 +94,7 @@ def optimize_pose_graph(
     Args:
         graph: poses and measurements, in the plane or in space.
         config: settings; plain least squares by default.
-        trust: (e,) how many ordinary edges must contradict an edge before the kernel lets it go.
+        trust: (e,) number of ordinary edges that must contradict an edge before the kernel rejects it.
 
     Returns:
         The optimised graph and its cost; the graph itself where no step lowers the cost.
@@ -156,5 +156,5 @@ def _weights(chi2: Floats, width: Floats) -> Floats:
 
 
 def _cost(chi2: Floats, width: Floats) -> float:
-    """Returns the cost of all edges; of each one chi2 if it is small, at most the width of the kernel."""
+    """Returns the sum of the costs of all edges: chi2 where it is small, at most the width of the kernel."""
     return float((chi2 / (1.0 + chi2 / width)).sum())

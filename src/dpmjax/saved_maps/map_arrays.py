@@ -1,7 +1,7 @@
 """A keyframe map as named arrays, and back: exactly, or as codes of few bytes for the smallest maps.
 
-Coded features are written in the basis of their principal components (few carry nearly all), and all coefficients are
-rounded to one step. Coded surface elements are rounded to centimetres. Ragged arrays are concatenated.
+Coded features are written in the basis of their principal components (a few hold nearly all variance). All coefficients
+are rounded to one step. Coded surface elements are rounded to centimetres. Ragged arrays are concatenated.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ MAX_RANK = 16
 # Step of the coefficients, as a share of the standard deviation of a channel.
 STEP_SHARE = 0.7
 
-# Number of surface elements of a keyframe, if it has no more descriptors: localisation needs keyframes more.
+# Number of surface elements of a keyframe, or of its descriptors if it has more: localisation gains more from further
+# keyframes than from further elements.
 NUM_ELEMENTS = 256
 
 POSITION_STEP_M = 0.02
@@ -49,7 +50,7 @@ def pack_map(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of a map.
 
     Args:
-        slam_map: with at least one keyframe; all scans have one number of descriptors and channels.
+        slam_map: map with at least one keyframe; all scans have one number of descriptors and channels.
         precision: see `save_map`.
 
     Returns:
@@ -64,8 +65,8 @@ def unpack_map(arrays: Arrays, precision: Precision, origin: MapOrigin) -> Keyfr
 
     Args:
         arrays: arrays from `pack_map`; others may be among them.
-        precision: that was given to `pack_map`.
-        origin: what made the map.
+        precision: precision that was given to `pack_map`.
+        origin: matcher and settings that made the map.
 
     Returns:
         The map.
@@ -173,7 +174,7 @@ def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
 
 
 def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
-    """Keeps the first elements, and fills up with elements that are not there."""
+    """Keeps the first elements, or pads with masked ones."""
     kept = [array[:num_elements] for array in elements[1:]]
     missing = num_elements - len(kept[-1])
     padded = (np.pad(array, [(0, missing), *[(0, 0)] * (array.ndim - 1)]) for array in kept)

@@ -25,7 +25,7 @@ from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3
-# Below the distance of consecutive keyframes: only those of other laps are left out.
+# Smaller than the spacing of consecutive keyframes, so that only keyframes of other laps are left out.
 SPACING_SHARE = 0.2
 
 ADVICE = "save it again with dpmjax.save_map"
@@ -34,14 +34,14 @@ ADVICE = "save it again with dpmjax.save_map"
 def save_map(
     path: str | Path, slam_map: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None
 ) -> Path:
-    """Writes a map to a file that `load_map` reads; an interruption never leaves half of it.
+    """Writes a map to a file that `load_map` reads; an interruption never leaves half a file.
 
     Args:
         path: must end in `.npz`; an existing file is replaced.
         slam_map: map of a run, `result.map`, with at least one keyframe.
-        precision: "float32" is exact: a run that goes on from the file equals an unbroken one. "int8" is the smallest,
-            for localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and omits
-            keyframes that those of other laps cover (`slam.thin_map`).
+        precision: with "float32" the file is exact: a run that continues from it equals an unbroken one. With "int8" it
+            is smallest, for localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and
+            omits keyframes that those of other laps cover (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
             0.2 for "int8" and 0 for "float32".
 
@@ -80,7 +80,7 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, array in map_arrays(slam_map, precision).items():
-            # LZMA packs codes smaller by a sixth, slowly; a mask of equal values would look like a harmful archive.
+            # LZMA makes codes a sixth smaller, but is slow; a mask of equal values would look like a ZIP bomb.
             is_code = precision == "int8" and array.dtype != bool
             stored = io.BytesIO()
             np.save(stored, array, allow_pickle=False)

@@ -1,6 +1,6 @@
-"""The state of a SLAM run in one file: the map, and what odometry and loop closure have beside it.
+"""The state of a SLAM run in one file: the map, and the states of odometry and loop closure.
 
-It is written after a keyframe. A run that was killed goes on from the file and repeats the scans since that keyframe.
+It is written after a keyframe. A killed run continues from the file and repeats the scans since that keyframe.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = 
         without: fields that are left out.
 
     Returns:
-        The arrays. A None takes no room; a mask marks it.
+        The arrays. A mask marks each None, which takes no space.
     """
     columns = {name: np.array(len(records))}
     for field in [field for field in records[0]._fields if field not in without] if records else ():
@@ -57,8 +57,8 @@ def from_columns(
     Args:
         record_type: the named tuple.
         columns: columns from `to_columns`; others may be among them.
-        name: as given there.
-        without: as given there.
+        name: name given there.
+        without: fields that were left out there.
 
     Returns:
         The records: numbers and texts of Python, arrays of NumPy; None for a field that was left out.
@@ -82,7 +82,7 @@ def from_columns(
 
 
 def part_of(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
-    """Returns the arrays whose names begin with `name` and a dot, without it."""
+    """Returns the arrays whose names begin with `name` and a dot, and removes this prefix."""
     return {key.removeprefix(f"{name}."): value for key, value in columns.items() if key.startswith(f"{name}.")}
 
 
@@ -93,7 +93,7 @@ def prefixed(columns: Mapping[str, np.ndarray], name: str) -> Arrays:
 
 ADVICE = "start the run again without --resume"
 OF_LOOPS = ("loops",)
-# Fields that are written apart, or made again from the map.
+# Fields that are stored separately, or computed from the map.
 OF_FRONT_END = ("local_map", "recent", "lost", "scores")
 
 
@@ -101,7 +101,7 @@ class RunState(NamedTuple):
     """A run after a keyframe.
 
     Attributes:
-        state: after the keyframe.
+        state: state after the keyframe.
         reports: reports of all scans of the run until then.
     """
 
@@ -110,11 +110,11 @@ class RunState(NamedTuple):
 
 
 def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]) -> Path:
-    """Writes the state of a run; an interruption never leaves half of it.
+    """Writes the state of a run; an interruption never leaves half a file.
 
     Args:
         path: an existing file is replaced.
-        state: after a keyframe.
+        state: state after a keyframe.
         reports: reports of all scans of the run until then.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Raw scans to masked clouds of fixed capacity, and what training does to them."""
+"""Raw 3-D scans: preprocessing to masked clouds, augmentation, surfaces and free space, alignment of surfaces."""
 
 import lazy_loader as _lazy
 

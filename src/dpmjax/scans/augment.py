@@ -24,7 +24,7 @@ from dpmjax.types import AnyArray, PointCloud
 # Lower and upper bound of a uniform draw.
 Interval = tuple[float, float]
 
-# Largest number of azimuth sectors that are empty from some range on; each number from 1 to it is equally likely.
+# Largest number of azimuth sectors that are empty beyond some range; all numbers from 1 on are equally likely.
 MAX_SECTORS = 3
 
 # Width of the first sector; the width of the i-th sector is divided by i (DeepPointMap's published configuration).
@@ -63,7 +63,7 @@ class AugmentConfig:
     """Strength of the augmentation (defaults: DeepPointMap's published configuration, the boxes excepted).
 
     Attributes:
-        max_drop_ratio: each scan loses a share of its points, uniform between 0 and this.
+        max_drop_ratio: largest share of points that a scan loses; the share is uniform from 0 to this.
         sparse_probability: probability that a scan is thinned further, as by a lidar of few beams.
         sparse_points: bounds of the number of points that such a scan keeps at most, uniform in its logarithm.
         sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
@@ -71,7 +71,7 @@ class AugmentConfig:
         box_probability: probability that boxes occlude a scan.
         max_yaw_rad: largest rotation about z, to either side.
         max_tilt_rad: largest rotation about x and about y, to either side.
-        tilt_power: the uniform number that gives a tilt is raised to this power: above 1, most scans stand upright.
+        tilt_power: exponent of the uniform number of a tilt; above 1, most scans stand upright.
         translation_sigma_m: standard deviation of the translation in x and y; half of it in z.
         jitter_sigma_m: standard deviation of the noise of each coordinate.
     """
@@ -117,8 +117,8 @@ class AugmentedScan(NamedTuple):
 def augment_scan(cloud: PointCloud, config: AugmentConfig, *, key: PRNGKeyArray) -> AugmentedScan:
     """Drops points, occludes, moves and jitters one scan, in this order (DeepPointMap section 3.3).
 
-    Use `vmap` over clouds and keys for several scans; each then gets a motion of its own. Whether two scans overlap
-    follows from their true poses before augmentation.
+    Use `vmap` over clouds and keys for several scans; each then gets a motion of its own. The overlap of two
+    scans follows from their true poses before augmentation.
 
     Args:
         cloud: a preprocessed scan, metres, in the frame of the lidar.

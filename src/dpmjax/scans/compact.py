@@ -1,4 +1,4 @@
-"""Surface elements and free space of a scan in few bytes, for maps: small integers from which both are made again."""
+"""Surface elements and free space of a scan in few bytes, for maps: small integers from which both are restored."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CompactElements(NamedTuple):
         unit_m: metres that 1 stands for in `positions`; 2 mm for a scan of 60 m.
         positions: (n, 3) in units.
         normals: (n, 3) unit normals times 127; 0 where there is no plane.
-        planarity: (n,) times 255.
+        planarity: (n,) planarity times 255.
         mask: (n,) True for elements that are there.
     """
 
@@ -40,7 +40,7 @@ class CompactImage(NamedTuple):
 
     Attributes:
         num_rows: rows of the whole image.
-        first_row: rows before it are empty; so are those after the last one.
+        first_row: row of the image that is the first of the codes; all rows outside the codes are empty.
         nearest: (r, c) codes, rounded down.
         farthest: (r, c) codes, rounded up.
     """
@@ -55,7 +55,7 @@ def compact_elements(elements: SurfaceElements) -> CompactElements:
     """Rounds surface elements to integers.
 
     Args:
-        elements: of a scan, metres, in the frame of the lidar.
+        elements: elements of a scan, metres, in the frame of the lidar.
 
     Returns:
         The integers.
@@ -73,10 +73,10 @@ def compact_elements(elements: SurfaceElements) -> CompactElements:
 
 
 def expand_elements(compact: CompactElements) -> SurfaceElements:
-    """Makes the surface elements again.
+    """Restores the surface elements.
 
     Args:
-        compact: from `compact_elements`.
+        compact: compact form from `compact_elements`.
 
     Returns:
         Elements as float32 arrays of NumPy, metres.
@@ -95,7 +95,7 @@ def compact_image(image: RangeImage) -> CompactImage:
     """Rounds near ranges down and far ranges up, so that the free space of a range image never grows.
 
     Args:
-        image: of a scan.
+        image: image of a scan.
 
     Returns:
         The codes.
@@ -109,10 +109,10 @@ def compact_image(image: RangeImage) -> CompactImage:
 
 
 def expand_image(compact: CompactImage) -> RangeImage:
-    """Makes the range image again.
+    """Restores the range image.
 
     Args:
-        compact: from `compact_image`.
+        compact: compact form from `compact_image`.
 
     Returns:
         The image.

@@ -71,12 +71,12 @@ def offsets_by_azimuth(
 
 
 def offsets_by_times(times: Float[AnyArray, " n"], interval_s: float | None = None) -> Float[np.ndarray, " n"] | None:
-    """Takes the times of points as files have them, in s, ms, us or ns, from any start.
+    """Converts the times of points, in s, ms, us or ns from any start, to offsets.
 
-    The unit is that in which the points of a scan were measured within 0.02 to 0.5 s.
+    The unit is the one in which the times of a scan span 0.02 to 0.5 s.
 
     Args:
-        times: of the points of one scan.
+        times: times of the points of one scan.
         interval_s: time between two scans, s; None takes the time of this one.
 
     Returns:
@@ -95,7 +95,7 @@ def offsets_by_times(times: Float[AnyArray, " n"], interval_s: float | None = No
 def _rotated(
     points: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, " 3"], angles: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Rodrigues' formula, an angle a point."""
+    """Applies Rodrigues' formula with one angle for each point."""
     across = np.cross(axis, points)
     sin, cos = np.sin(angles)[:, None], np.cos(angles)[:, None]
     return points + sin * across + (1 - cos) * np.cross(axis, across)
@@ -104,7 +104,7 @@ def _rotated(
 def _shifts(
     velocity: Float[np.ndarray, " 3"], axis: Float[np.ndarray, " 3"], angle: float, offsets: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Translations of exp(offset (velocity, angle axis))."""
+    """Computes the translations of exp(offset (velocity, angle axis))."""
     angles = angle * offsets
     across = np.cross(axis, velocity)
     rest = np.cross(axis, across)

@@ -4,7 +4,8 @@
     found = jax.vmap(align_elements, (None, None, 0))(source, target, T_starts)   # many starts at once
     found = align_elements_on_host(source, target, T_target_source)               # faster on a CPU
 
-They differ in the search of neighbours and in the dtype only. `surface_alignment` takes the same step for whole scans.
+The two functions differ in the search of neighbours and in the dtype only. `surface_alignment` takes the same step for
+whole scans.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from dpmjax.types import AnyArray, SurfaceElements
 
 ALL = 1 << 20
 
-# Elements are metres apart and their planes reach far: the kernel shrinks, and the radius hardly.
+# Elements are metres apart and their planes are large, so the kernel shrinks, but the radius hardly.
 ELEMENT_ALIGNMENT = AlignmentConfig(
     levels=(
         AlignmentLevel(3.0, ALL, 3, kernel_m=0.5),
@@ -43,7 +44,7 @@ class ElementAlignment(NamedTuple):
     """The aligned motion; failure is data. Arrays of NumPy from the host, else of JAX.
 
     Attributes:
-        T_target_source: maps points of the source to the target; where there are too few pairs, the motion so far.
+        T_target_source: motion from source to target; that of the step before where there are too few pairs.
         rmse: weighted root mean square distance of the pairs to their planes before the last step; infinite where
             there are too few.
         num_pairs: number of pairs of the last step, of both directions.
@@ -72,8 +73,9 @@ def align_elements(
 
     Each element of the source is moved onto the plane of the nearest element of the target (Chen and Medioni 1992). In
     the symmetric form, each element of the target is also paired with the nearest plane of the source: the normals of
-    both sides count, as in Rusinkiewicz 2019. A Geman-McClure kernel makes it robust. A pair counts by the
-    planarity of the plane and by the cosine between both normals; elements of less than `MIN_FLATNESS` are left out.
+    both sides count, as in Rusinkiewicz 2019. A Geman-McClure kernel makes it robust. A pair is weighted by
+    the planarity of the plane and by the cosine between both normals; elements of less than `MIN_FLATNESS` are left
+    out.
 
     The derivative is that of the last step with its pairs and weights held fixed: at convergence, that of the solution.
 
@@ -82,7 +84,7 @@ def align_elements(
         target: the same in the target frame.
         T_target_source: first guess, within about 3 m and 10 degrees.
         config: levels and kernel; `num_points` of a level are the first elements of each side.
-        is_symmetric: whether elements of the target are paired with planes of the source too.
+        is_symmetric: True also pairs elements of the target with planes of the source.
 
     Returns:
         The motion.
@@ -182,7 +184,7 @@ def _rows(side: SurfaceElements, rows: Any) -> SurfaceElements:
 
 
 def _search(side: SurfaceElements, radius_m: float) -> Callable[[Any], tuple[Any, Any]]:
-    """Returns the function that maps queries to the row of the nearest plane, and to whether it is near enough."""
+    """Returns the function that maps queries to the row of the nearest plane, and to True where it is near enough."""
     if isinstance(side.positions, jax.Array):
 
         def near_on_device(queries: Any) -> tuple[Any, Any]:

@@ -43,9 +43,9 @@ class PreprocessConfig:
     """Settings of the filters (the values are those of DeepPointMap's published configuration).
 
     Attributes:
-        min_range_m: nearer points belong to the vehicle and are dropped.
-        max_range_m: farther points are too sparse and are dropped.
-        voxel_size_m: the first point of each voxel is kept.
+        min_range_m: smallest range; nearer points belong to the vehicle.
+        max_range_m: largest range; farther points are too sparse.
+        voxel_size_m: side of a voxel, of which the first point is kept.
         num_outlier_neighbours: number of neighbours in the outlier test; 0 switches the test off.
         capacity: capacity of the resulting cloud. Where more points are left, evenly spaced ones are kept before the
             outlier test.
@@ -246,7 +246,7 @@ def _is_inlier_on_host(
 ) -> Bool[np.ndarray, " n"]:
     # One more neighbour, because each point is its own nearest one.
     num_nearest = min(config.num_outlier_neighbours + 1, len(points))
-    # Neighbours in space stand together in memory: they are found in two thirds of the time.
+    # Points near in space lie together in memory, so that neighbours are found in two thirds of the time.
     order = np.argsort(_numbered_voxels(points, SORTED_BY_M))
     points = points[order]
     distances = HostTree(points, num_threads=num_threads).nearest(points, num_nearest)[1]

@@ -26,7 +26,7 @@ MIN_KERNEL_M = 0.05
 # Width of the Geman-McClure kernel, as a share of the radius.
 KERNEL_SHARE = 1 / 6
 
-# Fewer pairs tell nothing about a motion.
+# Fewer pairs do not constrain a motion.
 MIN_PAIRS = 20
 
 
@@ -35,7 +35,7 @@ class AlignmentLevel:
     """One radius of the pairs.
 
     Attributes:
-        radius_m: a point is paired with the nearest point of the opposite surface within this distance.
+        radius_m: largest distance of a point from the point of the opposite surface that it is paired with.
         num_points: number of points that are paired.
         num_iterations: largest number of steps.
         kernel_m: width of the kernel; None for that of the configuration.
@@ -59,7 +59,7 @@ class AlignmentConfig:
 
     Attributes:
         levels: coarse to fine.
-        min_cosine: surfaces are paired if the cosine between their normals is larger; it weighs the pair.
+        min_cosine: smallest cosine between the normals of a pair; the cosine is also the weight of the pair.
     """
 
     levels: tuple[AlignmentLevel, ...] = (
@@ -86,7 +86,7 @@ class AlignmentConfig:
         return max(MIN_KERNEL_M, KERNEL_SHARE * level.radius_m) if level.kernel_m is None else level.kernel_m
 
     def is_converged(self, step: PlaneStep) -> Any:
-        """Compares steps with the least ones that go on.
+        """Compares steps with the limits of convergence.
 
         Args:
             step: steps of any leading axes, of NumPy or of JAX.
@@ -150,7 +150,7 @@ class NearestPlanes(NamedTuple):
 
     @property
     def pairs(self) -> PlanePairs:
-        """The samples that are paired."""
+        """The paired samples."""
         return PlanePairs(*(values[self.is_paired] for values in self[1:4]))
 
 
@@ -164,7 +164,7 @@ def align_surfaces(
 
     Args:
         source: surface of a scan.
-        target: the other.
+        target: the second surface.
         T_target_source: first guess, within about 3 m and 10 degrees.
         config: levels and kernel.
 
@@ -185,7 +185,7 @@ def align_surfaces_from(
 
     Args:
         source: surface of a scan.
-        target: the other.
+        target: the second surface.
         T_target_source: first guesses; see `align_surfaces`.
         config: levels and kernel.
 
@@ -224,7 +224,7 @@ def nearest_planes(
 
     Args:
         source: surface of a scan.
-        target: the other.
+        target: the second surface.
         T_target_source: motions of the source.
         level: radius and number of points.
 
@@ -257,7 +257,7 @@ def pair_with_planes(
 
     Args:
         source: surface of a scan.
-        target: the other.
+        target: the second surface.
         T_target_source: motion of the source.
         level: radius and number of points.
 

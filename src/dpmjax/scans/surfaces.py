@@ -25,7 +25,7 @@ MIN_NEIGHBOURS = 4
 # Number of points whose neighbours measure the density of a scan.
 NUM_PROBED = 200
 
-# Less flat neighbourhoods are no part of a surface: foliage, wires, edges.
+# Least flatness of a point of a surface; foliage, wires and edges are less flat.
 MIN_FLATNESS = 0.1
 
 # Pixels of 2 degrees, in elevation and azimuth.
@@ -40,13 +40,12 @@ class SurfaceConfig:
     """Range and density of the points, and neighbourhoods of the normals.
 
     Attributes:
-        min_range_m: nearer points belong to the vehicle and are dropped.
-        max_range_m: farther points are too sparse and are dropped.
-        voxel_size_m: the first point of each voxel is kept.
+        min_range_m: smallest range; nearer points belong to the vehicle.
+        max_range_m: largest range; farther points are too sparse.
+        voxel_size_m: side of a voxel, of which the first point is kept.
         num_neighbours: number of neighbours of a normal, the point itself among them.
-        neighbour_radius_m: neighbours farther away do not count.
-        sparse_radius_share: the radius is at least this share of the median distance of the last neighbour, for sparse
-            scans.
+        neighbour_radius_m: largest distance of a neighbour.
+        sparse_radius_share: least radius in sparse scans, as a share of the median distance of the last neighbour.
     """
 
     min_range_m: float = 1.0
@@ -68,8 +67,8 @@ class Surface(NamedTuple):
 
     Attributes:
         points: (n, 3) float64, metres, in the frame of the lidar.
-        normals: (n, 3) unit normals, either side; any where `flatness` is 0.
-        flatness: (n,) in [0, 1], how much the neighbourhood is a plane: (l2 - l1) / l3 of the eigenvalues of its
+        normals: (n, 3) unit normals, of either sign; undefined where `flatness` is 0.
+        flatness: (n,) planarity of the neighbourhood in [0, 1]: (l2 - l1) / l3 of the eigenvalues of its
             covariance, smallest first; 0 where there are too few neighbours.
         samples: rows of flat points in random order, those of the three main directions of normals in turn. So the
             first few constrain each direction equally (normal-space sampling, Rusinkiewicz and Levoy 2001).
@@ -118,7 +117,7 @@ def surface_at(
 
     Args:
         points: metres, in the frame of the lidar.
-        rows: which points.
+        rows: rows of the chosen points.
         config: neighbourhoods; range and density are those of the points.
 
     Returns:
@@ -179,7 +178,7 @@ class RangeImage(NamedTuple):
 
     Attributes:
         nearest_m: (rows, columns) smallest range of a pixel and its neighbours; infinite where nothing was measured.
-        farthest_m: the largest; 0 where nothing was measured.
+        farthest_m: (rows, columns) largest such range; 0 where nothing was measured.
     """
 
     nearest_m: Float[np.ndarray, "r c"]
@@ -190,8 +189,8 @@ class View(NamedTuple):
     """Visibility of the points of another scan in a range image.
 
     Attributes:
-        is_visible: the lidar measured something in this direction, and the point is not far behind it.
-        is_contradicted: the point lies clearly in front of all that was measured in this direction.
+        is_visible: True where the lidar measured something in this direction, and the point is not far behind it.
+        is_contradicted: True where the point lies clearly in front of all that was measured in this direction.
     """
 
     is_visible: Bool[np.ndarray, " n"]
@@ -220,7 +219,7 @@ def view_points(image: RangeImage, points: Float[np.ndarray, "n 3"]) -> View:
     """Compares points with the ranges that the lidar of an image has measured in their directions.
 
     Args:
-        image: from `range_image`.
+        image: range image from `range_image`.
         points: metres, in the frame of that lidar.
 
     Returns:

@@ -58,7 +58,7 @@ class ViewCorrelationConfig:
     """Extent of the search.
 
     Attributes:
-        num_motions: distinct motions that are returned; 0 switches the search off.
+        num_motions: largest number of distinct motions; 0 switches the search off.
     """
 
     num_motions: int = 24
@@ -76,7 +76,7 @@ def correlate_views(
 
     Args:
         source: surface of a scan.
-        target: the other.
+        target: the second surface.
         config: resolution and extent.
 
     Returns:
@@ -93,7 +93,7 @@ def correlate_views(
     norms = np.sqrt(np.sum(images[0] ** 2, axis=(1, 2)) * np.sum(fixed**2, axis=(1, 2)))
     if not norms.any():
         return np.zeros((0, 4, 4))
-    # Each direction counts alike: walls along a street do not outvote those across.
+    # Each direction has the same weight, so that walls along a street do not outweigh those across.
     fixed /= np.where(norms > 0, norms, 1)[:, None, None]
     spectra = np.conj(fft.rfft2(images)) * fft.rfft2(fixed)
     scores = fft.irfft2(spectra.sum(axis=1), s=images.shape[2:])
@@ -110,7 +110,7 @@ def T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
     """Finds the turn that makes the ground of a scan level, and the shift that puts it at height 0.
 
     Args:
-        surface: of the scan.
+        surface: surface of the scan.
 
     Returns:
         The motion; the identity where there is too little ground.
@@ -150,7 +150,7 @@ def _images(
     channel = np.where(is_flat, channel, num)
     number = np.arange(len(turns))[:, None]
     cells = ((number * (num + 1) + channel) * size + columns[0]) * size + columns[1]
-    # A cell counts once: dense surfaces near the lidar must not outvote far ones.
+    # A cell counts once: dense surfaces near the lidar must not outweigh far ones.
     images = np.zeros(int(np.prod(shape)), np.float32)
     images[cells.ravel()] = 1
     return images.reshape(shape)

@@ -1,7 +1,7 @@
-"""Directions in which the planes of two scans hold a motion least: the information of an alignment, and weak axes.
+"""Directions in which the planes of two scans constrain a motion least: information of an alignment, and weak axes.
 
 In a corridor almost all walls are parallel to its axis. They agree with any shift along the axis, and with a half-turn;
-only the few elements that face the axis (end walls, pillars, door frames) tell one motion from another.
+only the few elements that face the axis (end walls, pillars, door frames) distinguish motions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_mo
 # Information without any plane: standard deviations of 10 m and 1 rad.
 UNKNOWN = np.diag(np.repeat([10.0**-2, 1.0**-2], 3))
 
-# The pairs count as that many independent ones, for their residuals are correlated.
+# Number of independent pairs with the information of all pairs, because residuals are correlated.
 NUM_INDEPENDENT = 200
 
 MIN_SIGMA_M = 0.01
@@ -42,10 +42,10 @@ EXTENT_PERCENT, MAX_REACH_M = 90.0, 25.0
 
 
 class WeakDirection(NamedTuple):
-    """The horizontal direction in which a motion is known least.
+    """The horizontal direction in which a motion is least certain.
 
     Attributes:
-        direction: unit vector in the target frame, either sign.
+        direction: unit vector in the target frame, of either sign.
         sigma_m: standard deviation of the translation along it, metres.
     """
 
@@ -59,7 +59,7 @@ def plane_information(
     """Computes the normal equations of point-to-plane residuals.
 
     Args:
-        pairs: under the motion.
+        pairs: pairs under the motion.
         T_target_source: the motion.
         max_residual_m: pairs with a larger residual meet no plane.
 
@@ -84,12 +84,12 @@ def weakest_direction(
     *,
     max_residual_m: float,
 ) -> WeakDirection:
-    """Finds the horizontal direction in which the translation is known least, whatever the rotation is.
+    """Finds the horizontal direction in which the translation is least certain, for any rotation.
 
-    Normals across that direction have small components along it by noise alone, which tell nothing; they do not count.
+    Normals across that direction have small components along it by noise alone; these do not count.
 
     Args:
-        pairs: under the motion.
+        pairs: pairs under the motion.
         T_target_source: the motion.
         up: unit vector in the target frame.
         max_residual_m: pairs with a larger residual meet no plane.
@@ -118,7 +118,7 @@ def with_least_covariance(
     Args:
         information: inverse covariance.
         sigma_m: standard deviation of each translation that is added.
-        sigma_rad: of each rotation.
+        sigma_rad: standard deviation of each rotation that is added.
 
     Returns:
         The inverse of the sum.
@@ -129,10 +129,10 @@ def with_least_covariance(
 
 
 class WallAxis(NamedTuple):
-    """The horizontal direction that the walls of a scan hold least.
+    """The horizontal direction that the walls of a scan constrain least.
 
     Attributes:
-        T_level_lidar: makes the ground level, at height 0.
+        T_level_lidar: motion that makes the ground level, at height 0.
         yaw: angle of the axis in the level frame, radians; either of two opposite directions.
         information: (2,) sums of squared components of the normals along the axis, and across it.
         profile: (b,) number of voxels of parallel walls by their position across the axis.
@@ -155,7 +155,7 @@ def wall_axis(surface: Surface) -> WallAxis:
     """Finds the weak axis of the walls of a scan.
 
     Args:
-        surface: of the scan.
+        surface: surface of the scan.
 
     Returns:
         The axis; the information is 0 where there is no wall.
@@ -181,10 +181,10 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
 
     Args:
         source: axis of a scan.
-        target: axis of the other scan.
+        target: axis of the second scan.
 
     Returns:
-        In [0, 0.5]: 0 for bare parallel walls, 0.5 where all directions are held alike, or a scan has no walls.
+        In [0, 0.5]: 0 for bare parallel walls, 0.5 where all directions are constrained alike, or a scan has no walls.
     """
     if min(source.information.sum(), target.information.sum()) == 0:
         return 0.5
@@ -197,7 +197,7 @@ def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[
 
     Args:
         source: axis of a scan.
-        target: axis of the other scan.
+        target: axis of the second scan.
         step_m: length of a step; the motions reach as far as the scans, up to 25 m.
 
     Returns:
@@ -218,7 +218,7 @@ def facing_surface(surface: Surface, axis: Float[np.ndarray, "3"]) -> Surface:
     """Returns a surface whose samples are those that face an axis.
 
     Args:
-        surface: of a scan.
+        surface: surface of a scan.
         axis: unit vector in the frame of the lidar.
 
     Returns:
@@ -232,7 +232,7 @@ def facing_weights(surface: Surface, axis: Float[np.ndarray, "3"], max_count: fl
     """Weighs samples so that those at one position along an axis count up to a limit together.
 
     Args:
-        surface: from `facing_surface`.
+        surface: surface from `facing_surface`.
         axis: unit vector in the frame of the lidar.
         max_count: largest sum of the weights at one position.
 

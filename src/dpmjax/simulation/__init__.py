@@ -1,4 +1,4 @@
-"""Simulated worlds made by seed: 2-D worlds, apartments, a town. No algorithm imports them."""
+"""Simulated worlds made by seed: 2-D worlds, apartments, buildings, towns. No algorithm imports them."""
 
 import lazy_loader
 

@@ -42,8 +42,8 @@ class Door:
         rooms: numbers of the rooms.
         place: x and y of the middle of the opening, m.
         axis: direction of passage, 0 along x, 1 along y.
-        width: m.
-        height: m.
+        width: width of the opening, m.
+        height: height of the opening, m.
     """
 
     rooms: tuple[int, int]
@@ -168,7 +168,7 @@ def _door(
 
 
 def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArray:
-    """Draws a route from room to room at random, round in each room, with revisits in both directions.
+    """Draws a random route from room to room and through positions of each room, with revisits in both directions.
 
     Args:
         rng: source of all choices.

@@ -42,7 +42,7 @@ class DriveConfig:
         rate_hz: scans per second.
         length_m: length of the drive; None for once round (a closed route) or to the end.
         is_reversed: True to drive the route from its end to its start, in the opposite lane.
-        sensor_height_m: above the ground.
+        sensor_height_m: height above the ground.
         max_turn_deg_s: the car slows down in corners until it turns no faster; cars turn at 20 to 40 degrees a second.
 
     Raises:
@@ -109,7 +109,7 @@ def route_poses(
 
     Args:
         rng: source of all choices.
-        kind: of the route, see `make_streets`.
+        kind: kind of the route, see `make_streets`.
         length_m: wanted length of the route; met within a block or two.
         block_m: side of a block.
         step_m: distance between two poses.
@@ -139,10 +139,10 @@ def scan_along(
     """Returns the scans at given poses in a world; each is simulated when it is read.
 
     Args:
-        name: of the sequence.
+        name: name of the sequence.
         primitives: the world.
         way: poses and times.
-        seed: of the noise.
+        seed: seed of the noise.
         sensor: the lidar.
         is_moving: True where the lidar moves during its turn, at the velocity to the next pose.
 
@@ -180,7 +180,7 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     Args:
         town: the town.
         config: settings of the drive.
-        seed: of sway and shake.
+        seed: seed of sway and shake.
 
     Returns:
         The drive. A drive once round a closed route ends one step before the place where it began.
@@ -255,7 +255,7 @@ class WalkConfig:
 
     Attributes:
         rate_hz: scans per second.
-        height_m: above the floor.
+        height_m: height above the floor.
         tilt_deg: standard deviation of roll and pitch, which change over seconds; about 1 for a robot.
         is_robot: True for a robot, which looks ahead and takes no steps; False for a person.
 
@@ -287,7 +287,7 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     route, (look_deg, bob_m) = building.route, _ROBOT if config.is_robot else _PERSON
     times = np.arange(0.0, arc_lengths(route)[-1] / _SPEED_M_S, 1.0 / config.rate_hz)
     way = times * _SPEED_M_S
-    # People turn before they walk round a corner, and not at once.
+    # People begin to turn before they reach a corner.
     along = smooth(tangents(route), _LOOK_AHEAD_M / 0.1, is_closed=False)
     facing = at_way(np.column_stack([route, along]), way + _LOOK_AHEAD_M)[:, 2:]
     yaw = np.arctan2(facing[:, 1], facing[:, 0]) + np.radians(look_deg) * _slow_sway(rng, times)

@@ -78,7 +78,7 @@ class Scene:
         motion: settings of the motion, `DriveConfig` in a town, `WalkConfig` in a building.
         sensor: the lidar.
         scale: factor of points and poses.
-        is_moving: the lidar moves during its turn, and the scans are not corrected for it.
+        is_moving: True where the lidar moves during its turn, and the scans are not corrected for it.
         other_sensor: lidar of every other scan; None: all scans are of one lidar.
 
     Raises:
@@ -117,7 +117,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
     """Draws the scene of a seed, the same one every time; nothing is built yet.
 
     Args:
-        seed: of all choices, not negative.
+        seed: seed of all choices, not negative.
         mixture: distribution of scenes.
 
     Returns:
@@ -161,7 +161,7 @@ def simulate_scene(scene: Scene) -> LidarSequence:
     """Builds a scene; a scan is simulated when it is read.
 
     Args:
-        scene: from `draw_scene`, or made by hand.
+        scene: scene from `draw_scene`, or made by hand.
 
     Returns:
         The sequence, with exact poses and times.

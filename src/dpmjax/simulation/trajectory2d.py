@@ -26,7 +26,7 @@ def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generato
     """Simulates a walk through a world: repeatedly to new places and back by another route.
 
     Args:
-        world: where to walk.
+        world: the world.
         num_poses: number of poses.
         rng: source of all choices; the same state gives the same walk.
 
@@ -94,8 +94,8 @@ def _plan_route(clearance: FloatArray, length_px: float, rng: np.random.Generato
     centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
     visits = np.zeros(len(cells))
     # The most central of three positions, because few places are reachable from a corner.
-    wishes = rng.integers(len(cells), size=3)
-    home = place = int(wishes[np.argmin(np.linalg.norm(centres[wishes] - centres.mean(axis=0), axis=1))])
+    drawn = rng.integers(len(cells), size=3)
+    home = place = int(drawn[np.argmin(np.linalg.norm(centres[drawn] - centres.mean(axis=0), axis=1))])
     route, travelled, leg = [place], 0.0, 0
     while travelled < length_px:
         cost, before = _shortest_paths(cells, coarse, visits, place)
@@ -210,9 +210,9 @@ def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, pe
     """Shortens the beams that hit a person before the world.
 
     Args:
-        ranges: (n, b) of the world without people, px.
+        ranges: (n, b) ranges in the world without people, px.
         poses: (n, 3) x, y, heading of the sensor.
-        angles: (b,) of the beams in the sensor frame, radians.
+        angles: (b,) angles of the beams in the sensor frame, radians.
         people: (p, n, 2) centres of the people, px.
 
     Returns:

@@ -111,8 +111,8 @@ def _divide(grid: BoolArray, rng: np.random.Generator, room: tuple[int, int, int
     extent, start, other = (width, x, height) if along else (height, y, width)
     cut = start + int(extent * rng.uniform(0.36, 0.64))
     low = y if along else x
-    wishes = low + other * rng.uniform(0.12, 0.88, 2 if other > 600 else 1) - _DOOR_PX / 2
-    doors = np.clip(wishes, low + 20, low + other - 20 - _DOOR_PX).tolist()
+    starts = low + other * rng.uniform(0.12, 0.88, 2 if other > 600 else 1) - _DOOR_PX / 2
+    doors = np.clip(starts, low + 20, low + other - 20 - _DOOR_PX).tolist()
     _paint_span(grid, along, cut, (low, low + other), doors)
     first = (x, y, cut - x, height) if along else (x, y, width, cut - y)
     second = (cut, y, x + width - cut, height) if along else (x, cut, width, y + height - cut)
@@ -152,8 +152,8 @@ def _paint_span(grid: BoolArray, along: int, at: float, span: tuple[float, float
     grid[(slice(None), band) if along else (band, slice(None))] |= line[:, None] if along else line
 
 
-def _local(centre: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
-    """Computes coordinates of all pixel centres in a frame at `centre`, turned by `angle`."""
+def _pixel_coordinates(centre: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
+    """Computes coordinates of all pixel centres of the world in the frame of an obstacle."""
     x, y = centre
     axis = np.arange(SIZE_PX) + 0.5
     dx, dy = (axis - x)[None, :], (axis - y)[:, None]
@@ -161,17 +161,17 @@ def _local(centre: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _paint_box(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
-    (u, v), (half_u, half_v) = _local(centre, angle), size
+    (u, v), (half_u, half_v) = _pixel_coordinates(centre, angle), size
     grid |= (np.abs(u) < half_u) & (np.abs(v) < half_v)
 
 
 def _paint_disc(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
-    u, v = _local(centre, angle)
+    u, v = _pixel_coordinates(centre, angle)
     grid |= u**2 + v**2 < np.mean(size) ** 2
 
 
 def _paint_triangle(grid: BoolArray, centre: FloatArray, size: FloatArray, angle: float) -> None:
-    (u, v), (half_u, half_v) = _local(centre, angle), size
+    (u, v), (half_u, half_v) = _pixel_coordinates(centre, angle), size
     grid |= (v > -half_v) & (np.abs(u) / half_u < (half_v - v) / (2 * half_v))
 
 
@@ -189,7 +189,7 @@ def _paint_outline(grid: BoolArray, centre: FloatArray, radius: float, waves: Fl
     outline = radius * np.exp(np.cos(phase) @ waves[0] + np.sin(phase) @ waves[1])
     (left, bottom), size = np.maximum(centre - outline.max(), 0).astype(int), int(2 * outline.max()) + 2
     box = slice(bottom, bottom + size), slice(left, left + size)
-    u, v = (x[box] for x in np.broadcast_arrays(*_local(centre, 0.0)))
+    u, v = (x[box] for x in np.broadcast_arrays(*_pixel_coordinates(centre, 0.0)))
     grid[box] |= np.hypot(u, v) < np.interp(np.arctan2(v, u), turn, outline)
 
 

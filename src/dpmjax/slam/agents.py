@@ -1,7 +1,7 @@
 """Several agents: each maps alone, keyframes are exchanged, maps that meet are joined (DeepPointMap section 4).
 
-The relative pose of two maps is unknown. Candidates are similar keyframes of different maps. They are registered,
-verified and accepted like all loops: only together with loops that agree with them over the odometry of both maps.
+The relative pose of two maps is unknown. Candidates are similar keyframes of different maps. Like all
+loops, each is registered and verified, and accepted only together with others that the odometry of both maps confirms.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
 # Three float32 numbers.
 BYTES_A_POINT = 12
 
-# Called with the number of keyframes that were compared, and with that of all to be compared.
+# Callback for progress: number of compared keyframes, and number of all keyframes to compare.
 OnKeyframe = Callable[[int, int], None]
 
 
@@ -38,10 +38,10 @@ class JoinedMaps(NamedTuple):
 
     Attributes:
         slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
-        map_of_keyframe: (k,) which map each keyframe comes from.
-        component_of_map: which maps are joined: equal numbers, counted from 0. Maps of other components have frames
-            of their own, and their poses cannot be compared.
-        loops: candidates between maps and what became of them, by rows of `slam_map`.
+        map_of_keyframe: (k,) number of the map that each keyframe comes from.
+        component_of_map: number of the component of each map, from 0; joined maps share one. Each component has its own
+            frame, so poses of different components cannot be compared.
+        loops: candidates between maps and their outcome; rows are those of `slam_map`.
     """
 
     slam_map: KeyframeMap
@@ -51,11 +51,11 @@ class JoinedMaps(NamedTuple):
 
 
 class SentBytes(NamedTuple):
-    """Bytes that an agent sends, and those of its points.
+    """Numbers of bytes: messages of an agent, and its raw points for comparison.
 
     Attributes:
-        keyframe_bytes: its keyframes: descriptors, surface elements, range images, poses, retrieval vectors.
-        descriptor_bytes: features of the descriptors among them.
+        keyframe_bytes: keyframes: descriptors, surface elements, range images, poses, retrieval vectors.
+        descriptor_bytes: features of the descriptors, a part of `keyframe_bytes`.
         keyframe_scan_bytes: the raw points of the same keyframes, three float32 numbers each.
         scan_bytes: the raw points of all scans.
     """
@@ -70,12 +70,13 @@ class AgentsResult(NamedTuple):
     """Trajectories and maps of several agents.
 
     Attributes:
-        T_world_scan: of each agent, (n, 4, 4) float64, in the frame of its component, which is that of the component's
-            first agent at its first scan.
-        component: of each agent; agents with equal numbers have met. Poses of different components cannot be compared.
+        T_world_scan: (n, 4, 4) float64 poses of each agent. The world of a component is the frame of the first scan of
+            its first agent.
+        component: number of the component of each agent; agents of one component have met, and only their poses can be
+            compared.
         joined: all keyframes in one record, and the loops between agents.
-        agents: what each found alone.
-        traffic: of each agent.
+        agents: result of each agent alone.
+        traffic: bytes that each agent sends.
     """
 
     T_world_scan: tuple[Float[np.ndarray, "_n 4 4"], ...]
@@ -89,7 +90,7 @@ class MergedMaps(NamedTuple):
     """Merged maps, and the maps that have met.
 
     Attributes:
-        maps: one map for each component, in the frame of its first map; a map that met no other is as it was.
+        maps: one map for each component, in the frame of its first map; a map that met no other is unchanged.
         joined: the keyframes of all maps in one record, and the loops between maps.
     """
 
@@ -103,7 +104,7 @@ class MergedMaps(NamedTuple):
 
     @property
     def loops(self) -> tuple[Loop, ...]:
-        """Candidates between maps and their outcome; rows are those of the first map, then of the next."""
+        """Candidates between maps and their outcome; rows count all keyframes, map by map."""
         return self.joined.loops
 
     @property
@@ -140,12 +141,12 @@ def run_agents(
 def join_agents(
     methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe | None = None
 ) -> AgentsResult:
-    """Joins what agents have mapped alone; `run_agents` does both.
+    """Joins the maps that agents have made alone, the second half of `run_agents`.
 
     Args:
-        methods: of all agents.
+        methods: methods of all agents.
         agents: at least one.
-        on_keyframe: for progress, while keyframes are compared.
+        on_keyframe: callback for progress, while keyframes are compared.
 
     Returns:
         Trajectories, who has met whom, the joined graph, bytes sent.
@@ -170,7 +171,7 @@ def merge_maps(
         on_keyframe: called while keyframes are compared, for progress.
 
     Returns:
-        One map, or several where no loop joins them, and who has met whom.
+        One map, or several where no loop joins them, and the maps that have met.
 
     Raises:
         ValueError: if there are fewer than two maps, if a map was made with other weights, or if methods come with
@@ -199,10 +200,10 @@ def join_maps(
     Args:
         methods: matcher and settings; the matcher that made the maps.
         maps: at least one.
-        on_keyframe: for progress.
+        on_keyframe: callback for progress.
 
     Returns:
-        All keyframes, and which maps were joined.
+        All keyframes, and the components of the joined maps.
 
     Raises:
         ValueError: if a map was made by another matcher.
@@ -234,10 +235,10 @@ def join_maps(
 
 
 def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
-    """Takes one component out.
+    """Extracts the map of one component.
 
     Args:
-        joined: from `join_maps`.
+        joined: maps from `join_maps`.
         component: its number.
 
     Returns:
@@ -254,7 +255,7 @@ def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
 
 
 def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
-    """Puts all keyframes into one record; rows, segments and scans are numbered on, and no edge joins two maps."""
+    """Concatenates maps; rows, segments and scans are numbered consecutively, and no edge joins two maps."""
     joined, rows, scans, segments = KeyframeMap(), 0, 0, 0
     for other in maps:
         keyframes = [one._replace(scan=one.scan + scans, segment=one.segment + segments) for one in other.keyframes]
@@ -295,7 +296,7 @@ def _num_bytes(record: object) -> int:
 
 
 def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Float[np.ndarray, "_n 4 4"], ...]:
-    """Hangs all scans on the joined keyframes; the first scan of a component's first agent is its origin."""
+    """Computes the poses of all scans; the first scan of a component's first agent is its origin."""
     found: list[Float[np.ndarray, "_n 4 4"]] = []
     origins: dict[int, Float[np.ndarray, "4 4"]] = {}
     for number, agent in enumerate(agents):

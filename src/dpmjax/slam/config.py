@@ -51,7 +51,7 @@ class FrontEndConfig:
     """Acceptance of the pose of a scan, and choice of keyframes.
 
     Attributes:
-        min_probability: smallest P(correct) of the decoder's motion that accepts a pose of a lower share.
+        min_probability: smallest P(correct) of a decoder's motion that confirms a pose of too low a score.
         num_submap: largest number of keyframes that are merged for a registration.
         num_lost: number of scans without an accepted pose after which a new segment begins at the latest; loops may
             join it.
@@ -83,12 +83,12 @@ class LoopClosureConfig:
         num_near: largest number of candidates by distance.
         num_similar: largest number of candidates by retrieval.
         min_overlap: smallest overlap probability of a candidate that is registered; 0 uses no network.
-        num_asked: number of candidates whose overlap is predicted at a time, of both kinds in turn.
+        num_asked: number of candidates whose overlap is predicted at a time, alternately by distance and by retrieval.
         num_registered: largest number of candidates that are registered.
         min_probability: smallest P(correct) of an accepted registration.
-        min_support: number of consistent registrations, itself among them, that make a loop an edge.
-        sigma_m: standard deviation of a registration by descriptors.
-        sigma_rad: standard deviation of its rotation.
+        min_support: smallest number of consistent registrations, its own included, with which a loop becomes an edge.
+        sigma_m: standard deviation of the translation of a registration by descriptors.
+        sigma_rad: standard deviation of the rotation of a registration by descriptors.
     """
 
     is_on: bool = True
@@ -125,10 +125,10 @@ class SlamConfig:
 
 
 class MapOrigin(NamedTuple):
-    """Origin of a map.
+    """Matcher and settings that made a map.
 
     Attributes:
-        fingerprint: of the matcher; keyframes of another matcher cannot be compared.
+        fingerprint: fingerprint of the matcher; keyframes of another matcher cannot be compared.
         config: settings of SLAM.
         weights: name of the weights, for messages; may be empty.
     """

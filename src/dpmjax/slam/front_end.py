@@ -1,7 +1,7 @@
 """The front end: each scan in turn gets a pose, and some become keyframes (DeepPointMap section 4).
 
-A first guess comes from the motion of before or from the decoder. The alignment with the local map makes it exact, and
-the share of elements that meet planes decides whether the pose is accepted.
+The last motion or the decoder gives a first guess. The alignment with the local map makes it exact, and the share of
+elements that meet planes decides whether the pose is accepted.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ MIN_SCORE_SHARE = 0.4
 # Number of motions that the decoder proposes.
 NUM_HYPOTHESES = 3
 
-# Share of the usual score from which on no other start is tried.
+# Share of the usual score above which no other start is tried.
 GOOD_SHARE = 0.85
 
-# Poses farther apart are of other places.
+# Largest distance between two poses of one place.
 NEAR_M = 2.0
 
 # Largest turn between the decoder's motion and the pose that it confirms.
 NEAR_RAD = 0.087
 
-# Difference of the scores from which on the decoder's motion replaces another one.
+# Least lead in score with which the pose by the decoder replaces a pose of another place.
 MIN_MARGIN = 0.1
 
 # Number of scans whose median is the usual score.
@@ -72,15 +72,14 @@ GUESS_M = 1.0
 # Standard deviation of a predicted rotation.
 GUESS_RAD = 0.2
 
-# Standard deviation of a place that nothing is known of.
+# Standard deviation of the relative pose of two parts without a measurement between them.
 UNKNOWN_M = 1000.0
 
 
-# How the pose of a scan was found.  "first": the scan starts the map, or a new part of a loaded one. "tracked":
-# geometry, from the predicted pose. "network": geometry failed there, and agreed from the network's pose, or both agree
-# on a pose of a low score. "predicted": nothing agreed, the pose is a guess: what geometry prefers, or the motion of
-# before. "empty": the scan has too few points. "restarted": nothing agreed for a while, or the scan met only scans that
-# were lost before; a new part of the map begins here at a predicted pose, and loops may join it.
+# Source of a pose. "first": first scan of the map, or of a new part of a loaded one. "tracked": aligned from the
+# predicted pose. "network": aligned from the decoder's pose, or confirmed by it at a low score. "predicted": no alignment
+# was accepted; the pose is a guess. "empty": too few points. "restarted": first scan of a new part at a guessed pose,
+# after several rejected scans, or where the scan meets only such scans; loops may join the part.
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 
 
@@ -91,9 +90,9 @@ class ScanReport(NamedTuple):
         scan: its number.
         status: how the pose was found.
         reason: the numbers that decided.
-        keyframe: row of the keyframe that it hangs on; its own row if it is one.
+        keyframe: row of the keyframe that the pose is relative to; its own row if it is one.
         T_keyframe_scan: relative pose; loops move the keyframe only.
-        is_keyframe: whether it became one.
+        is_keyframe: True if it became a keyframe.
         score: agreement of the scan with the local map.
         probability: P(correct) of the network; None where it did not run.
         num_accepted: number of loops that were accepted at this scan.
@@ -164,10 +163,10 @@ AnyScan = Float[AnyArray, "_n 3"] | TimedScan
 
 
 class Located(NamedTuple):
-    """The pose of a scan in the frame of the last keyframe, and what a keyframe needs beside it.
+    """Pose of a scan in the frame of the last keyframe, and the inputs of a new keyframe.
 
     Attributes:
-        report: the pose, and why it is accepted or not.
+        report: the pose, and the reason of its acceptance or rejection.
         information: (6, 6) in the tangent of the scan.
         compact: the encoded scan; None where it was not encoded.
     """
@@ -180,7 +179,7 @@ class Located(NamedTuple):
 def place_scan(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: AnyScan
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
-    """Places a scan.
+    """Estimates the pose of a scan, and makes it a keyframe where it is far enough from the last one.
 
     Args:
         methods: matcher, geometry, settings.
@@ -189,7 +188,7 @@ def place_scan(
         scan: points in metres, in the frame of the lidar, perhaps with times.
 
     Returns:
-        The state and the map after, and how the scan was placed.
+        The state and the map after the scan, and its report.
     """
     T_turn = state.T_before_last if isinstance(scan, TimedScan) else None
     thinned = methods.geometry.thin(corrected_points(scan, T_turn))
@@ -212,7 +211,7 @@ def place_scan(
     if report.status == "predicted":
         after = after._replace(lost=(*state.lost, placed))
     else:
-        # Around a lidar that stands still, people move: the map of before fits less and less.
+        # People move around a lidar that stands still, so the local map is renewed where it fits less.
         is_changed = bool(state.scores) and report.score < GOOD_SHARE * state.usual_score
         spacing_m = 0.0 if is_changed else RECENT_SHARE * thinned.extent_m
         recent = with_scan(state.recent, placed, spacing_m, methods.config.odometry)
@@ -257,7 +256,7 @@ def _locate(
     wanted = _least_score(state)
     is_far = not are_near(state.predicted, best.T_map_scan, NEAR_M, np.inf)
     if is_far and state.scores and (probability or 0.0) < config.min_probability:
-        # A motion that neither the motion of before nor the decoder supports needs the usual score.
+        # A motion that neither the last motion nor the decoder supports needs the usual score.
         wanted = GOOD_SHARE * usual
     T, information = best.T_map_scan, best.information
     status: ScanStatus = "tracked" if best is tried.tracked else "network"
@@ -274,7 +273,7 @@ def _locate(
 
 
 def _least_score(state: FrontEndState) -> float:
-    # Nothing is usual yet where a part of the map begins: sparse scans never score high.
+    # A new part has no usual score yet, and sparse scans never score high.
     return max(MIN_SCORE, MIN_SCORE_SHARE * state.usual_score if state.scores else 0.0)
 
 
@@ -282,7 +281,7 @@ def _guess(
     methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, T: Pose
 ) -> tuple[Pose, bool]:
     """Returns the pose of a rejected scan, and whether the scan meets the lost ones: in a doorway the map ends."""
-    # The best alignment is the better guess, unless a robot hardly moves like that.
+    # The best alignment is the better guess, unless it is too far from the last motion.
     T = T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
     if not state.lost:
         return T, False
@@ -297,7 +296,7 @@ def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sc
     geometry, predicted = methods.geometry, state.predicted
     is_predicted = methods.config.odometry.proposer == "prediction"
     good_score = GOOD_SHARE * state.usual_score
-    # The second scan of a drive has no motion to go on with.
+    # The second scan of a drive has no last motion.
     has_motion, tracked = len(state.scores) > 0, None
     if is_predicted and has_motion:
         tracked = geometry.align(local_map, scan, predicted)

@@ -20,11 +20,11 @@ from dpmjax.types import PointCloud, Verification
 
 
 class ThinnedScan(NamedTuple):
-    """A scan after its one thinning.
+    """A thinned scan, the common input of encoder and odometry.
 
     Attributes:
         cloud: thinned points, metres, in the frame of the lidar; input of the encoder.
-        measured: their surface and free space.
+        measured: surface and free space of the thinned points.
         extent_m: median range of the thinned points.
     """
 
@@ -37,7 +37,7 @@ class Alignment(NamedTuple):
     """A scan in the frame of the local map.
 
     Attributes:
-        T_map_scan: float64.
+        T_map_scan: float64 pose of the scan.
         matched_share: share of the elements of the scan that meet planes of the map.
         contradicted_share: share of the visible elements of the map that lie in the free space of the scan.
         score: `matched_share` less the weighted `contradicted_share`.
@@ -73,7 +73,7 @@ class Geometry(Protocol):
             T_map_scan: first guess.
 
         Returns:
-            The pose.
+            The alignment.
         """
 
     def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Float[np.ndarray, "s 4 4"]) -> Alignment:
@@ -85,7 +85,7 @@ class Geometry(Protocol):
             T_map_scan: first guesses; at least one.
 
         Returns:
-            The pose of the highest score.
+            The alignment of the highest score.
         """
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
@@ -107,7 +107,7 @@ def best_of(alignments: Sequence[Alignment]) -> Alignment:
         alignments: at least one.
 
     Returns:
-        The first of the best.
+        The alignment; the first of equal ones.
     """
     return max(alignments, key=lambda found: found.score)
 
@@ -116,12 +116,12 @@ class Match(NamedTuple):
     """A registration without a first guess.
 
     Attributes:
-        T_target_source: float64.
-        probability: that it is right within 2 m and 5 degrees, if the matcher is calibrated; else a score in [0, 1].
-        rmse: of the pairs that it rests on, metres.
-        verification: how well the scans agree under it; None where the matcher has no scans.
+        T_target_source: float64 motion.
+        probability: P(right within 2 m and 5 degrees), if the matcher is calibrated; else a score in [0, 1].
+        rmse: root mean square error of the inlier pairs, metres.
+        verification: agreement of the scans under the motion; None where the matcher has no scans.
         information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
-            first; None where it is not known.
+            first; None where it is unknown.
     """
 
     T_target_source: Pose
@@ -136,7 +136,7 @@ class Proposal(NamedTuple):
 
     Attributes:
         T_target_source: (h, 4, 4) float64, the most likely first.
-        probability: P(correct) of the first.
+        probability: P(correct) of the first motion.
     """
 
     T_target_source: Float[np.ndarray, "h 4 4"]
@@ -147,7 +147,7 @@ class Matcher(Protocol):
     """Recognises places and registers scans and maps without a first guess.
 
     Attributes:
-        fingerprint: keyframes are compared only with those of a matcher of the same fingerprint.
+        fingerprint: text that is equal for equal matchers; keyframes of different fingerprints are not compared.
     """
 
     @property
@@ -165,7 +165,7 @@ class Matcher(Protocol):
         """
 
     def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
-        """Returns one vector for retrieval, of a length that is the same for all scans.
+        """Returns the vector of a scan for retrieval; its size is the same for all scans.
 
         Args:
             scan: from `encode`.
@@ -179,7 +179,7 @@ class Matcher(Protocol):
 
         Args:
             source: a scan.
-            target: the other.
+            target: a second scan.
             num_motions: largest number of motions.
 
         Returns:

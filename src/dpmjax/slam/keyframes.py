@@ -52,7 +52,7 @@ class MapEdge(NamedTuple):
         target: row of the second keyframe.
         T_target_source: float64.
         information: (6, 6) inverse covariance in the tangent of the source, translation first.
-        kind: what measured it; a "guess" is a motion that was only predicted.
+        kind: source of the relative pose; a "guess" is a motion that was only predicted.
     """
 
     source: int
@@ -67,11 +67,11 @@ class KeyframeMap:
     """Keyframes (k of them), poses and edges.
 
     Attributes:
-        keyframes: in the order of time.
+        keyframes: keyframes in the order of time.
         T_world_keyframe: (k, 4, 4) float64, corrected by loops.
         vectors: (k, c) unit vectors for retrieval, float32.
         edges: all relative poses.
-        origin: what made it; None for an empty map.
+        origin: matcher and settings that made it; None for an empty map.
     """
 
     keyframes: tuple[Keyframe, ...] = ()
@@ -100,7 +100,7 @@ class Submap(NamedTuple):
     """Keyframes around a central one, which are registered as a whole.
 
     Attributes:
-        scans: of the keyframes; the first is the central one.
+        scans: compact scans of the keyframes, the central one first.
         T_submap_keyframe: (n, 4, 4) their poses in the frame of the first.
     """
 
@@ -121,8 +121,8 @@ def add_keyframe(
         slam_map: the map before.
         keyframe: the new one.
         T_world_keyframe: its pose.
-        vector: for retrieval; any length of vector.
-        edge: how it was measured; None for the first of a map.
+        vector: vector for retrieval, of any norm.
+        edge: edge to an earlier keyframe; None for the first of a map.
 
     Returns:
         The map after.
@@ -133,7 +133,7 @@ def add_keyframe(
 
 
 def joined_maps(slam_map: KeyframeMap, other: KeyframeMap) -> KeyframeMap:
-    """Appends the keyframes and the edges of another map, which count the rows of both.
+    """Appends the keyframes and the edges of another map; rows in its edges must already count those of the first map.
 
     Args:
         slam_map: the map before.
@@ -154,12 +154,12 @@ def joined_maps(slam_map: KeyframeMap, other: KeyframeMap) -> KeyframeMap:
 
 
 def take_keyframes(slam_map: KeyframeMap, rows: Sequence[int], edges: Iterable[MapEdge]) -> KeyframeMap:
-    """Takes some keyframes out of a map.
+    """Selects keyframes of a map.
 
     Args:
         slam_map: the map.
-        rows: of the keyframes.
-        edges: between the keyframes, by their new rows.
+        rows: rows of the selected keyframes.
+        edges: edges of the result, with rows of the result.
 
     Returns:
         The smaller map.
@@ -175,13 +175,13 @@ def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
 
     Args:
         slam_map: the map.
-        origin: of the matcher that reads or extends it.
+        origin: origin of the matcher that reads or extends it.
 
     Returns:
         The map after.
 
     Raises:
-        ValueError: if its descriptions are those of another matcher.
+        ValueError: if another matcher made it.
     """
     made_by = slam_map.origin
     if made_by is not None and made_by.fingerprint != origin.fingerprint:
@@ -208,7 +208,7 @@ def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius
 
     Args:
         slam_map: the map.
-        row: of the keyframe.
+        row: row of the keyframe.
         num_keyframes: largest number of keyframes, and of edges between them and the first.
         radius_m: keyframes farther away are left out.
 
@@ -232,7 +232,7 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap
 
     Args:
         slam_map: the map.
-        row: of the central keyframe.
+        row: row of the central keyframe.
         num_keyframes: largest number of keyframes, the central one among them.
 
     Returns:
@@ -247,7 +247,7 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     """Makes the pose graph of a map; the ids of its nodes are numbers of scans.
 
     Args:
-        slam_map: with at least one keyframe.
+        slam_map: map with at least one keyframe.
 
     Returns:
         The graph.
@@ -308,7 +308,7 @@ def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, 
 
     Args:
         sigma_m: standard deviation of each translation.
-        sigma_rad: of each rotation.
+        sigma_rad: standard deviation of each rotation.
 
     Returns:
         The inverse covariance, translation first.

@@ -1,6 +1,6 @@
 """The local map: surface elements of the nearest keyframes and of the last scans.
 
-Keyframes keep few elements, the last scans all of theirs: density around the lidar makes odometry exact.
+A keyframe stores few elements. The last scans keep all, because dense surfaces around the lidar make odometry exact.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dpmjax.types import AnyArray
 # Smallest distance between the last scans, as a share of the extent.
 RECENT_SHARE = 0.08
 
-# Turn from which on a scan joins the local map at a smaller distance.
+# Turn above which a scan joins the local map at a smaller distance.
 RECENT_RAD = 0.17
 
 
@@ -33,7 +33,7 @@ class PlacedElements(NamedTuple):
     Attributes:
         T_map_scan: pose of the scan.
         positions: (n, 3) float32, metres, in the frame of the scan.
-        normals: (n, 3) unit normals, either side.
+        normals: (n, 3) unit normals, of either sign.
         planarity: (n,) above `MIN_FLATNESS`.
     """
 
@@ -58,10 +58,10 @@ class LocalMap(NamedTuple):
 
 
 def local_map_of(slam_map: KeyframeMap, recent: Sequence[PlacedElements], config: OdometryConfig) -> LocalMap:
-    """Gathers the keyframes around the last one, among those that the graph joins to it.
+    """Builds the local map: recent scans, and the nearest keyframes that the graph joins to the last one.
 
     Args:
-        slam_map: with at least one keyframe.
+        slam_map: map with at least one keyframe.
         recent: the last scans, in the frame of the last keyframe.
         config: number of keyframes.
 
@@ -82,7 +82,7 @@ def placed_keyframe(scan: CompactScan, T_map_scan: Pose) -> PlacedElements:
 
 
 def placed_scan(surface: Surface, T_map_scan: Pose) -> PlacedElements:
-    """Returns the flat elements of a scan with a pose, in float32 as a file has them."""
+    """Returns the flat elements of a scan with a pose, in float32, as files store them."""
     return _placed(T_map_scan, surface.points, surface.normals, surface.flatness)
 
 
@@ -104,7 +104,7 @@ def with_scan(
         config: number of scans.
 
     Returns:
-        The last scans after; the same tuple where the scan does not join.
+        The new last scans; the same tuple where the scan is not added.
     """
     if recent:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan

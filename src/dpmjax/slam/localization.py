@@ -1,7 +1,7 @@
-"""Re-localisation: single scans are found in a map without a first guess, or are said not to be in it.
+"""Re-localisation: single scans are found in a map without a first guess, or reported as not in it.
 
 The keyframes that look most alike are registered one by one. Registrations that put the scan at the same place support
-each other: two wrong ones hardly ever do. Then the neighbours of that place are registered too.
+each other: two wrong ones rarely agree. Then the neighbours of that place are registered too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dpmjax.slam.loop_candidates import most_similar
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray
 
-# Largest sum of probabilities of a second place, as a share of that of the best one.
+# Largest sum of probabilities of a second place, as a share of the sum of the best place.
 MAX_RIVAL_SHARE = 0.5
 
 # Largest turn between registrations that agree.
@@ -31,7 +31,7 @@ SAME_PLACE_RAD = 0.06
 # Largest distance between registrations that agree.
 SAME_PLACE_M = 1.5
 
-# Number of registrations at a time; the next ones follow only where the place is not clear.
+# Number of registrations at a time; further ones follow only while the place is not clear.
 NUM_AT_ONCE = 2
 
 # Number of further keyframes near the best place that are registered.
@@ -51,15 +51,15 @@ LocalizationStatus = Literal["found", "not in this map", "empty"]
 
 @dataclass(frozen=True)
 class LocalizationConfig:
-    """Number of registrations, and limits from which on a place is accepted.
+    """Number of registrations, and limits of acceptance.
 
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
-        num_registered: largest number of them that are registered, in order of their overlap.
+        num_registered: largest number of these keyframes that are registered, in order of their overlap.
         min_support: number of registrations that must end at the same place; the scans of at least one must agree. One
             registration suffices where no other keyframe is near.
-        min_best: smallest P(correct) of the best registration of a place. Streets look alike: several may agree on a
-            wrong place.
+        min_best: smallest P(correct) of the best registration of a place. Streets look alike, so
+            several registrations may agree on a wrong place.
     """
 
     num_similar: int = 16
@@ -77,9 +77,9 @@ class KeyframeMatch(NamedTuple):
 
     Attributes:
         keyframe: row of the keyframe.
-        T_world_scan: where it puts the scan.
+        T_world_scan: pose of the scan by this registration.
         match: the registration.
-        do_scans_agree: whether enough points meet planes, and few lie in free space; streets look alike.
+        do_scans_agree: True if enough points meet planes, and few lie in free space.
     """
 
     keyframe: int
@@ -89,13 +89,13 @@ class KeyframeMatch(NamedTuple):
 
 
 class Localization(NamedTuple):
-    """Place of a scan in a map, or that it is not in the map.
+    """Result of `localize`.
 
     Attributes:
         status: "found", "not in this map", or "empty": the scan has too few points.
         T_world_scan: pose in the frame of the map; None where it was not found.
         probability: P(correct) of the place; 0 where it was not found.
-        keyframe: row of the keyframe that it was found by; None where it was not found.
+        keyframe: row of the keyframe of the most probable registration; None where it was not found.
         reason: the numbers that decided.
         evidence: all registrations.
     """
@@ -123,12 +123,12 @@ def localize(
 
     Args:
         model: the model that made the map; or methods of your own.
-        slam_map: from `load_map` or of a run.
+        slam_map: map from `load_map` or of a run.
         scan: points in metres, in the frame of the lidar; points that are not finite are dropped.
         config: number of registrations and limits of acceptance; None takes the defaults.
 
     Returns:
-        The pose in the frame of the map, or that the scan is not in it.
+        The result; its pose is None if the scan is not in the map.
 
     Raises:
         ValueError: if the shape is not (n, 3), the map is empty, or it was made with other weights.
@@ -170,7 +170,7 @@ Place = tuple[KeyframeMatch, ...]
 
 
 class _Search(NamedTuple):
-    # Where scans are looked for, and how.
+    # The map, and the settings of the search in it.
     methods: SlamMethods
     slam_map: KeyframeMap
     config: LocalizationConfig
@@ -220,7 +220,7 @@ class _Search(NamedTuple):
 
     def _places(self, tried: list[KeyframeMatch]) -> list[Place]:
         """Groups registrations around the most probable ones whose scans agree; the most probable place first."""
-        # Fewer points meet planes of a keyframe farther off: that it puts the scan at the same place is enough.
+        # Few points meet planes of a distant keyframe, so its registration only needs to end at the same place.
         left = sorted(tried, key=lambda one: -one.match.probability)
         left = [one for one in left if one.match.probability >= MIN_PROBABILITY]
         places = []

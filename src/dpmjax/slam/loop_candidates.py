@@ -26,20 +26,20 @@ DRIFT_SHARE = 0.03
 # Smallest similarity of a candidate by retrieval.
 MIN_COSINE = 0.8
 
-# The mean of fewer vectors is no background.
+# The mean of fewer vectors is too noisy to subtract.
 MIN_NUM_CENTRED = 20
 
 
 def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[Loop]:
     """Finds older keyframes that may show the place of a keyframe.
 
-    By distance: within a radius that grows with the path since, for odometry drifts. By retrieval: over the whole map,
-    so that neither drift nor a lost track matters. Of several neighbours only the best is taken.
+    By distance: within a radius that grows with the length of the path between, because odometry drifts. By retrieval:
+    over the whole map, even after drift or a lost track. Of several neighbours only the best is a candidate.
 
     Args:
         slam_map: the map.
-        row: of the new keyframe.
-        config: numbers.
+        row: row of the new keyframe.
+        config: largest numbers of candidates.
 
     Returns:
         Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
@@ -78,13 +78,13 @@ def nearest_pairs(slam_map: KeyframeMap) -> list[tuple[float, int, int]]:
 def similar_keyframes(
     slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"], config: LoopClosureConfig
 ) -> list[Loop]:
-    """Finds keyframes that may show the place of a keyframe, by retrieval alone: no position is known.
+    """Finds keyframes that may show the place of a keyframe, by retrieval alone, without positions.
 
     Args:
         slam_map: the map; or several maps in one record.
-        row: of the keyframe.
+        row: row of the keyframe.
         is_allowed: False for keyframes that are no candidates.
-        config: numbers.
+        config: largest number of candidates.
 
     Returns:
         Candidates, most similar first.
@@ -104,11 +104,11 @@ def most_similar(
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Finds the vectors with the largest cosine, by one matrix product.
 
-    The mean of many vectors says nothing about a place, so it is subtracted first.
+    The mean of many vectors is common to all places, so it is subtracted first.
 
     Args:
         vectors: unit vectors.
-        query: any length of vector.
+        query: vector of any norm.
         count: largest number of vectors.
         is_allowed: False for vectors that are no candidates.
 
@@ -137,17 +137,17 @@ def _paths(slam_map: KeyframeMap) -> tuple[Float[np.ndarray, " k"], Int[np.ndarr
 
 
 def _path_since_m(path_m: Float[np.ndarray, " k"], segments: Int[np.ndarray, " k"], row: int) -> np.ndarray:
-    """Returns the path from each keyframe to one; infinite where the track was lost between them."""
+    """Returns the path length from each keyframe to that of `row`; infinite where the track was lost between them."""
     return np.where(segments == segments[row], path_m[row] - path_m, np.inf)
 
 
 def _is_old(since_m: Float[np.ndarray, " k"], row: int, extent_m: float) -> Bool[np.ndarray, " k"]:
-    """Returns True for keyframes that a loop may join to one."""
+    """Returns True for keyframes early enough on the path for a loop to that of `row`."""
     return (np.arange(len(since_m)) < row) & (since_m > MIN_PATH_SHARE * extent_m)
 
 
 def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float, count: int) -> Int[np.ndarray, " m"]:
-    """Returns the first rows that are not within `spacing_m` of one taken before, of the same segment."""
+    """Returns the first rows without those within `spacing_m` of an earlier row of the same segment."""
     positions = slam_map.T_world_keyframe[rows, :3, 3]
     segments = np.array([slam_map.keyframes[row].segment for row in rows])
     is_free: Bool[np.ndarray, " n"] = np.ones(len(rows), bool)

@@ -19,25 +19,25 @@ from dpmjax.slam.loop_candidates import find_loop_candidates, nearest_pairs
 from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, loop_status, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 
-# Overlap probability from which on no further candidate is looked at.
+# Overlap probability above which no further candidate is examined.
 SURE_OVERLAP = 0.9
 
-# Lower bound of the standard deviation of an aligned loop: scans hold walkers and motion.
+# Lower bound of the standard deviation of an aligned loop: people and the motion of the lidar disturb scans.
 FLOOR_M = 0.05
 
 # Lower bound of the standard deviation of the rotation of an aligned loop.
 FLOOR_RAD = 0.005
 
-# Path after an accepted loop on which no other is looked for, in extents.
+# Length of path after an accepted loop without a search for another one, in extents.
 REST_SHARE = 0.3
 
 # Smallest number of keyframes between two optimisations.
 EVERY_KEYFRAMES = 8
 
-# Share of all keyframes between two optimisations: the cost of a scan does not grow with the map.
+# Share of all keyframes between two optimisations, so that the cost of a scan does not grow with the map.
 EVERY_SHARE = 0.05
 
-# Number of registrations after an optimisation.
+# Largest number of further registrations after an optimisation.
 MAX_AGAIN = 4
 
 
@@ -46,7 +46,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 
     Args:
         methods: matcher and settings.
-        slam_map: with the new keyframe.
+        slam_map: map with the new keyframe.
         state: candidates so far.
 
     Returns:
@@ -66,11 +66,11 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 
 
 def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> LoopState:
-    """Registers keyframes with earlier ones that are near only since the optimisation.
+    """Registers keyframes with earlier ones that the optimisation has brought near.
 
     Args:
         methods: matcher and settings.
-        slam_map: after the optimisation.
+        slam_map: map after the optimisation.
         state: its loops.
 
     Returns:
@@ -97,8 +97,8 @@ def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
 
     Args:
         slam_map: the map.
-        loops: so far.
-        row: of a keyframe.
+        loops: loops so far.
+        row: row of a keyframe.
 
     Returns:
         True where the last accepted loop is near along the path.
@@ -118,7 +118,7 @@ def examine_candidates(
     Args:
         methods: matcher and settings.
         slam_map: the map.
-        loops: so far; in the order of the keyframes of each chain.
+        loops: loops so far; in the order of the keyframes of each chain.
         candidates: pairs of this keyframe and an older one, which may show the same place.
 
     Returns:
@@ -154,7 +154,7 @@ def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates
 
 
 def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list[Loop]) -> list[Loop]:
-    """Predicts the overlap of some candidates at a time, until one surely overlaps; the remaining ones stay."""
+    """Predicts the overlap, some candidates at a time, until one surely overlaps; the remaining ones do not change."""
     config, loops = methods.config.loops, list(candidates)
     for start in range(0, len(candidates), config.num_asked):
         some = candidates[start : start + config.num_asked]
@@ -171,7 +171,7 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
 
 
 def _edge_information(match: Match, config: LoopClosureConfig) -> Float[np.ndarray, "6 6"]:
-    """Returns the information by the planes, with an upper bound; for descriptors alone, that of the configuration."""
+    """Returns the information by the planes, with an upper bound; without planes, that of the configuration."""
     if match.information is None:
         return diagonal_information(config.sigma_m, config.sigma_rad)
     return with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)

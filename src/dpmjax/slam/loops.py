@@ -1,7 +1,7 @@
 """Loops: candidates as records, and their acceptance by their own numbers, by odometry, and by one another.
 
-A single registration may be wrong in a place that looks like another. It becomes an edge only together with others, of
-other keyframes, that agree with it over the odometry between them (pairwise consistency, Mangelson et al. 2018).
+A single registration may be wrong in a place that looks like another. It becomes an edge only together with
+registrations of other keyframes that the odometry between them confirms (pairwise consistency, Mangelson et al. 2018).
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ CONSISTENT_SIGMAS = 3.0
 MIN_DRIFT_SHARE = 0.1
 
 # Largest number of accepted loops that are compared with a new one.
-MAX_WITNESSES = 6
+MAX_COMPARED = 6
 
-# What became of a loop candidate; all but "accepted" are reasons why it is no edge.
+# Outcome of a loop candidate; every one but "accepted" is the reason why it is no edge.
 LoopStatus = Literal[
     "not asked",
     "no overlap",
@@ -54,12 +54,12 @@ class Loop(NamedTuple):
     Attributes:
         source: row of the new keyframe.
         target: row of an older one.
-        found_by: how it became a candidate; "map" is a loop of the map that was extended.
-        status: what became of it.
+        found_by: search that found it; "map" is a loop of the map that was extended.
+        status: outcome.
         overlap: probability of overlap; 1 where no network predicts it, None where another candidate surely overlaps.
         probability: P(correct) of the registration; None without one.
-        rmse: of the registration, metres; None without one.
-        T_target_source: the registration; None without one.
+        rmse: root mean square error of the registration, metres; None without one.
+        T_target_source: motion of the registration; None without one.
         information: (6, 6) inverse covariance, as in `MapEdge`; None without a registration.
     """
 
@@ -86,7 +86,7 @@ class LoopState(NamedTuple):
     Attributes:
         loops: every candidate, in the order in which they were found.
         num_optimized: number of keyframes at the last optimisation.
-        is_stale: whether edges were added since that do not only lengthen the chain of odometry.
+        is_stale: True if edges other than further steps of odometry were added since.
     """
 
     loops: tuple[Loop, ...] = ()
@@ -98,7 +98,7 @@ def loops_of_map(slam_map: KeyframeMap) -> LoopState:
     """Lists the loops that an earlier run has accepted; the optimisation may remove them later.
 
     Args:
-        slam_map: of the earlier run.
+        slam_map: map of the earlier run.
 
     Returns:
         The loops.
@@ -157,8 +157,8 @@ def accept_consistent(
     Args:
         slam_map: the map.
         loops: all candidates, in the order of their sources.
-        number: of the loop; nothing is changed unless it waits for support.
-        config: uncertainties and the number that is enough.
+        number: index of the loop; nothing is changed unless it waits for support.
+        config: standard deviations and the required number of registrations.
 
     Returns:
         All candidates after.
@@ -170,8 +170,8 @@ def accept_consistent(
         return are_consistent(slam_map, loops[one], loops[other], config)
 
     near = list(_near_along(slam_map, loops, number))
-    witnesses = [other for other in near if loops[other].status == "accepted"][:MAX_WITNESSES]
-    others = [other for other in near if other in witnesses or loops[other].status == "waits for support"]
+    compared = [other for other in near if loops[other].status == "accepted"][:MAX_COMPARED]
+    others = [other for other in near if other in compared or loops[other].status == "waits for support"]
     others = [other for other in others if agree(number, other)]
     members = [number]
     for other in sorted(others, key=lambda other: -(loops[other].probability or 0.0)):
@@ -192,7 +192,7 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
         config: uncertainties.
 
     Returns:
-        False also where the loops are too far from each other to tell.
+        False also where the loops are too far apart for a test.
     """
     if loop.source == other.source or loop.T_target_source is None or other.T_target_source is None:
         return False

@@ -17,11 +17,11 @@ from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, as_pose_graph, con
 from dpmjax.slam.loops import LoopState
 from dpmjax.types import AnyArray
 
-# Cost from which on the optimisation reduces the weight of a loop edge.
+# Cost above which the optimisation reduces the weight of a loop edge.
 OUTLIER_CHI2 = 25.0
 
 # Smallest weight of a loop edge that stays after the optimisation.
-TAKEN_BACK_WEIGHT = 0.25
+MIN_LOOP_WEIGHT = 0.25
 
 # Number of contradicting loops that would remove an edge of odometry.
 CERTAIN = 1e9
@@ -36,8 +36,8 @@ OnWindow = Callable[[int, int], None]
 def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
     """Optimises all poses, and removes loops that contradict the remaining edges.
 
-    Parts that loops join for the first time are first moved to where a loop says. A predicted motion gives way where
-    measured ones join its ends.
+    Parts that loops join for the first time are first moved to the pose that a loop gives. A predicted motion is
+    dropped where measured edges join its ends.
 
     Args:
         slam_map: the map.
@@ -58,7 +58,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     trust[: len(edges)] = 1.0
     settings = PoseGraphConfig(outlier_chi2=OUTLIER_CHI2, is_chordal_start=False)
     solved = optimize_pose_graph(graph, settings, trust=trust)
-    loops, is_kept = list(state.loops), solved.weights[: len(edges)] >= TAKEN_BACK_WEIGHT
+    loops, is_kept = list(state.loops), solved.weights[: len(edges)] >= MIN_LOOP_WEIGHT
     for number in np.array(accepted, int)[~is_kept]:
         loops[number] = loops[number]._replace(status="taken back")
     kept = [edge for edge, stays in zip(edges, is_kept, strict=True) if stays]
@@ -69,7 +69,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
 def _joined_poses(
     T_world_keyframe: Float[np.ndarray, "k 4 4"], parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]
 ) -> Float[np.ndarray, "k 4 4"]:
-    """Moves whole parts, so that one edge between two of them holds exactly: the optimisation starts near its end."""
+    """Moves whole parts, so that one edge between two parts holds exactly: a start near the solution."""
     T_world, parts = T_world_keyframe.copy(), parts.copy()
     for edge in edges:
         into, moved = parts[edge.target], parts[edge.source]
@@ -85,7 +85,7 @@ class RefinedKeyframes(NamedTuple):
     """Keyframes after the refinement.
 
     Attributes:
-        slam_map: the map with refined poses; its edges are those of before.
+        slam_map: the map with refined poses; its edges are unchanged.
         num_windows: number of windows.
         num_improved: number of windows whose fit was taken.
     """
@@ -110,9 +110,9 @@ def refine_keyframes(
     Args:
         slam_map: the map of a run.
         read_keyframe: reads the points of a keyframe by its row, in metres, in the frame of the lidar.
-        key: of the fits.
+        key: key of the fits.
         on_window: called after each window, for progress.
-        stop: called before each window; from the first True on, windows keep their poses.
+        stop: called before each window; after the first True, all further windows keep their poses.
 
     Returns:
         The map with refined poses, and the number of windows that became better.
@@ -125,7 +125,7 @@ def refine_keyframes(
             clouds = [read_keyframe(row) for row in rows]
             found = _fitted_motions(slam_map, rows, clouds, jax.random.fold_in(key, number))
             num_improved += bool(found)
-            # A motion that two windows share is that of the window where it is farther from the border.
+            # Fits are worst at borders: a motion that two windows share comes from the one where it is farther inside.
             first_new = rows.start + OVERLAP // 2
             motions |= {row: motion for row, motion in found.items() if row not in motions or row >= first_new}
         on_window(number + 1, len(parts))
@@ -148,7 +148,7 @@ def windows(num_keyframes: int) -> list[range]:
 def _fitted_motions(
     slam_map: KeyframeMap, rows: range, clouds: Sequence[Float[AnyArray, "_n 3"]], key: jax.Array
 ) -> dict[int, Pose]:
-    """Returns `T_before_keyframe` of each row but the first; none where the fit was not better than its start."""
+    """Returns `T_before_keyframe` of each row but the first; none if the fit was not better than its start."""
     fitted = register_clouds(clouds, key=key, start=slam_map.T_world_keyframe[list(rows)])
     if fitted.kept != "fit":
         return {}

@@ -11,14 +11,14 @@ from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, take_ke
 
 
 def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
-    """Leaves out keyframes near others, also of other laps, so that the map does not grow where it is driven again.
+    """Leaves out keyframes near others, also of other laps, so that repeated drives of a place do not enlarge the map.
 
-    The poses are those of the map. An edge between keyframes that were left out joins those that cover them; its
-    information falls with the number of steps that it stands for.
+    Poses do not change. An edge between keyframes that were left out joins those that cover them; its
+    information is divided by the number of steps that it replaces.
 
     Args:
-        slam_map: of a run.
-        spacing_share: no two joined keyframes are nearer than this share of the extent of the earlier one.
+        slam_map: map of a run.
+        spacing_share: smallest distance of joined keyframes, as a share of the extent of the earlier one.
 
     Returns:
         The smaller map; the first keyframe stays.
@@ -42,7 +42,7 @@ def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMa
 
 
 def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
-    """Returns the rows that stay, and for each row the nearest of them."""
+    """Returns the rows that stay, and the nearest one of these for each row."""
     extents_m = slam_map.column("extent_m")
     # Parts of a map that no loop has joined have no known distance.
     part = connected_parts(len(slam_map), slam_map.edges_of("odometry", "loop"))

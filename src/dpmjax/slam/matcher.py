@@ -44,7 +44,7 @@ class NetworkMatcher:
         self.fingerprint = model_fingerprint(model)
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
-        """Encodes a scan, and keeps of it what a map needs; see `Matcher`.
+        """Encodes a scan in the compact form of a map; see `Matcher`.
 
         Args:
             scan: the scan.
@@ -73,7 +73,7 @@ class NetworkMatcher:
 
         Args:
             source: a scan.
-            target: the other.
+            target: a second scan.
             num_motions: largest number of motions.
 
         Returns:
@@ -105,7 +105,7 @@ class NetworkMatcher:
 
         Args:
             source: a scan.
-            targets: the others.
+            targets: the scans that it is compared with.
 
         Returns:
             The probabilities.

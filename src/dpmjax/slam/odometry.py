@@ -35,10 +35,10 @@ NUM_SAMPLES = 1000
 # Weight of the share of points in free space in the score.
 CONTRADICTION_WEIGHT = 2.0
 
-# Factors of the predicted step among the other starts.
+# Factors of the predicted step among the further starts.
 STEP_FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 
-# Steps along the x axis of the lidar among the other starts, as shares of the extent.
+# Steps along the x axis of the lidar among the further starts, as shares of the extent.
 AHEAD_SHARES = (-0.08, 0.08, 0.16)
 
 # Lower bound of the standard deviation of a translation.
@@ -50,13 +50,13 @@ FLOOR_RAD = 0.001
 # Number of elements of the local map that are compared with the free space of a scan.
 MAX_VIEWED = 4000
 
-# Largest number of surface elements of a scan: rings of denser scans hold on to each other.
+# Largest number of surface elements of a scan: denser scans would align ring with ring.
 MAX_ELEMENTS = 3000
 
-# Scans of 1,000 points have neighbours farther away than others.
+# In scans of 1,000 points neighbours are farther away.
 NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
 
-# One element of each voxel of this size comes first: ground near the lidar is dense.
+# One element of each voxel of this size is chosen first, because ground near the lidar is dense.
 SPREAD_M = 1.5
 
 # Number of starts of a search that are aligned finely.
@@ -142,7 +142,7 @@ class SurfaceGeometry:
         motions = [(R, factor * step) for factor in STEP_FACTORS]
         motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
         motions += [(turned, translation) for turned in turns for translation in (np.zeros(3), step)]
-        # A vehicle that rocks does not turn on: its tilt comes back.
+        # A rocking vehicle tilts back, so its last rotation does not continue.
         motions.append((np.eye(3), step))
         motions += [(rotation, step) for tilt in tilts for rotation in (R @ tilt, tilt)]
         found = np.tile(np.eye(4), (len(motions), 1, 1))
@@ -175,13 +175,13 @@ def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
 def _matched_share(surface: Surface, planes: NearestPlanes) -> float:
     """Returns the mean share of elements that meet planes, over the main directions of their normals.
 
-    Ground meets ground under any motion: without the mean it would outvote the walls.
+    Ground meets ground under any motion: without the mean it would outweigh the walls.
     """
     meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M) & (planes.cosines > MIN_COSINE)
     direction = np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)
     counts = np.bincount(direction, minlength=3)
     shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
-    # A direction of few elements counts less: their share is hardly known.
+    # A direction of few elements counts less, because its share is uncertain.
     return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
 
 

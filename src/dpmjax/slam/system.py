@@ -1,4 +1,4 @@
-"""The whole system: scans in, one map out. Front end, loop closure and optimisation, scan by scan."""
+"""The whole system: scan by scan, front end, loop closure and optimisation make one map."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from dpmjax.slam.odometry import SurfaceGeometry
 
 
 class SlamState(NamedTuple):
-    """All that the next scan needs.
+    """State of SLAM between two scans.
 
     Attributes:
-        front_end: the last scan and the local map.
+        front_end: state of odometry, with the local map.
         slam_map: keyframes and edges.
         loops: candidates of loops.
     """
@@ -44,10 +44,10 @@ class SlamResult(NamedTuple):
         T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one, or of the map that was
             extended.
         keyframes: (k,) numbers of the scans that are keyframes.
-        loops: every candidate and what became of it; rows are those of `keyframes`.
+        loops: every candidate and its outcome; rows are those of `keyframes`.
         graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
-        reports: how each scan was placed.
-        state: goes on with `step_slam`.
+        reports: report of each scan.
+        state: state after the last scan, from which `step_slam` continues.
         T_odometry_scan: (n, 4, 4) every scan by odometry alone, without any loop.
     """
 
@@ -103,10 +103,11 @@ def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMet
 def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
     """Begins an empty map, or a new part of an earlier one.
 
-    Scans are numbered on from those of the map. The new part has no known place in the map until a loop joins it.
+    The numbers of scans continue those of the map. The pose of the new part in the map is unknown until a loop
+    joins it.
 
     Args:
-        slam_map: from `load_map` or of an earlier run; None for an empty one.
+        slam_map: map from `load_map` or of an earlier run; None for an empty one.
 
     Returns:
         The state before the first scan.
@@ -117,16 +118,16 @@ def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
 
 
 def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[SlamState, ScanReport]:
-    """Places a scan; a new keyframe is compared with the map.
+    """Estimates the pose of a scan, and searches loops of a new keyframe.
 
     Args:
-        methods: from `make_methods`.
-        state: after the scan before.
+        methods: methods from `make_methods`.
+        state: state after the scan before.
         scan: (n, 3) points in metres, in the frame of the lidar, or a `TimedScan`, which is deskewed by the predicted
             motion; points that are not finite are dropped.
 
     Returns:
-        The state after, and how the scan was placed.
+        The state after the scan, and its report.
 
     Raises:
         ValueError: if the shape is not (n, 3).
@@ -146,8 +147,8 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     """Optimises a last time and puts every scan into the world.
 
     Args:
-        state: after the last scan.
-        reports: of all scans.
+        state: state after the last scan.
+        reports: reports of all scans.
         config: settings.
 
     Returns:
@@ -174,7 +175,7 @@ def place_scans(
 
     Args:
         T_world_keyframe: poses of the keyframes; none where all scans were empty.
-        reports: of all scans.
+        reports: reports of all scans.
 
     Returns:
         Poses of the scans; the world is the frame of the first one, or of the map that was extended.
@@ -193,7 +194,7 @@ def run_slam(
     *,
     slam_map: KeyframeMap | None = None,
 ) -> SlamResult:
-    """Makes one map of a drive: odometry, loops, and a graph that agrees with both (DeepPointMap section 4).
+    """Makes one map of a drive by odometry, loop closure and optimisation of the pose graph (DeepPointMap section 4).
 
     Every scan gets a pose, also an empty one. `reports` has how each pose was found, and flags uncertain ones.
 
@@ -202,7 +203,7 @@ def run_slam(
         scans: points in metres, each in the frame of the lidar, in the order of time; any iterable. `TimedScan`s are
             deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
-        slam_map: from `load_map`, to be extended; None begins an empty one.
+        slam_map: map from `load_map`, to be extended; None begins an empty one.
 
     Returns:
         `T_world_scan` of every scan, keyframes, loops, graph, map and reports.

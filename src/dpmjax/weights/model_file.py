@@ -89,7 +89,7 @@ def save_model(
 
 
 def read_card(path_or_name: str | Path) -> str:
-    """Reads the description of a model; a `ValueError` says if the file is missing or no such model.
+    """Reads the description of a model; raises a `ValueError` if the file is missing or no such model.
 
     Args:
         path_or_name: the name of a shipped model, or a `.safetensors` file that `save_model` wrote.

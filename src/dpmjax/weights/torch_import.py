@@ -46,7 +46,7 @@ for _layer in range(2):
     ENCODER_NAMES[rf"upsampler\.(\d+)\.mlp\.{3 * _layer}\."] = rf"propagation_\1.linear_{_layer}."
     ENCODER_NAMES[rf"upsampler\.(\d+)\.mlp\.{3 * _layer + 1}\.ln\."] = rf"propagation_\1.norm_{_layer}."
 
-# Networks whose linear layers have the numbers 0, 2, 4 there, and 0, 1, 2 here.
+# Networks whose linear layers have the numbers 0, 2, 4 in the published files, and 0, 1, 2 here.
 _SEQUENCES = {
     r"descriptor_attention\.(\d+)\.mlp": r"layer_\1.network",
     "similarity_head": "similarity_head",
@@ -77,8 +77,8 @@ def import_torch_checkpoint(path: str | Path) -> Model:
     """Reads a model from a published checkpoint: `{"encoder": state_dict, "decoder": state_dict}`.
 
     The shapes of the tensors give widths, depths and numbers of blocks. Radii, numbers of points and numbers of
-    neighbours come from a `config.json` beside the file (keys `npoint`, `radius_list`, `nsample_list`,
-    `upsample_layers` under `encoder`, and `coordinate_scale`), or are those of the paper where there is none. Attention
+    neighbours come from a `config.json` beside the file: keys `npoint`, `radius_list`, `nsample_list` and
+    `upsample_layers` under `encoder`, and `coordinate_scale`. Without that file they are those of the paper. Attention
     has eight heads.
 
     Args:
@@ -244,7 +244,7 @@ def _read_with_torch(path: Path) -> Any:
         raise ValueError(f"{path}: no ZIP archive, so at best a checkpoint of PyTorch before 1.6; {needed}") from None
     try:
         return _as_numpy(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # whatever a broken file makes of it
+    except Exception as error:  # a broken file raises anything at all
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path}: not a PyTorch checkpoint that can be read ({reason})") from error
 

@@ -1,9 +1,9 @@
 """Settings of training: the stages of the curriculum, and the sizes of the maps in their samples.
 
-The sizes are a few fixed layouts for each stage, so that no step computes on empty rows. Attention over padded maps
-costs 5 times as much as over the scans that are there with groups of up to 4 scans, and 13 times with 16. So the sizes
-of the groups are not drawn for each step. The layouts of a stage together hold them in the proportions of the published
-draw, and the steps take the layouts in turn. Each layout compiles one step.
+The sizes are a few fixed layouts for each stage, so that no step computes on empty rows. With groups
+of up to 4 scans, attention over padded maps costs 5 times as much as over the valid scans alone, and 13 times with up
+to 16. So the sizes of the groups are not drawn for each step. All layouts of a stage together have the proportions of
+the published draw, and the steps take the layouts in turn. Each layout compiles one step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ GroupShape = tuple[int, int]
 Layout = tuple[GroupShape, ...]
 
 NUM_LAYOUTS = 4
-# Its multiples, modulo 1, spread evenly however many there are.
+# Golden ratio: any number of its multiples modulo 1 are spread evenly.
 GOLDEN = 0.6180339887498949
 
 
@@ -58,8 +58,8 @@ class SamplingConfig:
 
     Attributes:
         num_scans: capacity of one sample, all groups together.
-        min_distance_m: scans nearer to the anchor are too similar to it.
-        max_distance_m: scans farther from the anchor do not belong to its group.
+        min_distance_m: smallest distance of a scan from its anchor; nearer ones are too similar.
+        max_distance_m: largest distance of a scan of a group from its anchor.
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
         max_descriptors: largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans,
@@ -161,7 +161,7 @@ class TrainingConfig:
         return replace(self, curriculum=stages, warmup_steps=warmup)
 
 
-# What DeepPointMap's Table 2 leaves out.
+# Parts that DeepPointMap's Table 2 leaves out.
 TrainingPart = Literal["offset-head", "coarse-loss", "curriculum", "occlusion"]
 
 
@@ -200,13 +200,14 @@ def training_preset(name: Preset) -> TrainingConfig:
     Returns:
         The configuration.
 
-    A name that no preset has is a `ValueError`.
+    An unknown name raises a `ValueError`.
     """
     require_one_of("name", name, PRESETS)
     return PRESETS[name]
 
 
-# For frames that turn with the scan: large motions put the origin of rays beside the lidar, tilts turn walls over.
+# For frames that turn with the scan: after a large motion rays do not start at the lidar, and after a large tilt
+# normals of walls are not horizontal.
 NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
 
 PRESETS = {
@@ -214,7 +215,7 @@ PRESETS = {
         model=model_preset("tiny"),
         curriculum=(CurriculumStage(2, 700), CurriculumStage(4, 40)),
         sampling=SamplingConfig(num_scans=16),
-        # So few steps need weaker augmentation, more positives, and a direct loss on the encoder.
+        # Few steps need weaker augmentation, more positives, and a direct loss on the encoder.
         augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.3),
         objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
         learning_rate=2e-3,
@@ -224,7 +225,7 @@ PRESETS = {
     "small": TrainingConfig(
         model=model_preset("small"),
         curriculum=tuple(map(CurriculumStage, (2, 4, 8, 16), (6000, 3000, 3000, 3000))),
-        # Pairs within 20 m are nearly all right after some thousand steps.
+        # Farther than published: pairs within 20 m are nearly all right after some thousand steps.
         sampling=SamplingConfig(num_scans=16, max_distance_m=25.0),
         augment=replace(
             NEAR_THE_LIDAR, max_drop_ratio=0.5, sparse_probability=0.4, max_tilt_rad=math.radians(15), tilt_power=3.0
@@ -245,11 +246,11 @@ def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
     """Makes the layouts of a stage.
 
     The published draw of a group: two scans with `pair_probability`, else 2 to `max_group`, each number equally likely.
-    One half of the groups is split into one scan against all others; the second half is split anywhere. The two maps of
-    a group may change places, as the losses are symmetric; the smaller one is the first.
+    One half of the groups is split into one scan against all others; the second half is split anywhere. The losses
+    are symmetric, so the smaller map of a group is always the first.
 
     Args:
-        max_group: scans in both maps of a group together, at most.
+        max_group: largest number of scans in both maps of a group together.
         config: capacity of a sample, and proportions.
 
     Returns:

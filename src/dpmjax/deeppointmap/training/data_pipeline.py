@@ -38,8 +38,8 @@ class SampleMaker:
             store: the scans.
             config: settings of training.
             seed: seed of the run.
-            num_samples: samples of one batch: the number of devices of this process.
-            first_sample: number of the first of them among those of all processes.
+            num_samples: number of samples of a batch, one for each device of this process.
+            first_sample: number of the first sample among the samples of all processes.
         """
         self._store, self._config, self._seed = store, config, seed
         self._numbers = range(first_sample, first_sample + num_samples)

@@ -31,10 +31,10 @@ from dpmjax.types import AnyArray, DescriptorCloud, Registration
 TRAINED = ObjectiveConfig()
 
 PAIR_STREAM = 3103
-# A map of an evaluation holds scans so near to its first one.
+# Largest distance of the scans of an evaluated map from its first scan.
 MAP_RADIUS_M = 10.0
 
-# Nothing but a random yaw.
+# No augmentation but a random yaw.
 UPRIGHT = AugmentConfig(
     max_drop_ratio=0.0,
     sector_probability=0.0,
@@ -105,7 +105,7 @@ class EvaluationPairs(NamedTuple):
         """Computes the true motions of pairs.
 
         Args:
-            pairs: of these.
+            pairs: pairs of these scans.
 
         Returns:
             Target from source, metres.
@@ -118,8 +118,8 @@ class Evaluation(NamedTuple):
     """Results of a model on evaluation pairs.
 
     Attributes:
-        recalls: for each kind, errors and the share of correct registrations.
-        matches: for each kind, the registrations, stacked.
+        recalls: errors and share of correct registrations of each kind.
+        matches: stacked registrations of each kind.
         clouds: descriptors of all scans, stacked.
     """
 
@@ -129,7 +129,7 @@ class Evaluation(NamedTuple):
 
     @property
     def mean_recall(self) -> float:
-        """The mean over the kinds."""
+        """Mean recall over the kinds."""
         return float(np.mean([recall.recall for recall in self.recalls]))
 
 
@@ -187,7 +187,7 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
 
     Args:
         model: a model of the configuration that the pairs were drawn for.
-        pairs: from `draw_evaluation_pairs`.
+        pairs: pairs from `draw_evaluation_pairs`.
 
     Returns:
         Errors, registrations and descriptors.

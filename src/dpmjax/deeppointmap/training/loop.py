@@ -163,7 +163,7 @@ def begin_training(config: TrainingConfig, *, seed: int = 0, start: Model | None
 
 
 def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgress:
-    """Keeps the parameters of the state if no score was better; of equal scores, the later one counts.
+    """Keeps the parameters of the state as the best ones, unless an earlier score was higher.
 
     Args:
         progress: progress before the evaluation.
@@ -200,8 +200,8 @@ def train(
             `simulation.simulate_scenes` return; or scans that are prepared already.
         config: settings of training; `training_preset` has three.
         seed: seed of parameters, samples and augmentation.
-        start: progress to continue from, that of process 0 counts; or a model to begin with its parameters; None
-            begins with random parameters.
+        start: progress to continue from, of which that of process 0 counts; or a model with the first parameters;
+            None begins with random ones.
         cache: folder where scans that are prepared here are kept for later calls; None keeps them in memory.
         hooks: evaluation, which chooses the best model, reports and stopping.
 

@@ -31,9 +31,9 @@ class ObjectiveConfig:
         coarse_weight: weight of the coarse pairing loss.
         offset_weight: weight of the offset loss.
         temperature: temperature of both pairing losses.
-        positive_radius_m: the nearest descriptor within this radius is the positive; further descriptors within it are
-            neutral.
-        offset_radius_m: offsets are learned for all pairs within this radius.
+        positive_radius_m: largest distance of the positive, which is the nearest descriptor; further descriptors within
+            it are neutral.
+        offset_radius_m: largest distance of the pairs whose offsets are learned.
         max_close: largest number of such pairs for each descriptor, the nearest first. Two scans need 4, maps of many
             scans need more.
     """
@@ -58,7 +58,8 @@ class TrainingPairs:
     Attributes:
         indices: row in the second cloud; 0 where `mask` is False.
         mask: False where there are fewer.
-        offsets: from the descriptor to its neighbour, metres, in the frame of the descriptor; 0 where `mask` is False.
+        offsets: offsets from the descriptor to its neighbour, metres, in the frame of the descriptor; 0 where `mask` is
+            False.
     """
 
     indices: Int[AnyArray, "*b m k"]
@@ -75,7 +76,7 @@ class TrainingSide:
         mask: True for descriptors that are there; others may hold anything.
         matched_features: correlated descriptors after the similarity head.
         coarse_features: uncorrelated descriptors after the coarse head.
-        close: from `training_pairs`.
+        close: close pairs from `training_pairs`.
         offsets: predicted offsets of the close pairs, metres, in the frame of the cloud.
     """
 
@@ -91,9 +92,9 @@ class ObjectiveTerms(NamedTuple):
     """Unweighted parts of the loss, each the mean of both directions.
 
     Attributes:
-        pairing: eq. 4, on correlated descriptors.
-        coarse: eq. 5, on uncorrelated descriptors.
-        offset: eq. 6.
+        pairing: pairing loss, eq. 4, on correlated descriptors.
+        coarse: coarse pairing loss, eq. 5, on uncorrelated descriptors.
+        offset: offset loss, eq. 6.
         top1_accuracy: share of the descriptors with a positive that are most similar to this positive.
         num_positives: number of descriptors with a positive, in both clouds together.
     """
@@ -134,7 +135,7 @@ def matching_loss(
 
     Args:
         a: one cloud, with the predictions of the networks.
-        b: the other cloud.
+        b: the second cloud.
         T_b_a: the true motion, metres.
         config: weights and distances.
 

@@ -30,7 +30,7 @@ def join_processes(coordinator: str | None, num_processes: int | None, process_i
     """Makes this process one of several; call it before JAX is used. Without any argument it does nothing.
 
     Args:
-        coordinator: HOST:PORT on which process 0 listens; or `auto`, to ask the scheduler that started the processes
+        coordinator: HOST:PORT on which process 0 listens; or `auto`, for the scheduler that started the processes
             (Slurm, Open MPI, a TPU pod).
         num_processes: number of processes.
         process_id: number of this process, from 0.
@@ -71,7 +71,7 @@ def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
     Args:
         tree: without an axis, the same in every process. With `BATCH_AXIS`, the samples of this process, stacked along
             the first axis. Their number is that of the devices of this process in the mesh, or a multiple.
-        mesh: from `device_mesh`.
+        mesh: mesh from `device_mesh`.
         *axes: `BATCH_AXIS` to spread the first axis over the devices; none to copy the tree to every device.
 
     Returns:
@@ -82,7 +82,7 @@ def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
 
 
 def is_first() -> bool:
-    """Says if this is the process that writes, prints and shows progress.
+    """Returns True in the one process that writes, prints and shows progress.
 
     Returns:
         True in process 0; True with one process.
@@ -106,7 +106,7 @@ def from_first(tree: TreeT) -> TreeT:
     """Copies a tree from process 0 to all processes.
 
     Args:
-        tree: the same structure, shapes and types in every process.
+        tree: tree of the same structure, shapes and types in every process.
 
     Returns:
         The tree of process 0.

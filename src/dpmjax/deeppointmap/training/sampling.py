@@ -28,7 +28,7 @@ NUM_ATTEMPTS = 100
 
 @dataclass(frozen=True)
 class ScanTable:
-    """True poses of the scans of all drives; a `ValueError` says if there are fewer than two, or one is not finite.
+    """True poses of the scans of all drives; raises a `ValueError` if there are fewer than two, or one is not finite.
 
     Attributes:
         T_world_lidar: (n, 4, 4) float64 true poses, metres.
@@ -96,8 +96,8 @@ def draw_groups(
         rng: source of the draws.
 
     Returns:
-        A group for each entry of the layout; smaller where there are fewer scans, None where no scan was found with
-        another one near it.
+        A group for each entry of the layout; smaller where there are fewer scans, None where no anchor with a
+        scan near it was found.
 
     Raises:
         ValueError: if all are None.
@@ -142,7 +142,7 @@ class MapOfScans:
     """One map of each group.
 
     Attributes:
-        rows: its scans, as rows of the sample; 0 where a map has fewer scans.
+        rows: rows of its scans in the sample; 0 where a map has fewer scans.
         mask: False where a map has fewer scans or descriptors, and where `matching.thinned_mask` removes one.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
@@ -213,7 +213,7 @@ def arrange_groups(groups: Sequence[Group | None], layout: Layout, placed: Place
     """Arranges groups as NumPy arrays, whose shapes depend on the layout only.
 
     Args:
-        groups: from `draw_groups`.
+        groups: groups from `draw_groups`.
         layout: sizes of the groups.
         placed: the scans of all groups: the source of the first group, its target, the source of the second, ...
 

@@ -32,7 +32,7 @@ LOGGER = logging.getLogger("dpmjax.training")
 PUBLISHED = SamplingConfig()
 
 VARIANT_STREAM = 3104
-# Raise it when the same scans and settings shall give other files.
+# Version of the files, to be raised when the same scans and settings give other files.
 FORMAT = 2
 
 
@@ -42,7 +42,7 @@ class PreparedDrive(NamedTuple):
     Attributes:
         T_world_lidar: (n, 4, 4) float64 true poses, metres.
         pyramids: (n, num_variants) records of `record_type`, or the file that holds them.
-        bad: for each bad scan the reason; bad scans count as empty.
+        bad: reason for each bad scan; bad scans count as empty.
     """
 
     T_world_lidar: Float[np.ndarray, "n 4 4"]
@@ -55,14 +55,14 @@ class ScanStore:
 
     Attributes:
         table: poses of all scans.
-        bad: for each bad scan the reason.
+        bad: reason for each bad scan.
     """
 
     def __init__(self, drives: Sequence[PreparedDrive]) -> None:
         """Collects the poses.
 
         Args:
-            drives: from `prepare_drive`, all with the same settings.
+            drives: drives from `prepare_drive`, all with the same settings.
         """
         poses = [drive.T_world_lidar for drive in drives]
         scene = np.concatenate([np.full(len(T), number) for number, T in enumerate(poses)])
@@ -117,9 +117,9 @@ def prepare_drive(
     name until it is whole.
 
     Args:
-        drive: with poses.
+        drive: drive with poses.
         config: settings of training.
-        folder: where files are kept; None keeps the pyramids in memory.
+        folder: folder of the files; None keeps the pyramids in memory.
         seed: seed of the variants.
         on_scan: called after each scan, to show progress.
 
@@ -207,7 +207,7 @@ def _augmented(cloud: PointCloud, keys: Array, *, config: AugmentConfig) -> Poin
 def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
     model = config.model
     settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
-    # What changes in the step does not change the file.
+    # Motions are drawn in the step, so they do not change the file.
     for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
         del settings[-1][name]
     content = json.dumps([FORMAT, settings, model.scale_m, config.num_variants, seed], sort_keys=True)
@@ -227,9 +227,9 @@ def prepare_drives(
     """Prepares the scans of all drives, in order.
 
     Args:
-        drives: with poses.
+        drives: drives with poses.
         config: settings of training.
-        folder: where prepared scans are kept for later calls; None keeps them in memory.
+        folder: folder of prepared scans for later calls; None keeps them in memory.
         seed: seed of the variants.
 
     Returns:
@@ -251,10 +251,10 @@ def prepare_drives(
 
 
 def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> str | None:
-    """Finds a reason why nothing can be learned from a drive, or measured on it. Reads scans up to the first good one.
+    """Finds a reason against training or evaluation on a drive. Reads scans up to the first good one.
 
     Args:
-        drive: to be checked.
+        drive: drive that is checked.
         sampling: distances between the scans of a pair.
 
     Returns:

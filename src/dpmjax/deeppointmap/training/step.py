@@ -63,7 +63,7 @@ class TrainingState:
         params: parameters of the model.
         optimizer: state of the optimiser.
         step: number of steps done.
-        decay_start: step from which on the learning rate falls.
+        decay_start: first step of the decay of the learning rate.
         end: step after the last.
     """
 
@@ -117,7 +117,7 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
 def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
     """Begins the decay of the learning rate at once, so that training ends early.
 
-    The decay then has the share of the steps that `config.decay_ratio` says.
+    The decay still takes the share `config.decay_ratio` of all steps.
 
     Args:
         state: state before any step.
@@ -238,8 +238,9 @@ def _over_samples(function: Callable[[Any], Any], batch: Any) -> Any:
 
 
 def _in_parts(function: Callable[[Any], Any], trees: Any, at_once: int) -> Any:
-    # Maps the function over the first axis, about `at_once` entries at a time. The gradient computes the inside again
-    # instead of keeping it, except for the loops over neighbours: a tenth of the memory, and small parts stay cached.
+    # Maps the function over the first axis, about `at_once` entries at a time. The gradient recomputes inner
+    # values instead of storing them, except in loops over neighbours: a tenth of the memory, and small parts stay
+    # cached.
     num = len(jax.tree.leaves(trees)[0])
     # A divisor, because a last part of another size would be compiled separately.
     size = max(size for size in range(1, max(1, min(at_once, num)) + 1) if num % size == 0)
@@ -285,7 +286,7 @@ def _learning_rate(state: TrainingState, config: TrainingConfig) -> Float[Array,
 
 
 def _optimizer(config: TrainingConfig) -> optax.GradientTransformation:
-    # AdamW without its learning rate, which the state decides about.
+    # AdamW without its learning rate, which depends on the state.
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
         # The mean of gradients is stored in 16 bits: a sixth of a checkpoint less, and training does not need more.

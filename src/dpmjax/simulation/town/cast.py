@@ -45,7 +45,7 @@ class NearBodies(NamedTuple):
     """Bodies of one kind that lie near the sensor, nearest first.
 
     Attributes:
-        bodies: relative to the sensor.
+        bodies: bodies, relative to the sensor.
         distances: lower bounds of the distances from the sensor to the surfaces, m; ascending, infinite for padding.
     """
 
@@ -90,7 +90,7 @@ def near_world(
     Args:
         town: the world.
         start: position of the sensor, m.
-        time: s, for the traffic.
+        time: time of the traffic, s.
         max_range: bodies beyond this range are left out, m.
 
     Returns:
@@ -117,7 +117,7 @@ def _nearest_bodies(bodies: Bodies, capacity: int, max_range: float) -> NearBodi
     """Selects the bodies with the nearest surfaces.
 
     Args:
-        bodies: all of the town, relative to the sensor.
+        bodies: all bodies of the town, relative to the sensor.
         capacity: number of kept bodies.
         max_range: bodies beyond this are left out, m.
 
@@ -184,8 +184,8 @@ class Hits(NamedTuple):
     """First hits of the rays of a turn: s sectors of g bands of c columns of b beams.
 
     Attributes:
-        ranges: m; infinite for nothing.
-        cosines: of the angle between the ray and the surface's normal; 1 for foliage.
+        ranges: m; infinite without a hit.
+        cosines: cosine of the angle between the ray and the surface's normal; 1 for foliage.
         surfaces: NOTHING, GROUND, SOLID, SOFT, POLE or MOVING.
         is_glass: True in windows.
     """
@@ -235,8 +235,8 @@ def cast_turn(near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *
     Args:
         near: bodies and ground near the sensor.
         T_world_lidar: pose of the sensor.
-        rays: by sector.
-        max_range: m.
+        rays: rays by sector.
+        max_range: largest range, m.
 
     Returns:
         The hits, by sector.

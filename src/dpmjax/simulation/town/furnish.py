@@ -236,7 +236,7 @@ def _plant_land(into: Collection, rng: np.random.Generator, plots: Plots, kind: 
     """Adds plants on the free land outside of streets and plots, in patches.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of all choices.
         plots: free ground.
         kind: kind of place, with densities of plants.

@@ -48,7 +48,7 @@ def cross_box(direction: Float[Array, "... 3"], box: Bodies) -> Crossing:
     """Intersects a ray from the origin with an upright box (the slab method, Kay and Kajiya 1986).
 
     Args:
-        direction: of the ray, unit length.
+        direction: unit direction of the ray.
         box: the box.
 
     Returns:
@@ -65,8 +65,8 @@ def cross_cylinder(direction: Float[Array, "... 3"], cylinder: Bodies) -> Crossi
     """Intersects a ray from the origin with an upright cylinder with lids; see `cross_box`.
 
     Args:
-        direction: of the ray, unit length.
-        cylinder: by the box round it.
+        direction: unit direction of the ray.
+        cylinder: the cylinder, by its bounding box.
 
     Returns:
         The crossing, m.
@@ -87,13 +87,13 @@ def cross_spheroid(direction: Float[Array, "... 3"], spheroid: Bodies) -> Crossi
     """Intersects a ray from the origin with an ellipsoid of revolution about z; see `cross_box`.
 
     Args:
-        direction: of the ray, unit length.
-        spheroid: by the box round it.
+        direction: unit direction of the ray.
+        spheroid: the ellipsoid, by its bounding box.
 
     Returns:
         The crossing, m.
     """
-    # In coordinates where it is the unit sphere; distances along the ray are the same.
+    # In coordinates where the spheroid is the unit sphere, distances along the ray are the same.
     (x, y, z), (u, v, w) = _split(direction / spheroid.half_sizes), _split(spheroid.centres / spheroid.half_sizes)
     squared = x * x + y * y + z * z
     nearest = (x * u + y * v + z * w) / squared
@@ -165,7 +165,7 @@ def ground_height(ground: Ground, positions: Float[Array, "... 2"]) -> Float[Arr
         positions: x and y, m.
 
     Returns:
-        z, m; bilinear between the nodes, and that of the nearest border outside.
+        z, m; bilinear between the nodes; outside, the height of the nearest border.
     """
     rows, columns = ground.heights.shape
     at = (positions - ground.origin) / ground.cell
@@ -189,7 +189,7 @@ def cross_ground(
     Args:
         ground: the height field.
         start: common start of the rays, in the world, m.
-        direction: of the rays, unit length, in the world; the b rays of a column have nearly the same azimuth.
+        direction: unit directions of the rays in the world; the b rays of a column have nearly the same azimuth.
         max_range: largest distance, m.
 
     Returns:

@@ -13,18 +13,18 @@ class Quarter:
     """Houses, gardens and trees along a street. Distances in metres.
 
     Attributes:
-        setback: from the kerb to the house fronts.
-        house_width: along the street.
-        house_depth: across it.
+        setback: distance from the kerb to the house fronts.
+        house_width: width along the street.
+        house_depth: depth across the street.
         eaves: height of the houses.
-        gap: between houses; below 1 they touch.
-        house_rate: part of the plots that has a house.
-        border_rate: part of the plots with a hedge, wall or fence along the pavement.
-        parked_rate: part of the parking places that is taken.
+        gap: distance between houses; below 1 they touch.
+        house_rate: share of the plots with a house.
+        border_rate: share of the plots with a hedge, wall or fence along the pavement.
+        parked_rate: share of the parking places with a car.
         garden_trees: mean number of trees on a plot.
         street_tree_step: distance of trees on the pavement; 0 for none.
         garden_bushes: mean number of bushes on a plot.
-        car_park_rate: part of the free plots that is a car park.
+        car_park_rate: share of the free plots with a car park.
     """
 
     setback: Span
@@ -47,21 +47,21 @@ class Kind:
 
     Attributes:
         quarters: kinds of its streets.
-        shares: of the quarters.
-        half_width: of the streets, from the middle to the kerb, m.
+        shares: shares of the quarters.
+        half_width: half width of the streets, from the middle to the kerb, m.
         steepness: typical slope of the land, rise over run.
-        roughness: of the ground beside streets; 1 is a lawn.
-        trees_per_ha: outside of plots, in woods.
-        bushes_per_ha: undergrowth and tall grass there.
+        roughness: roughness of the ground beside streets; 1 is a lawn.
+        trees_per_ha: density of trees in woods, outside of plots.
+        bushes_per_ha: density of undergrowth and tall grass there.
         woodland: share of the free land that is wooded.
-        tree_height: m.
-        conifers: share of the trees.
+        tree_height: lowest and highest tree, m.
+        conifers: share of conifers among the trees.
         verge_step: mean distance of bushes along the kerb, m; 0 for none.
-        cars_per_km: on each lane.
-        trucks: share of the traffic.
-        queues_per_km: rows of slow cars.
-        bridges_per_km: over the streets.
-        has_pavement: people, lamps, signs.
+        cars_per_km: number of cars on a kilometre of each lane.
+        trucks: share of trucks in the traffic.
+        queues_per_km: number of rows of slow cars.
+        bridges_per_km: number of bridges over the streets.
+        has_pavement: True for pavements with people, lamps and signs.
     """
 
     quarters: tuple[Quarter, ...] = field(repr=False)

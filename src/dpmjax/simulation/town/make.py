@@ -28,7 +28,7 @@ class TownConfig:
     """Settings of a town.
 
     Attributes:
-        kind: of the place: suburb, canyon (tall houses), country, car_park, campus, wood, field, or jam (queues of
+        kind: kind of place: suburb, canyon (tall houses), country, car_park, campus, wood, field, or jam (queues of
             cars).
         route: kind of the drive's route; "there_and_back" drives the same street in both directions.
         route_length_m: wanted length of the route, met within a block or two.
@@ -55,7 +55,7 @@ class Town:
     """A town.
 
     Attributes:
-        name: with its seed, for titles.
+        name: name with its seed, for titles.
         streets: the streets and the route, on the host.
         terrain: the ground, on the host.
         primitives: bodies and ground for the ray caster, on the device.
@@ -71,8 +71,8 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     """Builds the town of a seed; the same one every time.
 
     Args:
-        seed: of all choices, not negative.
-        config: settings of the town; with a trajectory, its route and slopes do not count.
+        seed: seed of all choices, not negative.
+        config: settings of the town; with a trajectory, its route and slopes are ignored.
         trajectory: (n, 4, 4) `T_world_lidar` of a real drive, z up (of KITTI: in the lidar's frame, not the camera's).
             One street is laid along it, and the ground goes 1.73 m below it, at one height for all passes of a place.
 

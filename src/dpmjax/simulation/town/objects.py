@@ -26,8 +26,8 @@ class Collection:
 
     Attributes:
         boxes: x y z, half sizes, heading, softness, window depth.
-        cylinders: the same of the boxes round them.
-        spheroids: the same.
+        cylinders: the same numbers of their bounding boxes.
+        spheroids: the same numbers of their bounding boxes.
     """
 
     boxes: list[tuple[float, ...]] = field(default_factory=list)
@@ -46,8 +46,8 @@ class Place:
     """A place on the ground.
 
     Attributes:
-        x: m.
-        y: m.
+        x: x in the world, m.
+        y: y in the world, m.
         ground: height of the ground, m.
         heading: direction of the object's x, radians.
     """
@@ -69,12 +69,12 @@ def put_box(
     """Adds an upright box.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         place: its middle.
         size: length along and across the heading, m.
         levels: lowest and highest point above the ground, m.
-        softness: m.
-        window_depth: m.
+        softness: mean depth of a beam before it is reflected, m; 0 if solid.
+        window_depth: distance of windows behind the faces, m; 0 without windows.
     """
     low, high = levels
     centre = (place.x, place.y, place.ground + 0.5 * (low + high))
@@ -87,11 +87,11 @@ def put_house(
     """Adds a house to the objects: body with windows, stepped roof, and bays, steps and balconies towards the street.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of all choices.
         place: middle of the body; the street lies to the right of its heading.
-        size: along and across the street, m.
-        height: of the eaves, m.
+        size: length along and across the street, m.
+        height: height of the eaves, m.
         is_plain: no bays, steps or balconies.
     """
     width, depth = size
@@ -122,7 +122,7 @@ def put_car(into: Collection, rng: np.random.Generator, place: Place) -> None:
     """Adds a parked car, van or lorry to the objects: body, cabin, a gap below.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of its size.
         place: its middle.
     """
@@ -149,10 +149,10 @@ def put_pole(into: Collection, place: Place, radius: float, height: float) -> No
     """Adds a pole to the objects: an upright cylinder on the ground.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         place: its foot.
-        radius: m.
-        height: m.
+        radius: radius, m.
+        height: height, m.
     """
     centre = (place.x, place.y, place.ground + 0.5 * height - 0.1)
     into.cylinders.append((*centre, radius, radius, 0.5 * height + 0.1, 0.0, 0.0, 0.0))
@@ -162,7 +162,7 @@ def put_sign(into: Collection, rng: np.random.Generator, place: Place) -> None:
     """Adds a sign to the objects: a post with a plate across the street's direction.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of its size.
         place: its foot.
     """
@@ -175,10 +175,10 @@ def put_border(into: Collection, rng: np.random.Generator, place: Place, length:
     """Adds a hedge, wall or fence along the street to the objects, in pieces, with an open gate.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of its shape.
         place: its middle.
-        length: m.
+        length: length, m.
         kind: "hedge", "wall" or "fence".
     """
     height, gate = rng.uniform(0.8, 2.0), rng.uniform(-0.4, 0.4) * length
@@ -203,9 +203,9 @@ def put_person(into: Collection, rng: np.random.Generator, place: Place) -> None
     """Adds a standing person to the objects: a body and a head.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of the height.
-        place: where.
+        place: its foot.
     """
     height = rng.uniform(1.5, 1.9)
     put_pole(into, place, 0.22, height - 0.25)
@@ -216,10 +216,10 @@ def put_car_park(into: Collection, rng: np.random.Generator, place: Place, size:
     """Adds a car park to the objects: rows of parked cars, lamps and a few trolleys or bollards between them.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of all choices.
         place: middle of the car park.
-        size: along and across the heading, m.
+        size: length along and across the heading, m.
     """
     taken = rng.uniform(0.25, 0.9)
     for across in np.arange(-0.5 * size[1] + 3.0, 0.5 * size[1] - 2.5, 8.5):
@@ -238,10 +238,10 @@ def put_bridge(into: Collection, rng: np.random.Generator, place: Place, half_wi
     """Adds a bridge over the street to the objects: a deck with parapets on piers, above the traffic.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of its size.
         place: on the middle of the street, heading along it.
-        half_width: of the street, m.
+        half_width: half width of the street, m.
     """
     wide, clear, thick = rng.uniform(4, 14), rng.uniform(4.8, 6.5), rng.uniform(0.6, 1.4)
     span = 2 * half_width + rng.uniform(6, 30)
@@ -260,9 +260,9 @@ def plant_trees(
     """Adds trees of random shape: a trunk, and a crown of tufts.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of their shapes.
-        feet: (n, 3) places on the ground.
+        feet: (n, 3) positions on the ground.
         height: lowest and highest of the trees, m.
         conifers: share of trees with a narrow crown from near the ground.
     """
@@ -291,9 +291,9 @@ def plant_bushes(into: Collection, rng: np.random.Generator, feet: FloatArray) -
     """Adds bushes, undergrowth and tall grass: one tuft each.
 
     Args:
-        into: where to.
+        into: collection that gets the objects.
         rng: source of their shapes.
-        feet: (n, 3) places on the ground.
+        feet: (n, 3) positions on the ground.
     """
     count = len(feet)
     radius, zero = rng.uniform(0.4, 1.7, count), np.zeros(count)

@@ -33,7 +33,7 @@ class Bodies(NamedTuple):
     """Upright boxes, cylinders or ellipsoids of revolution, by the boxes round them, turned about z only.
 
     Attributes:
-        centres: in the world, m.
+        centres: centres in the world, m.
         half_sizes: along the box's own x, y, z, m; of a round body: radius, radius, half height.
         headings: cosine and sine of the angle from the world's x to the box's x.
         softness: mean depth, m, of a beam in hedges, fences and foliage before it is reflected; 0 if solid.
@@ -75,7 +75,7 @@ class RoadUsers(NamedTuple):
         starts: path length along the lane at time 0, m.
         speeds: m/s, positive; at the end of the lane a road user starts again.
         sides: distance to the left of the lane, m.
-        half_sizes: of the box around the road user, m; cars (longer than 1 m) get a cabin on top.
+        half_sizes: half sizes of the box around the road user, m; cars (longer than 1 m) get a cabin on top.
         mask: True for road users, False for padding.
     """
 
@@ -162,7 +162,7 @@ def turn_back(vectors: Float[Array, "... 3"], heading: Float[Array, "... 2"]) ->
     """Rotates vectors into the axes of a box that is turned about z.
 
     Args:
-        vectors: in axes of the world.
+        vectors: vectors in axes of the world.
         heading: cosine and sine of the turn.
 
     Returns:
@@ -180,7 +180,7 @@ def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Ar
     Args:
         traffic: lanes and users.
         sensor: position of the sensor in the world, m; road users within 4 m of it are left out.
-        time: s.
+        time: time, s.
 
     Returns:
         Two boxes for each: body and cabin (masked for people and lorries).

@@ -42,11 +42,11 @@ class LidarSensor:
     Hashable, so that it can be a static argument of a kernel.
 
     Attributes:
-        name: for titles and files.
+        name: name for titles and files.
         elevations_deg: angle of each beam above the horizontal, highest first.
         num_azimuths: number of columns of a turn, clockwise from straight behind, as in a range image.
-        min_range_m: nearer surfaces return nothing.
-        max_range_m: farther surfaces return nothing.
+        min_range_m: smallest range of a return.
+        max_range_m: largest range of a return.
         range_noise_m: standard deviation of a range.
         drop_rate: share of lost returns at any range.
         half_loss_m: range at which half of the returns of a surface of 20 % reflectivity, met head-on, are lost.
@@ -129,8 +129,8 @@ def scan_town(
     Args:
         town: the world, from `make_town` or `make_interior`.
         T_world_lidar: (4, 4) pose of the sensor in the middle of its turn, x forward, y left, z up.
-        time: s, moves the traffic.
-        key: of noise, lost returns and foliage.
+        time: time of the traffic, s.
+        key: key of noise, lost returns and foliage.
         sensor: the lidar.
         motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.se3.exp`), in its own frame. Points
             stay in the frame of the moment of their beam, as in a raw scan. None for a sensor that stands still.

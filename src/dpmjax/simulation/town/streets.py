@@ -25,10 +25,10 @@ class Streets:
 
     Attributes:
         paths: (k, 2) points of each street at steps of half a metre, from side street to side street.
-        half_widths: from the middle to the kerb, m, of each street.
+        half_widths: distance from the middle to the kerb of each street, m.
         lanes: (k, 2) points of the lanes of the traffic, in one direction; traffic drives in both directions.
         route: (k, 2) points of the drive's middle line at steps of half a metre.
-        is_closed: the route ends where it began.
+        is_closed: True for a route that ends where it began.
     """
 
     paths: tuple[FloatArray, ...]
@@ -45,8 +45,9 @@ def make_streets(
 
     Args:
         rng: source of all choices.
-        kind: kind of route. "loop" goes once round some blocks. "there_and_back" goes along a street, round a block,
-            back on the opposite side, and round a block there. "wander" is a random walk and the shortest way back.
+        kind: kind of route. A "loop" goes once round some blocks. A route "there_and_back" goes along a street, round a
+            block, back on the opposite side, and round a block there. A "wander" is a random walk and the shortest
+            way back.
         length: wanted length of the route, m; met within a block or two.
         block: side of a block, m.
         half_width: narrowest and widest street, from the middle to the kerb, m.
@@ -150,8 +151,8 @@ def _wander(rng: np.random.Generator, side: int, num_blocks: int) -> list[tuple[
         while route[-1] != (0, 0):
             # Leftwards, but not along the first row, on which the route set out; then down the first column.
             (i, j), steps = route[-1], _neighbours(route, side)
-            wishes = [(i, j - 1), (i - 1, j), (i + 1, j), (i, j + 1)] if i else [(1, j), (0, j - 1), (0, j + 1)]
-            route.append(next(step for step in wishes if step in steps))
+            preferred = [(i, j - 1), (i - 1, j), (i + 1, j), (i, j + 1)] if i else [(1, j), (0, j - 1), (0, j + 1)]
+            route.append(next(step for step in preferred if step in steps))
         if route[-2] == (1, 0):
             return route
 
@@ -167,7 +168,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
     """Returns the right lane of the route.
 
     Args:
-        streets: with the route.
+        streets: streets with the route.
         is_reversed: True for the lane of the route in reverse, on the opposite side of the street.
 
     Returns:
@@ -178,7 +179,7 @@ def lane_of(streets: Streets, *, is_reversed: bool) -> FloatArray:
 
 
 def arc_lengths(path: FloatArray) -> FloatArray:
-    """Computes the path length from the start to each point.
+    """Computes the length of a curve from its start to each of its points.
 
     Args:
         path: (k, 2) points, m.
@@ -194,7 +195,7 @@ def at_way(path: FloatArray, way: FloatArray) -> FloatArray:
 
     Args:
         path: (k, d) points; path lengths are those of x and y.
-        way: (m,) m, clipped to the path.
+        way: (m,) path lengths, m, clipped to the path.
 
     Returns:
         (m, d).
@@ -235,7 +236,7 @@ def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
 
     Args:
         path: (k, 2) points.
-        distance: m, one for all or one each; negative for the right.
+        distance: distance in m, one for all points or one for each; negative to the right.
 
     Returns:
         (k, 2).
@@ -245,12 +246,12 @@ def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
 
 
 def smooth(path: FloatArray, sigma: float, *, is_closed: bool) -> FloatArray:
-    """Rounds corners with a Gaussian along the path.
+    """Rounds the corners of a curve with a Gaussian along it.
 
     Args:
         path: (k, d) points at equal steps of `sigma / 6` or less.
-        sigma: in steps.
-        is_closed: the last point is the first one again.
+        sigma: standard deviation in steps.
+        is_closed: True where the last point is the first one again.
 
     Returns:
         (k, d); the ends are unchanged, unless the path is closed.

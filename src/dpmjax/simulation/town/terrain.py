@@ -146,7 +146,7 @@ class Plots:
 
         Args:
             place: its middle.
-            size: along and across its heading, m.
+            size: length along and across its heading, m.
             kerb_distance: least distance of all parts from a kerb, m; negative: the object may stand on the street.
 
         Returns:
