@@ -52,20 +52,19 @@ class Recording(NamedTuple):
 
     def between(self, poses: Floats) -> Floats:
         """Returns poses of all scans from those of the registered scans and the motion between them."""
-        rows = np.unique(self.originals)
+        rows, copies = np.unique(self.originals, return_inverse=True)
         if self.motion is not None:
             poses = fill_between(np.searchsorted(rows, self.chosen), poses, self.motion[rows])
-        return poses[np.searchsorted(rows, self.originals)]
+        return poses[copies]
 
     def aligned(self, poses: Floats) -> Floats:
         """Returns poses of all scans, each scan aligned with the nearest registered one."""
         poses = self.between(poses)
         if self.motion is None:
             return poses
-        rows = np.unique(self.originals)
+        rows, copies = np.unique(self.originals, return_inverse=True)
         scans = planar_scans(take_scans(self.scans, rows))
-        aligned = align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])
-        return aligned[np.searchsorted(rows, self.originals)]
+        return align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])[copies]
 
 
 def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
@@ -166,7 +165,8 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     # In the frame of the chosen scan before: the next chosen scan by odometry, and the error of odometry there.
     T_before_after = se2.relative(odometry[start], odometry[end])
     error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
-    part = _exp(_share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64))
+    part = _share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64)
+    part = se2.from_matrix(np.asarray(se2.exp(part), np.float64))
     correction = se2.compose(se2.compose(T_before_after, part), se2.inverse(T_before_after))
     T_before_scan = se2.compose(correction, se2.relative(odometry[start], odometry))
     filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)
@@ -233,7 +233,3 @@ def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
     lengths = np.hypot(steps[:, 0], steps[:, 1]) + np.abs(se2.wrap_angle(steps[:, 2])) + 1e-9
     way = np.append(0.0, np.cumsum(lengths))
     return np.asarray((way - way[start]) / np.maximum(way[end] - way[start], 1e-9), np.float64)
-
-
-def _exp(tangent: Floats) -> Floats:
-    return np.asarray(se2.from_matrix(np.asarray(se2.exp(tangent), np.float64)), np.float64)

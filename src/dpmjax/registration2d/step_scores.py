@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
 from dpmjax.registration2d.recordings import fill_between
@@ -121,9 +120,8 @@ def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
     source = np.concatenate([np.arange(k, num_scans) for k in spans]).astype(np.int64)
     target = np.concatenate([np.arange(num_scans - k) for k in spans]).astype(np.int64)
     score = pair_scores(profiles, source, target, se2.relative(poses[target], poses[source]))
-    fits = (score > _FITTING_SCORE).astype(np.float64)
-    links = scipy.sparse.csr_matrix((fits, (source, target)), shape=(num_scans, num_scans))
-    group = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+    fits = score > _FITTING_SCORE
+    group = label_parts(num_scans, source[fits], target[fits])
     size = np.bincount(group)[group]
     is_new = np.isin(np.arange(num_scans), distinct_rows(scans))
     return np.asarray((size > min(_SMALL_GROUP, num_scans // 4)) & is_new)

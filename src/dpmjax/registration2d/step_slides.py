@@ -30,6 +30,8 @@ _LEAST_SHIFT, _LEAST_GAIN = 0.03, 2.5
 # A step is open where its standard deviation along the weak direction, by the scores alone, is above this, in typical
 # ranges.
 _OPEN_DEVIATION = 0.02
+# Least standard deviation of a constrained step, typical ranges and radians.
+LEAST_DEVIATION = 0.005
 
 
 class Slides(NamedTuple):
@@ -44,7 +46,7 @@ class Slides(NamedTuple):
         is_torn: (k,) True where the mode lies far from the given step and is clearly more probable.
         is_open: (k,) True where the scores alone do not constrain the shift.
         scores: (k,) score after the shift.
-        reach: the largest shift that is tried to either side, in the unit of the points.
+        typical_range: of the scans.
     """
 
     directions: Floats
@@ -53,7 +55,7 @@ class Slides(NamedTuple):
     is_torn: Bool[np.ndarray, " k"]
     is_open: Bool[np.ndarray, " k"]
     scores: Floats
-    reach: float
+    typical_range: float
 
     def moved(self, steps: Floats) -> Floats:
         """Returns the steps (k, 3) after their shifts."""
@@ -64,13 +66,22 @@ class Slides(NamedTuple):
 
         The information of a uniform posterior over the reach is subtracted, so flat scores give 0.
         """
-        flat = 3.0 / self.reach**2
+        flat = 3.0 / (_REACH * self.typical_range) ** 2
         return np.where(self.is_open, np.maximum(np.maximum(self.deviations, 1e-9) ** -2.0 - flat, 0.0), np.inf)
 
-    def axes(self, steps: Floats) -> Floats:
-        """Returns the weak directions as tangents (k, 3) in the frames of the sources of these steps (k, 3)."""
+    def constrained_deviations(self) -> Floats:
+        """Returns the standard deviations (k,), at least that of a constrained step."""
+        return np.maximum(self.deviations, LEAST_DEVIATION * self.typical_range)
+
+    def open_directions(self, steps: Floats) -> Floats:
+        """Returns projections (k, 3, 3) of tangents, in the source frames of these steps, onto open directions."""
         turned = np.einsum("kji,kj->ki", se2.rotation(steps[:, 2]), self.directions)
-        return np.concatenate([turned, np.zeros((len(steps), 1))], axis=1)
+        axes = np.where(self.is_open[:, None], np.column_stack([turned, np.zeros(len(steps))]), 0.0)
+        return np.asarray(axes[:, :, None] * axes[:, None, :])
+
+    def open_information(self, steps: Floats) -> Floats:
+        """Returns the information (k, 3, 3) of the shifts along open directions, in the source frames."""
+        return self.open_directions(steps) / self.constrained_deviations()[:, None, None] ** 2
 
 
 def weak_directions(scans: PlanarScans) -> Float[np.ndarray, "n 2"]:
@@ -80,16 +91,20 @@ def weak_directions(scans: PlanarScans) -> Float[np.ndarray, "n 2"]:
 
 
 def slide_steps(
-    profiles: RangeProfiles, source: Indices, target: Indices, steps: Floats, prior: StepPrior | None = None
+    profiles: RangeProfiles,
+    steps: Floats,
+    prior: StepPrior | None = None,
+    *,
+    pairs: tuple[Indices, Indices] | None = None,
 ) -> Slides:
     """Computes the posterior of shifts of steps along the weak directions of their targets.
 
     Args:
         profiles: n scans.
-        source: (k,) rows of the scans that are shifted.
-        target: (k,) rows of the scans that the sources are compared with.
         steps: (k, 3) T_target_source.
         prior: of these steps; None: the scores alone.
+        pairs: (k,) rows of the sources, which are shifted, and of the targets, which they are compared with. None: the
+            steps are the n - 1 steps T_scan_next between neighbours in time.
 
     Returns:
         Slides.
@@ -97,7 +112,8 @@ def slide_steps(
     unit, count = profiles.scans.typical_range, round(_REACH / _SPACING)
     if not len(steps):
         none = np.zeros(0, bool)
-        return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none, np.zeros(0), _REACH * unit)
+        return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none, np.zeros(0), unit)
+    source, target = pairs or (np.arange(1, len(profiles)), np.arange(len(profiles) - 1))
     directions = weak_directions(profiles.scans)[target]
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
     places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
@@ -122,7 +138,7 @@ def slide_steps(
     deviations = deviations if prior is None else 2.0**0.5 * _spread(2.0 * nats, shifts)[1]
     shift = np.where(is_open, means, np.where(is_torn, shifts[best], 0.0))
     nearest = np.abs(shifts - shift[:, None]).argmin(axis=1)
-    return Slides(directions, shift, deviations, is_torn, is_open, scores[row, nearest], _REACH * unit)
+    return Slides(directions, shift, deviations, is_torn, is_open, scores[row, nearest], unit)
 
 
 def _interpolated(values: Floats) -> Floats:
