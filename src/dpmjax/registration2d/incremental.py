@@ -73,7 +73,7 @@ def incremental_icp(
     predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
     steps = match_pairs(source, target, guesses, FINE, belief, metric=metric)
-    poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps).poses
+    poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps)
     return IncrementalResult(poses, steps)
 
 

@@ -60,19 +60,7 @@ _PRIOR_WEIGHT = 0.1
 _NUM_ARCS = 3
 
 
-class SequenceResult(NamedTuple):
-    """Result of `search_sequence`.
-
-    Attributes:
-        poses: (n, 3) T_world_scan, the first one zero; of unregistered scans an interpolation.
-        is_registered: (n,) False for scans that fit none of the scans around them.
-    """
-
-    poses: Floats
-    is_registered: NDArray[np.bool_]
-
-
-def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
+def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
     """Finds the poses of scans in time order.
 
     Args:
@@ -80,7 +68,7 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
         steps: the n - 1 steps T_scan_next that an ICP has found.
 
     Returns:
-        SequenceResult.
+        (n, 3) T_world_scan, the first one zero; an interpolation for scans that fit none of the scans around them.
     """
     rows = distinct_rows(scans)
     some, profiles = scans.take(rows), make_profiles(scans.take(rows))
@@ -89,13 +77,11 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
     hypotheses = _find_hypotheses(some, profiles, matched)
     is_clear = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
     prior = MotionPrior.of(hypotheses.poses[is_clear], scans.typical_range)
-    found = _Beam(profiles, hypotheses, prior).run()
-    kept = np.flatnonzero(found.is_registered)
-    kept = kept[~_is_alone(weak_steps(profiles, found.poses, kept))]
-    poses = join_parts(profiles, found.poses, kept, prior, _SEARCH)
-    is_registered = np.zeros(len(scans), bool)
-    is_registered[rows[kept]] = True
-    return SequenceResult(interpolate(len(scans), rows[kept], poses[kept]), is_registered)
+    poses, is_registered = _Beam(profiles, hypotheses, prior).run()
+    kept = np.flatnonzero(is_registered)
+    kept = kept[~_is_alone(weak_steps(profiles, poses, kept))]
+    poses = join_parts(profiles, poses, kept, prior, _SEARCH)
+    return interpolate(len(scans), rows[kept], poses[kept])
 
 
 def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -217,15 +203,15 @@ class _Beam:
         self.unit = profiles.scans.typical_range
         self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
 
-    def run(self) -> SequenceResult:
-        """Runs the search over all scans and returns the best sequence."""
+    def run(self) -> tuple[Floats, NDArray[np.bool_]]:
+        """Runs the search over all scans and returns the best sequence: poses (n, 3), and True for registered scans."""
         now = _Sequences(np.zeros((1, 1, 3)), np.ones((1, 1), bool), np.zeros(1))
         for scan in range(1, len(self.profiles)):
             now = self.advance(now, scan)
             if scan == 1:
                 # The first scan may fit no other scan.
                 now = _with_second_start(now)
-        return SequenceResult(now.poses[0], now.is_placed[0])
+        return now.poses[0], now.is_placed[0]
 
     def advance(self, now: _Sequences, scan: int) -> _Sequences:
         """Returns the best sequences with one more scan."""

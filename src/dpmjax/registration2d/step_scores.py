@@ -30,26 +30,25 @@ _FITTING_SCORE, _FITTING_SPAN, _SMALL_GROUP = 0.0, 3, 3
 _LEAST_NOISE = 1.5e-4
 
 
-class Evidence(NamedTuple):
-    """Agreement of pairs of scans at their relative poses, as shares of all beams of both.
+def find_evidence(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> tuple[Floats, Floats]:
+    """Compares pairs of scans at T_target_source (p, 3).
 
-    Attributes:
-        agreement: (p,) matched less weighted contradicting beams.
-        visible: (p,) beams that end in the visible region of their partner scan.
+    Args:
+        profiles: n scans.
+        source: (p,) rows.
+        target: (p,) rows.
+        poses: (p, 3) T_target_source.
+
+    Returns:
+        Agreement (p,), which is matched less weighted contradicting beams, and beams (p,) that end in the visible
+        region of their partner scan; shares of all beams of both scans.
     """
-
-    agreement: Floats
-    visible: Floats
-
-
-def find_evidence(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Evidence:
-    """Compares pairs of scans at T_target_source (p, 3)."""
     views = compare_pairs(profiles, source, target, poses, stride=4)
     contradicted = np.maximum(views.contradicted - _NOISY_SHARE * views.visible, 0.0)
     num_beams = np.asarray(profiles.scans.mask.sum(1), np.float64)
     beams = np.maximum(num_beams[source] + num_beams[target], 1.0)
     agreement = np.asarray(views.matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
-    return Evidence(agreement / beams, np.asarray(views.visible, np.float64) / beams)
+    return agreement / beams, np.asarray(views.visible, np.float64) / beams
 
 
 def pair_scores(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
