@@ -156,7 +156,7 @@ def test_wrong_arguments_are_named(as_user) -> None:
         k_nearest(jnp.ones(3), jnp.ones((4, 3)), 1)
     with pytest.raises(ValueError, match="^points: expected 3 columns"):
         k_nearest(jnp.ones((3, 3)), jnp.ones((4, 2)), 1)
-    with pytest.raises(ValueError, match="^mask: expected shape"):
+    with pytest.raises(ValueError, match="^mask: expected bool of shape"):
         k_nearest(jnp.ones((3, 3)), jnp.ones((4, 3)), 1, jnp.ones(3, bool))
     with pytest.raises(ValueError, match="^mask: expected bool"):
         k_nearest(jnp.ones((3, 3)), jnp.ones((4, 3)), 1, jnp.ones(4))
