@@ -12,9 +12,10 @@ from dpmjax.io.carmen import read_carmen_log
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
 from dpmjax.registration2d.planar_scans import PlanarScans
-from dpmjax.registration2d.range_profiles import make_profiles
+from dpmjax.registration2d.range_profiles import make_profiles, pair_scores, weak_steps
+from dpmjax.registration2d.recordings import fitting_scans, interpolate
 from dpmjax.registration2d.sequence_search import align_arcs
-from dpmjax.registration2d.step_scores import MotionPrior, fitting_scans, interpolate, pair_scores, weak_steps
+from dpmjax.registration2d.step_prior import MotionPrior
 from dpmjax.simulation import make_world, scan_world, simulate_sequence
 
 NUM_SCANS, METRES_A_PX = 24, 0.05

@@ -20,9 +20,8 @@ from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.pair_search import Hypotheses
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.quality import MAX_NOISE, near_pairs
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, pair_scores
 from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_scores import pair_scores
 from dpmjax.registration2d.step_slides import Slides, slide_steps
 
 # Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs

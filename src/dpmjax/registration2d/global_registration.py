@@ -32,8 +32,7 @@ from dpmjax.registration2d.pair_search import (
     search_pairs,
 )
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, spread_evenly
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
-from dpmjax.registration2d.step_scores import weak_steps
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, weak_steps
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Numbers of search partners of a scan that is no keyframe: keyframes with the most similar views, and, without an

@@ -22,9 +22,9 @@ from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
+from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
+from dpmjax.registration2d.recordings import fitting_scans, interpolate
 from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_scores import fitting_scans, interpolate, pair_scores
 from dpmjax.types import ScanSet
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,

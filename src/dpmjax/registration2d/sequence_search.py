@@ -19,18 +19,19 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
 from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles, contradicted_share, make_profiles
-from dpmjax.registration2d.sequence_joining import join_parts
-from dpmjax.registration2d.step_scores import (
+from dpmjax.registration2d.range_profiles import (
     LEAST_VISIBLE,
     WEAK_SCORE,
-    MotionPrior,
-    distinct_rows,
+    RangeProfiles,
+    contradicted_share,
     find_evidence,
-    interpolate,
+    make_profiles,
     pair_scores,
     weak_steps,
 )
+from dpmjax.registration2d.recordings import distinct_rows, interpolate
+from dpmjax.registration2d.sequence_joining import join_parts
+from dpmjax.registration2d.step_prior import MotionPrior
 
 # Turns of a step that are searched, radians for each scan that it spans.
 _MAX_TURN = 1.7

@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles
+from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence
 from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_scores import LEAST_VISIBLE, find_evidence
 
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
