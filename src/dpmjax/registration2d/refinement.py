@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
-from dpmjax.registration2d.held_steps import matched_steps, settle_steps
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, align_all, restore_open, restore_torn
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
@@ -25,6 +24,7 @@ from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
 from dpmjax.registration2d.recordings import fitting_scans, interpolate
 from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.step_slides import matched_steps, settle_steps
 from dpmjax.types import ScanSet
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,

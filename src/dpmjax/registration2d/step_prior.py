@@ -1,4 +1,4 @@
-"""Priors of the steps of a sequence, from odometry, from given poses, or from the usual motion."""
+"""Priors of the steps of a sequence: from odometry, given poses or the usual motion; and edges of a pose graph from them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior
 from dpmjax.registration2d.planar_scans import Floats, Indices
 
@@ -20,6 +21,8 @@ _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_DEVIATION = 0.15, 5, 0.015
 _SHORT, _LONG, _SIDEWAYS, _TURN = 0.6, 1.5, 0.5, 0.8
 # Turns (radians) of the arcs that a robot may drive in a step, and their lengths in usual steps.
 _ARC_TURNS, _ARC_LENGTHS = np.radians(np.arange(-90.0, 91.0, 15.0)), (0.0, 0.5, 1.0, 1.5)
+# Accuracy of a fitted beam, typical ranges; and of a step without other information: typical ranges, radians.
+BEAM_DEVIATION, _STEP_DEVIATION = 0.03, (0.045, 0.15)
 # Degrees of freedom of Student's t for steps, heavy-tailed because wheels slip and logs have gaps.
 _FREEDOM = 3.0
 
@@ -136,3 +139,16 @@ class MotionPrior(NamedTuple):
         excess = np.where(ahead < 0, ahead / _SHORT, ahead / _LONG) ** 2
         excess += (share[:, 1] / gap / _SIDEWAYS) ** 2 + (turn / (_TURN * gap**0.5)) ** 2
         return np.asarray(np.log1p(excess), np.float64)
+
+
+def pose_steps(poses: Floats, typical_range: float) -> Edges:
+    """Returns edges between neighbours in time of these poses (n, 3), with little information."""
+    relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
+    information = np.diag((np.array(_STEP_DEVIATION)[[0, 0, 1]] * [typical_range, typical_range, 1.0]) ** -2.0)
+    return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
+
+
+def prior_steps(prior: StepPrior) -> Edges:
+    """Returns edges between neighbours in time from a prior of n - 1 steps."""
+    later, variances = np.arange(1, len(prior.steps) + 1), prior.deviations**2
+    return Edges(later, later - 1, prior.steps, np.eye(3) / variances[:, None])

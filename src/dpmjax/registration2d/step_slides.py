@@ -3,20 +3,24 @@
 The weak direction is the direction of the least translation information of the walls. Two scans of a corridor fit at
 every shift along it, and a local alignment stops at the first of these. So the scores of a relative pose, called step,
 are computed at shifts far to either side. Scores and prior together give the posterior of the shift. The mode of this
-posterior is the most probable relative pose, and the spread is the uncertainty along the weak direction.
+posterior is the most probable relative pose, and the spread is the uncertainty along the weak direction. The edges of a
+pose graph have the relative pose of the scans where these constrain it, and the posterior along the weak direction.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges
+from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PosePrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence
-from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence, make_profiles
+from dpmjax.registration2d.step_prior import BEAM_DEVIATION, StepPrior, pose_steps
 
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
@@ -30,7 +34,7 @@ _LEAST_SHIFT, _LEAST_GAIN = 0.03, 2.5
 # ranges.
 _OPEN_DEVIATION = 0.02
 # Least standard deviation of a constrained step, typical ranges and radians.
-LEAST_DEVIATION = 0.005
+_LEAST_DEVIATION = 0.005
 
 
 class Slides(NamedTuple):
@@ -70,7 +74,7 @@ class Slides(NamedTuple):
 
     def constrained_deviations(self) -> Floats:
         """Returns the standard deviations (k,), at least that of a constrained step."""
-        return np.maximum(self.deviations, LEAST_DEVIATION * self.typical_range)
+        return np.maximum(self.deviations, _LEAST_DEVIATION * self.typical_range)
 
     def open_directions(self, steps: Floats) -> Floats:
         """Returns projections (k, 3, 3) of tangents, in the source frames of these steps, onto open directions."""
@@ -153,3 +157,67 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
     probability /= probability.sum(axis=1, keepdims=True)
     means, best = probability @ shifts, shifts[nats.argmax(axis=1)]
     return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
+
+
+def matched_steps(matches: PairMatches, slides: Slides) -> Edges:
+    """Returns edges between neighbours in time from their matches.
+
+    Args:
+        matches: of the n - 1 steps.
+        slides: of the same steps.
+
+    Returns:
+        Edges. Along an unconstrained direction the variance is that of the shift. Elsewhere the information is at
+        least that of `pose_steps`.
+    """
+    loose = pose_steps(se2.chain(matches.poses), slides.typical_range)
+    fixed = matches.information / (BEAM_DEVIATION * slides.typical_range) ** 2
+    across = np.eye(3) - slides.open_directions(matches.poses)
+    information = across @ (fixed + loose.information) @ across + slides.open_information(matches.poses)
+    return loose._replace(information=information)
+
+
+def held_steps(slides: Slides, poses: Floats) -> Edges:
+    """Returns pose-graph edges for ambiguous relative poses (open or torn in `Slides`), at their most probable shifts.
+
+    Args:
+        slides: of the n - 1 steps of the poses.
+        poses: (n, 3) T_world_scan.
+
+    Returns:
+        Edges; a step that is open and not torn has information along its weak direction alone.
+    """
+    steps = pose_steps(poses, slides.typical_range)
+    firm = np.array([slides.typical_range, slides.typical_range, 1.0]) * _LEAST_DEVIATION
+    information = slides.open_information(steps.measurements)
+    across = np.eye(3) - slides.open_directions(steps.measurements)
+    information += np.where(slides.is_torn[:, None, None], across @ np.diag(firm**-2.0) @ across, 0.0)
+    rows = np.flatnonzero(slides.is_torn | slides.is_open)
+    held = steps._replace(measurements=slides.moved(steps.measurements), information=information)
+    return jax.tree.map(lambda x: x[rows], held)
+
+
+def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> tuple[PairMatches, Slides]:
+    """Shifts ambiguous relative poses along their weak direction to the posterior mode, and re-aligns these scans.
+
+    Args:
+        scans: n scans in time order.
+        matches: of the n - 1 steps.
+        prior: of the steps.
+
+    Returns:
+        The matches after the shift and alignment, and the Slides of these.
+    """
+    profiles = make_profiles(scans)
+    slides = slide_steps(profiles, matches.poses, prior)
+    rows = np.flatnonzero(slides.is_torn | slides.is_open)
+    if not len(rows):
+        return matches, slides
+    moved = slides.moved(matches.poses)[rows]
+    information = (3.0 * scans.noise / slides.constrained_deviations()[rows, None] * [1.0, 1.0, 0.0]) ** 2
+    source, target = scans.take(rows + 1), scans.take(rows)
+    found = match_pairs(source, target, moved[:, None], FINE, PosePrior(moved, information))
+    settled = PairMatches(*(x.copy() for x in matches))
+    for kept, new in zip(settled, found, strict=True):
+        kept[rows] = new
+    return settled, slide_steps(profiles, settled.poses, prior)
