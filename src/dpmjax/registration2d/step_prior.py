@@ -1,4 +1,4 @@
-"""Priors of the steps of a sequence: from odometry, given poses or the usual motion; and edges of a pose graph from them."""
+"""Priors of the steps of a sequence, from odometry, given poses or the usual motion, and pose-graph edges from them."""
 
 from __future__ import annotations
 

@@ -113,9 +113,6 @@ def slide_steps(
         Slides.
     """
     unit, count = profiles.scans.typical_range, round(_REACH / _SPACING)
-    if not len(steps):
-        none = np.zeros(0, bool)
-        return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none, np.zeros(0), unit)
     source, target = pairs or (np.arange(1, len(profiles)), np.arange(len(profiles) - 1))
     directions = weak_directions(profiles.scans)[target]
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
@@ -126,7 +123,7 @@ def slide_steps(
     # The number of visible beams must not favour short steps. Where all beams are visible, these scores equal
     # `pair_scores`.
     scores = agreement / (np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE))
-    scores = scores.reshape(len(steps), -1)
+    scores = scores.reshape(len(steps), len(shifts))
     shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
     is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
@@ -148,7 +145,8 @@ def _interpolated(values: Floats) -> Floats:
     """Interpolates values (..., s) linearly between each two neighbours."""
     parts = np.arange(_FINER) / _FINER
     between = values[..., :-1, None] + parts * np.diff(values)[..., None]
-    return np.concatenate([between.reshape(*values.shape[:-1], -1), values[..., -1:]], axis=-1)
+    between = between.reshape(*values.shape[:-1], _FINER * (values.shape[-1] - 1))
+    return np.concatenate([between, values[..., -1:]], axis=-1)
 
 
 def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
