@@ -151,7 +151,7 @@ def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, wrong_poses, mo
     nothing = np.zeros(0, np.int64)
     loops = LoopResult(closed, Edges(nothing, nothing, np.zeros((0, 3)), np.zeros((0, 3, 3))), np.ones(5))
     monkeypatch.setattr("dpmjax.registration2d.refinement._is_sound", lambda *_: False)
-    monkeypatch.setattr("dpmjax.registration2d.refinement.fitting_scans", lambda scans, _: np.ones(len(scans), bool))
+    monkeypatch.setattr("dpmjax.registration2d.refinement.distinct_rows", lambda scans: np.arange(len(scans)))
     monkeypatch.setattr("dpmjax.registration2d.refinement.correct_by_loops", lambda *_args, **_named: loops)
     found = refine(walk_scans, start)
     assert ate(found.poses, right) < 0.01

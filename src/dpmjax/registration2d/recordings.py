@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.pair_alignment import FINE, PosePrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
-from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles, pair_scores
+from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
 from dpmjax.types import ScanSet
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
@@ -33,9 +32,6 @@ _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 _STANDING = 0.02
 # Scans that are aligned at a time.
 _BLOCK = 1024
-# Score above which two scans fit each other, and the largest number of steps between them. Largest size of an outlier
-# group.
-_FITTING_SCORE, _FITTING_SPAN, _SMALL_GROUP = 0.0, 3, 3
 # Range noise, in typical ranges, above which no two scans are equal.
 _LEAST_NOISE = 1.5e-4
 
@@ -247,29 +243,6 @@ def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
     lengths = np.hypot(steps[:, 0], steps[:, 1]) + np.abs(se2.wrap_angle(steps[:, 2])) + 1e-9
     way = np.append(0.0, np.cumsum(lengths))
     return np.asarray((way - way[start]) / np.maximum(way[end] - way[start], 1e-9), np.float64)
-
-
-def fitting_scans(scans: PlanarScans, poses: Floats) -> NDArray[np.bool_]:
-    """Returns False for outliers, which match only a small group of neighbours in time or repeat the scan before.
-
-    Args:
-        scans: n scans in time order.
-        poses: (n, 3) T_world_scan.
-
-    Returns:
-        (n,) True for scans that are no outliers. Outliers are scans of another time, repeated scans, and scans taken
-        through a covered lens.
-    """
-    num_scans, profiles = len(scans), make_profiles(scans)
-    spans = range(1, min(_FITTING_SPAN + 1, num_scans))
-    source = np.concatenate([np.arange(k, num_scans) for k in spans]).astype(np.int64)
-    target = np.concatenate([np.arange(num_scans - k) for k in spans]).astype(np.int64)
-    score = pair_scores(profiles, source, target, se2.relative(poses[target], poses[source]))
-    fits = score > _FITTING_SCORE
-    group = label_parts(num_scans, source[fits], target[fits])
-    size = np.bincount(group)[group]
-    is_new = np.isin(np.arange(num_scans), distinct_rows(scans))
-    return np.asarray((size > min(_SMALL_GROUP, num_scans // 4)) & is_new)
 
 
 def distinct_rows(scans: PlanarScans) -> Indices:

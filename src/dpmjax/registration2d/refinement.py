@@ -22,7 +22,7 @@ from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
-from dpmjax.registration2d.recordings import fitting_scans, interpolate
+from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.registration2d.step_slides import matched_steps, settle_steps
 from dpmjax.types import ScanSet
@@ -102,14 +102,14 @@ def refine(
     fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
-        # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
-        chained, steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range))
-        rows = np.flatnonzero(fitting_scans(scans, chained))
+        rows = distinct_rows(scans)
         if len(rows) < len(scans):
             some = scans.take(rows).replace(is_ordered=True)
             fitting = refine(some, start[rows], config, prior=prior.through(rows), on_progress=on_progress)
             whole = interpolate(len(scans), rows, fitting.poses)
             return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
+        # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
+        steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range)).steps
         on_progress(_STEPS_SHARE)
         settled, slides = settle_steps(scans, steps, prior)
         edges = matched_steps(settled, slides)
