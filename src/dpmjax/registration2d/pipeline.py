@@ -299,14 +299,12 @@ def _start_poses(
     name = START_NAMES[start]
     hooks.report(_START, f"start: {name}")
     match start:
-        case "zero":
-            return name, np.zeros((len(scans), 3))
         case "global":
             return name, register_globally(scans).poses
         case "icp-plane" | "icp-point":
             return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
-    assert evidence is not None
-    return name, evidence.poses
+    # Zero poses, and one scan alone, have no odometry.
+    return name, np.zeros((len(scans), 3)) if evidence is None else evidence.poses
 
 
 def fit_in_order(
