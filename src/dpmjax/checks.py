@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -57,13 +58,14 @@ def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = N
     return array
 
 
-def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Array:
+def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...], xp: ModuleType = jnp) -> Any:
     """Makes a boolean mask.
 
     Args:
         name: name of the argument, for messages.
         value: the array; None stands for all True.
         shape: shape of the mask.
+        xp: `numpy` or `jax.numpy`, the kind of the mask.
 
     Returns:
         The mask.
@@ -71,12 +73,9 @@ def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...]) -> jax.Ar
     Raises:
         ValueError: the shape is another one, or the dtype is not bool.
     """
-    if value is None:
-        return jnp.ones(shape, bool)
-    array = jnp.asarray(value)
-    if array.dtype != bool:
-        raise ValueError(f"{name}: expected dtype bool, got {array.dtype}")
-    require_shape(name, array, shape)
+    array = xp.ones(shape, bool) if value is None else xp.asarray(value)
+    if array.dtype != bool or array.shape != shape:
+        raise ValueError(f"{name}: expected bool of shape {shape}, got {array.dtype} of {array.shape}")
     return array
 
 

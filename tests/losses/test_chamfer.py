@@ -93,5 +93,5 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
 def test_wrong_arguments_are_named(as_user) -> None:
     with pytest.raises(ValueError, match="^b: expected 2 columns"):
         chamfer_distance(jnp.ones((4, 2)), jnp.ones((4, 3)))
-    with pytest.raises(ValueError, match="^mask_b: expected shape"):
+    with pytest.raises(ValueError, match="^mask_b: expected bool of shape"):
         chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), None, jnp.ones(4, bool))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
+from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.joint_alignment import solve_step
 from tests.tolerances import DOUBLE
@@ -29,6 +29,14 @@ def edges_of(poses: np.ndarray, source: np.ndarray, target: np.ndarray, weight: 
 def steps_of(poses: np.ndarray) -> Edges:
     later = np.arange(1, len(poses))
     return edges_of(poses, later, later - 1)
+
+
+def test_nodes_of_one_part_have_one_label() -> None:
+    label = label_parts(6, np.array([1, 4, 5]), np.array([0, 3, 4]))
+    assert label[0] == label[1]
+    assert label[3] == label[4] == label[5]
+    assert len({label[0], label[2], label[3]}) == 3
+    assert len(set(label_parts(3, np.zeros(0, int), np.zeros(0, int)))) == 3
 
 
 @pytest.mark.parametrize("seed", [0, 1])

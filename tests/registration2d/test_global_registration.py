@@ -119,7 +119,7 @@ def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
     poses[wrong, 0] = [5.0, -20.0, 2.0]
     scores[wrong, 0] = 0.9 * scores.max()
     candidates = found._replace(poses=poses, scores=scores)
-    assembled = assemble(profiles, candidates)
+    assembled = assemble(profiles, candidates, is_ordered=False)
     assert ate(assembled, sequence) < 4.0
     edges = agreeing_edges(assembled, candidates, profiles)
     assert not ((edges.source == 6) & (edges.target == 0)).any()
@@ -128,11 +128,11 @@ def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
 def test_a_block_at_a_wrong_pose_moves_back_as_a_whole(sequence, truth, found, scorer) -> None:
     torn = truth.copy()
     torn[4:] = se2.compose(np.array([300.0, 150.0, 0.4]), torn[4:])
-    mended, num_moved = move_blocks(torn, Hypotheses.of(found), scorer)
+    mended, num_moved = move_blocks(torn, Hypotheses.of(found, 0.0).in_both_directions(), scorer)
     assert num_moved == 1
     assert ate(torn, sequence) > 50.0
     assert ate(mended, sequence) < 4.0
-    assert move_blocks(mended, Hypotheses.of(found), scorer)[1] == 0
+    assert move_blocks(mended, Hypotheses.of(found, 0.0).in_both_directions(), scorer)[1] == 0
 
 
 def test_weakest_cut_is_between_two_groups() -> None:

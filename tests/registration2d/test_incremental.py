@@ -8,7 +8,6 @@ from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
 from dpmjax.registration2d.incremental import scan_odometry
-from dpmjax.registration2d.pair_alignment import Schedule
 
 
 def ate(poses: np.ndarray, reference: np.ndarray) -> float:
@@ -79,8 +78,3 @@ def test_a_step_without_a_match_is_no_standing_robot(walk) -> None:
 
 def test_one_scan_is_a_trajectory(walk_scans) -> None:
     np.testing.assert_array_equal(incremental_icp(walk_scans.take(slice(1))).poses, np.zeros((1, 3)))
-
-
-def test_schedule_refuses_what_never_shrinks() -> None:
-    with pytest.raises(ValueError, match="must be positive"):
-        Schedule(gate=(1.0, 0.0), kernel=(1.0, 1.0), num_iterations=3)

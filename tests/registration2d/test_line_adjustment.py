@@ -11,10 +11,8 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error, position_bound
 from dpmjax.registration2d import planar_scans
-from dpmjax.registration2d.line_adjustment import LineAdjustmentConfig, adjust_to_lines
+from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.simulation import cast_scans, make_world
-
-CONFIG = LineAdjustmentConfig(num_neighbours=12, num_rounds=3)
 
 
 def ate(poses: np.ndarray, reference: np.ndarray) -> float:
@@ -30,7 +28,7 @@ def start(noisy_walk) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def aligned(noisy_walk_scans, start) -> np.ndarray:
-    return adjust_to_lines(noisy_walk_scans, start, CONFIG)
+    return adjust_to_lines(noisy_walk_scans, start)
 
 
 def test_lines_bring_poses_near_the_bound(noisy_walk, start, aligned) -> None:
@@ -48,13 +46,13 @@ def test_lines_hold_the_first_pose(start, aligned) -> None:
 
 def test_lines_move_with_the_world(noisy_walk_scans, start, aligned) -> None:
     offset = np.array([300.0, -200.0, 1.1])
-    moved = adjust_to_lines(noisy_walk_scans, se2.compose(offset, start), CONFIG)
+    moved = adjust_to_lines(noisy_walk_scans, se2.compose(offset, start))
     np.testing.assert_allclose(se2.relative(np.broadcast_to(offset, moved.shape), moved), aligned, atol=2e-3)
 
 
 def test_lines_do_not_depend_on_the_order_of_scans(noisy_walk_scans, start, aligned) -> None:
     order = np.concatenate([[0], np.random.default_rng(3).permutation(np.arange(1, len(start)))])
-    shuffled = adjust_to_lines(noisy_walk_scans.take(order), start[order], CONFIG)
+    shuffled = adjust_to_lines(noisy_walk_scans.take(order), start[order])
     np.testing.assert_allclose(shuffled, aligned[order], atol=2e-3)
 
 
@@ -63,20 +61,20 @@ def test_lines_never_use_masked_beams(noisy_walk, start) -> None:
     results = []
     for filling in (0.0, np.nan):
         points = np.where(mask[..., None], noisy_walk.points, np.float32(filling))
-        results.append(adjust_to_lines(planar_scans(points, mask), start, CONFIG))
+        results.append(adjust_to_lines(planar_scans(points, mask), start))
     np.testing.assert_array_equal(results[0], results[1])
 
 
 def test_lines_leave_alone_what_has_no_noise_or_no_neighbour(noisy_walk_scans, start) -> None:
     quiet = noisy_walk_scans.replace(noises=jnp.zeros_like(noisy_walk_scans.noises))
-    np.testing.assert_array_equal(adjust_to_lines(quiet, start, CONFIG), start)
+    np.testing.assert_array_equal(adjust_to_lines(quiet, start), start)
     alone = noisy_walk_scans.take(slice(1))
-    np.testing.assert_array_equal(adjust_to_lines(alone, start[:1], CONFIG), start[:1])
+    np.testing.assert_array_equal(adjust_to_lines(alone, start[:1]), start[:1])
 
 
 def test_lines_survive_scans_that_share_nothing(noisy_walk_scans, start) -> None:
     blind = noisy_walk_scans.replace(is_on_line=noisy_walk_scans.is_on_line.at[5].set(False))
-    aligned = adjust_to_lines(blind, start, CONFIG)
+    aligned = adjust_to_lines(blind, start)
     assert np.isfinite(aligned).all()
     # Nothing says where it is: it stays.
     np.testing.assert_allclose(aligned[5], start[5], atol=1e-3)

@@ -235,6 +235,13 @@ def test_scans_without_an_order_refuse_starts_that_need_one(few, start: str) -> 
         register(few, unordered, odometry=few.reference_poses)
 
 
+def test_one_scan_recorded_again_and_again_is_refused(few) -> None:
+    points = np.repeat(few.points[:1], 3, axis=0)
+    for odometry in (None, np.zeros((3, 3))):
+        with pytest.raises(ValueError, match="^scans: expected at least 2"):
+            register_scans(points, SHORT, key=KEY, odometry=odometry)
+
+
 @pytest.mark.parametrize("limits", [{"min_distance": 0.0}, {"min_turn": -1.0}])
 def test_limits_are_positive(limits: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(limits))}: "):

@@ -10,8 +10,9 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d import LoopConfig, RefinementConfig, correct_by_loops, planar_scans, refine
-from dpmjax.registration2d.joint_alignment import _rounded_up, choose_pairs
+from dpmjax.registration2d.joint_alignment import choose_pairs
 from dpmjax.registration2d.loop_closure import LoopResult, count_support, find_candidates
+from dpmjax.registration2d.planar_scans import rounded_up
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -93,7 +94,7 @@ def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
 
 
 def test_pairs_are_filled_up_to_few_sizes() -> None:
-    sizes = {num_pairs: _rounded_up(num_pairs) for num_pairs in range(1, 4097)}
+    sizes = {num_pairs: rounded_up(num_pairs, 128, 1024) for num_pairs in range(1, 4097)}
     assert all(size >= num_pairs for num_pairs, size in sizes.items())
     assert set(sizes.values()) == {128, 256, 512, 1024, 2048, 3072, 4096}
 
@@ -151,7 +152,7 @@ def test_the_better_of_start_and_loops_is_kept(walk, walk_scans, wrong_poses, mo
     nothing = np.zeros(0, np.int64)
     loops = LoopResult(closed, Edges(nothing, nothing, np.zeros((0, 3)), np.zeros((0, 3, 3))), np.ones(5))
     monkeypatch.setattr("dpmjax.registration2d.refinement._is_sound", lambda *_: False)
-    monkeypatch.setattr("dpmjax.registration2d.refinement.fitting_scans", lambda scans, _: np.ones(len(scans), bool))
+    monkeypatch.setattr("dpmjax.registration2d.refinement.distinct_rows", lambda scans: np.arange(len(scans)))
     monkeypatch.setattr("dpmjax.registration2d.refinement.correct_by_loops", lambda *_args, **_named: loops)
     found = refine(walk_scans, start)
     assert ate(found.poses, right) < 0.01

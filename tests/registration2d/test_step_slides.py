@@ -7,12 +7,11 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d import PlanarScans, assess_trajectory, incremental_icp, planar_scans, refine
-from dpmjax.registration2d.joint_alignment import JointAlignmentConfig
+from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, restore_torn
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.range_profiles import make_profiles
 from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.registration2d.step_slides import slide_steps
-from dpmjax.registration2d.torn_steps import restore_torn
 from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.
@@ -56,8 +55,7 @@ def steps_of(poses: np.ndarray) -> np.ndarray:
 
 
 def test_steps_are_open_in_a_corridor_and_closed_in_rooms(scans, truth) -> None:
-    later = np.arange(1, NUM_SCANS)
-    slides = slide_steps(make_profiles(scans), later, later - 1, steps_of(truth))
+    slides = slide_steps(make_profiles(scans), steps_of(truth))
     assert slides.is_open[IN_CORRIDOR].all()
     assert not slides.is_open[:3].any()
     assert not slides.is_open[-3:].any()
@@ -66,10 +64,10 @@ def test_steps_are_open_in_a_corridor_and_closed_in_rooms(scans, truth) -> None:
 
 
 def test_an_open_step_is_as_uncertain_as_its_odometry_and_moves_to_it(scans, truth) -> None:
-    later, deviation = np.arange(1, NUM_SCANS), 2.0
+    deviation = 2.0
     prior = StepPrior(steps_of(truth), np.full((NUM_SCANS - 1, 3), [deviation, deviation, 0.01]))
     torn = steps_of(torn_in_the_corridor(truth, 18.0))
-    slides = slide_steps(make_profiles(scans), later, later - 1, torn, prior)
+    slides = slide_steps(make_profiles(scans), torn, prior)
     assert np.flatnonzero(slides.is_torn).tolist() == [10]
     np.testing.assert_allclose(slides.moved(torn)[10, :2], steps_of(truth)[10, :2], atol=2.0)
     assert 0.3 * deviation < slides.deviations[10] < 2.0 * deviation

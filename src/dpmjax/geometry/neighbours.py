@@ -87,10 +87,9 @@ def _checked_pair(queries: AnyArray, points: AnyArray) -> tuple[jax.Array, jax.A
 
 @functools.partial(jax.jit, static_argnames="k")
 def _k_nearest(queries: jax.Array, points: jax.Array, mask: jax.Array, *, k: int) -> Neighbours:
-    num_points = points.shape[0]
-    num_found = min(k, num_points)
-    if num_found == 0:
-        return _masked_neighbours(queries.shape[0], k, queries.dtype)
+    if points.shape[0] == 0:
+        points, mask = jnp.zeros((1, points.shape[1]), points.dtype), jnp.zeros(1, bool)
+    num_found = min(k, points.shape[0])
     search = _search_nearest if num_found == 1 else functools.partial(_search_top_k, k=num_found)
     indices, is_found = search(lax.stop_gradient(queries), lax.stop_gradient(points), mask)
     indices = jnp.where(is_found, indices, 0)
@@ -114,11 +113,6 @@ def _radius_search(queries: jax.Array, points: jax.Array, mask: jax.Array, radiu
         squared_distances=jnp.where(is_within, near.squared_distances, jnp.inf),
         mask=is_within,
     )
-
-
-def _masked_neighbours(num_queries: int, k: int, dtype: jnp.dtype) -> Neighbours:
-    shape = (num_queries, k)
-    return Neighbours(jnp.zeros(shape, jnp.int32), jnp.full(shape, jnp.inf, dtype), jnp.zeros(shape, bool))
 
 
 def _search_nearest(

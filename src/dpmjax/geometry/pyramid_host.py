@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dpmjax.checks import require_count
+from dpmjax.checks import as_mask, require_count
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.pyramid import RADIUS_SLACK, WEIGHT_EPSILON, PyramidConfig, PyramidStage
 from dpmjax.geometry.sampling import farthest_point_sample
@@ -46,9 +46,7 @@ def build_pyramid_on_host(
     points = np.asarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"points: expected shape (n, 3) with n >= 1, got {points.shape}")
-    mask = np.ones(len(points), bool) if mask is None else np.asarray(mask)
-    if mask.shape != points.shape[:1] or mask.dtype != bool:
-        raise ValueError(f"mask: expected bool of shape {points.shape[:1]}, got {mask.dtype} of {mask.shape}")
+    mask = as_mask("mask", mask, points.shape[:1], np)
     require_count("num_threads", num_threads)
     points = np.where(mask[:, None], points, np.float32(0))
     order = farthest_points_on_host(points, mask, config.stages[0].num_points).astype(np.int32)

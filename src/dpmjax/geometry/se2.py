@@ -83,6 +83,22 @@ def relative(pose_w_a: Any, pose_w_b: Any) -> Any:
     return xp.stack([cos * dx + sin * dy, -sin * dx + cos * dy, heading], axis=-1)
 
 
+def is_within(motions: Any, length: Any, angle: Any) -> Any:
+    """Compares motions with limits.
+
+    Args:
+        motions: (..., 3) x, y, heading.
+        length: limit of the translation.
+        angle: limit of the turn, radians.
+
+    Returns:
+        (...) True where the translation is shorter than `length`, and the turn smaller than `angle`.
+    """
+    xp = namespace_of(motions)
+    is_short = xp.hypot(motions[..., 0], motions[..., 1]) < length
+    return is_short & (xp.abs(wrap_angle(motions[..., 2])) < angle)
+
+
 def chain(steps: Poses) -> Poses:
     """Poses from steps: `T_world_next = T_world_scan @ T_scan_next`, the first pose zero.
 
@@ -96,6 +112,18 @@ def chain(steps: Poses) -> Poses:
     for step in steps:
         poses.append(compose(poses[-1], step))
     return np.array(poses)
+
+
+def path_lengths(poses: Poses) -> Poses:
+    """Computes the length of a trajectory up to each of its poses.
+
+    Args:
+        poses: (n, 3) T_world_scan, on the host.
+
+    Returns:
+        (n,), the first one zero.
+    """
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
 def rotation(heading: Any) -> Any:

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from dpmjax.geometry import rigid, se2
-from dpmjax.metrics.inputs import checked_pose_pair, checked_poses
-from dpmjax.metrics.poses import rotation_angle
+from dpmjax.metrics.poses import checked_pose_pair, checked_poses, rotation_angle
 from dpmjax.sequences import Relations
 from dpmjax.types import AnyArray
 

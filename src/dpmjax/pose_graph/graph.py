@@ -46,6 +46,21 @@ def join_edges(*edges: Edges) -> Edges:
     return Edges(*(np.concatenate(parts) for parts in zip(*edges, strict=True)))
 
 
+def label_parts(size: int, source: NDArray[np.integer], target: NDArray[np.integer]) -> Indices:
+    """Labels the connected parts of a graph.
+
+    Args:
+        size: number of nodes.
+        source: (e,) rows of the nodes at one end of the edges.
+        target: (e,) rows of the nodes at the other end.
+
+    Returns:
+        (size,) number of the part of each node.
+    """
+    joined = sp.coo_matrix((np.ones(len(source)), (source, target)), (size, size))
+    return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1], np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses (n nodes) and the relative poses measured between them. `PoseGraph.create` makes and checks one.
@@ -100,10 +115,8 @@ class PoseGraph:
         Returns:
             (n,) True for fixed nodes, and for the first node of each connected part without any.
         """
-        edges, size = self.edges, len(self.poses)
-        joined = sp.coo_matrix((np.ones(len(edges.source)), (edges.source, edges.target)), (size, size))
-        num_parts, part = sp.csgraph.connected_components(joined, directed=False)
-        has_fixed = np.bincount(part[self.is_fixed], minlength=num_parts) > 0
+        part = label_parts(len(self.poses), self.edges.source, self.edges.target)
+        has_fixed = np.bincount(part[self.is_fixed], minlength=part.max() + 1) > 0
         first = np.unique(part, return_index=True)[1]
         held = self.is_fixed.copy()
         held[first[~has_fixed]] = True

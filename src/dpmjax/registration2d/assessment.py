@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.pose_graph.graph import label_parts
+from dpmjax.registration2d.pair_search import Hypotheses
+from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.quality import MAX_NOISE, near_pairs
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, pair_scores
 from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_scores import pair_scores
 from dpmjax.registration2d.step_slides import Slides, slide_steps
 
 # Limits of `assess_trajectory`, calibrated on right and wrong maps of simulated worlds and of thinned logs
@@ -68,18 +68,6 @@ class Assessment(NamedTuple):
     fault: str | None = None
 
 
-class _Pairs(NamedTuple):
-    """Pairs of near scans (p): rows, T_target_source, and their scores."""
-
-    source: Indices
-    target: Indices
-    relative: Floats
-    scores: Floats
-
-    def take(self, is_taken: NDArray[np.bool_]) -> _Pairs:
-        return _Pairs(self.source[is_taken], self.target[is_taken], self.relative[is_taken], self.scores[is_taken])
-
-
 def assess_trajectory(
     scans: PlanarScans, poses: Floats, *, prior: StepPrior | None = None, fault: str | None = None
 ) -> Assessment:
@@ -100,7 +88,7 @@ def assess_trajectory(
     """
     profiles, (source, target) = make_profiles(scans), near_pairs(poses, scans.typical_range)
     relative = np.asarray(se2.relative(poses[target], poses[source]))
-    pairs = _Pairs(source, target, relative, pair_scores(profiles, source, target, relative))
+    pairs = Hypotheses(source, target, relative, pair_scores(profiles, source, target, relative))
     views = compare_pairs(profiles, source, target, relative)
     best = np.full(len(poses), -np.inf)
     np.maximum.at(best, np.concatenate([source, target]), np.tile(pairs.scores, 2))
@@ -121,7 +109,7 @@ def assess_trajectory(
     if prior is not None:
         lost = np.convolve(is_alone, np.ones(_MAX_ALONE + 1))
         is_whole &= bool(lost.max(initial=0.0) <= _MAX_ALONE)
-    steps = None if prior is None else _slide_all(profiles, poses, prior)
+    steps = None if prior is None else slide_steps(profiles, se2.relative(poses[:-1], poses[1:]), prior)
     deviations = _deviations(profiles, len(poses), pairs, steps)
     if steps is not None:
         later = np.arange(1, len(poses))
@@ -133,19 +121,14 @@ def assess_trajectory(
     return Assessment(weakest, float(excess), bool(is_trusted), uncertain, fault)
 
 
-def _slide_all(profiles: RangeProfiles, poses: Floats, prior: StepPrior) -> Slides:
-    later = np.arange(1, len(poses))
-    return slide_steps(profiles, later, later - 1, np.asarray(se2.relative(poses[:-1], poses[1:])), prior)
-
-
-def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: Slides | None) -> Floats:
+def _deviations(profiles: RangeProfiles, num_scans: int, pairs: Hypotheses, steps: Slides | None) -> Floats:
     """Returns the standard deviation (n,) of each scan's position relative to the largest fully constrained part.
 
     A pair is closed where its shift along the weak direction is constrained. Other pairs enter with the variance of
     this shift. These variances, and those of the n - 1 steps with a prior, are the resistances of a network. The
     variance of a scan is the resistance between the scan and that part, infinite where they are not connected.
     """
-    slides = slide_steps(profiles, pairs.source, pairs.target, pairs.relative)
+    slides = slide_steps(profiles, pairs.poses, pairs=(pairs.source, pairs.target))
     is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
     if steps is not None:
         # A step between neighbours in time counts with its prior.
@@ -156,16 +139,13 @@ def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: S
         source, target = np.concatenate([source, rows + 1]), np.concatenate([target, rows])
         information = np.concatenate([information, steps.information()[rows]])
     is_closed = np.isinf(information)
-    size = (num_scans, num_scans)
-    closed = scipy.sparse.csr_array((is_closed.astype(np.float64), (source, target)), size)
-    closed.eliminate_zeros()
-    label = scipy.sparse.csgraph.connected_components(closed, directed=False)[1]
+    label = label_parts(num_scans, source[is_closed], target[is_closed])
     # A closed part moves as one.
     network = np.zeros((label.max() + 1, label.max() + 1))
     np.add.at(network, (label[source[~is_closed]], label[target[~is_closed]]), -information[~is_closed])
     network += network.T
     ground = np.bincount(label).argmax()
-    part = scipy.sparse.csgraph.connected_components(scipy.sparse.csr_array(network), directed=False)[1]
+    part = label_parts(len(network), *np.nonzero(network))
     variances, rows = np.full(len(network), np.inf), np.flatnonzero(part == part[ground])
     variances[ground], rows = 0.0, rows[rows != ground]
     np.fill_diagonal(network, 0.0)
@@ -176,7 +156,7 @@ def _deviations(profiles: RangeProfiles, num_scans: int, pairs: _Pairs, steps: S
 
 def _weakest_connection(tree: scipy.sparse.csr_array) -> tuple[int, float]:
     """Returns the number of scans of the largest tree, and its lowest score between two parts of several scans."""
-    label = scipy.sparse.csgraph.connected_components(tree, directed=False)[1]
+    label = label_parts(tree.shape[0], *tree.nonzero())
     root = int(np.flatnonzero(label == np.bincount(label).argmax())[0])
     order, parent = scipy.sparse.csgraph.breadth_first_order(tree, root, directed=False)
     size = np.ones(tree.shape[0], np.int64)

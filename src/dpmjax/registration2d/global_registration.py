@@ -12,14 +12,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 import scipy.spatial
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import PoseGraph, join_edges
+from dpmjax.pose_graph.graph import PoseGraph, join_edges, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.map_assembly import PoseScorer, assemble, settle
@@ -33,9 +31,8 @@ from dpmjax.registration2d.pair_search import (
     noisy_share,
     search_pairs,
 )
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles
-from dpmjax.registration2d.step_scores import weak_steps
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, spread_evenly
+from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, weak_steps
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Numbers of search partners of a scan that is no keyframe: keyframes with the most similar views, and, without an
@@ -144,11 +141,6 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
 
 
-def spread_evenly(num_scans: int, count: int) -> Indices:
-    """Returns up to `count` evenly spaced rows, the first and the last among them."""
-    return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
-
-
 def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
     """Selects `count` columns greedily, which maximise the summed similarity of each scan to its most similar one.
 
@@ -187,14 +179,14 @@ def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer:
     """
     is_placed = np.zeros(len(poses), bool)
     is_placed[placed] = True
-    fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.anchor] & ~is_placed[hypotheses.scan]))
+    fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.target] & ~is_placed[hypotheses.source]))
     candidates = fresh.world_poses(poses)
     # Only hypotheses of one scan are compared with each other, so the chance level is not subtracted.
-    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.scan, candidates, placed, poses)
+    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.source, candidates, placed, poses)
     order = np.argsort(score, kind="stable")
     poses = poses.copy()
     # The best one of each scan is written last.
-    poses[fresh.scan[order]] = candidates[order]
+    poses[fresh.source[order]] = candidates[order]
     return settle(poses, hypotheses, scorer)
 
 
@@ -231,7 +223,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         candidates = join_candidates(found, more)
         share = noisy_share(task.profiles, candidates)
         scorer = PoseScorer(task.profiles, chance_level(found), share, task.is_ordered)
-        return place_in_map(poses, task.keyframes, Hypotheses.of(candidates), scorer)
+        return place_in_map(poses, task.keyframes, Hypotheses.of(candidates, 0.0).in_both_directions(), scorer)
 
     poses = place(poses, more)
     # A scan that overlaps with no keyframe has its neighbours among the remaining scans; so has a keyframe that
@@ -269,10 +261,8 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
     views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
     matched = np.where(scan == other, 0.0, views.matched)
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
-    links = (matched > _MIN_LINK * usual).astype(np.float64)
-    is_linked = scipy.sparse.csr_array((links, (scan, other)), shape=(num_scans, num_scans))
-    is_linked.eliminate_zeros()
-    cluster = scipy.sparse.csgraph.connected_components(is_linked, directed=False)[1]
+    is_linked = matched > _MIN_LINK * usual
+    cluster = label_parts(num_scans, scan[is_linked], other[is_linked])
     is_small = np.bincount(cluster)[cluster] <= config.max_unregistered // 2
     matched = np.where(is_small[scan] & (cluster[scan] == cluster[other]), 0.0, matched)
     support = matched.reshape(near.shape).max(axis=1)

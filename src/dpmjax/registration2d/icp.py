@@ -255,7 +255,4 @@ def _resolution(target: _Cloud) -> Float[Array, ""]:
 
 def _median(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
     """Returns the median of the valid values; 0 without any."""
-    count = mask.sum()
-    ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
-    middle = 0.5 * (ordered[jnp.maximum(count - 1, 0) // 2] + ordered[count // 2])
-    return jnp.where(count > 0, middle, 0.0)
+    return jnp.nan_to_num(jnp.nanmedian(jnp.where(mask, values, jnp.nan)))

@@ -64,8 +64,10 @@ def incremental_icp(
         prior = usual_motion(rough, unit)
     else:
         prior = prior or StepPrior.of_poses(odometry, unit)
-        guesses = np.asarray(se2.relative(odometry[:-1], odometry[1:]))
-        rough = _match_odometry(source, target, guesses, prior.as_pose_prior(_COARSE_RESIDUAL * unit), metric)
+        fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5, -1.5, 1.5], [0.0, 0.0, 1.0])
+        guesses = se2.relative(odometry[:-1], odometry[1:])[:, None] + fan
+        loose = prior.as_pose_prior(_COARSE_RESIDUAL * unit)
+        rough = match_pairs(source, target, guesses, COARSE, loose, metric=metric)
     # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
     num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
     is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
@@ -73,7 +75,7 @@ def incremental_icp(
     predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
     steps = match_pairs(source, target, guesses, FINE, belief, metric=metric)
-    poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps).poses
+    poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps)
     return IncrementalResult(poses, steps)
 
 
@@ -99,14 +101,6 @@ def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> Pair
     """Returns coarse matches from zero motion and small turns."""
     fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
     return match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
-
-
-def _match_odometry(
-    source: PlanarScans, target: PlanarScans, guess: Floats, prior: PosePrior, metric: Metric
-) -> PairMatches:
-    """Returns coarse matches around the steps of the odometry."""
-    fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5, -1.5, 1.5], [0.0, 0.0, 1.0])
-    return match_pairs(source, target, guess[:, None] + fan, COARSE, prior, metric=metric)
 
 
 def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:

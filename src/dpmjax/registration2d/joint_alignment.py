@@ -2,6 +2,10 @@
 
 A pair of scans in a corridor constrains the direction across the corridor alone. Along it, the posterior of the shift
 constrains open steps, and torn steps are put at their most probable shift (see `Slides`).
+
+A loop over a long step, or a wrong pair in space, moves single scans away from their neighbours, beyond the basin of
+convergence of an alignment. These steps are torn, too: the relative poses of two scans that fit each other before a
+refinement and not after it. The pose graph is solved again with the previous relative poses of these steps.
 """
 
 from __future__ import annotations
@@ -18,12 +22,11 @@ from jaxtyping import Array
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_edges
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.held_steps import held_steps, open_projections, pose_steps, prior_steps
 from dpmjax.registration2d.pair_alignment import PairSystem, Schedule, linearise_pair
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_slides import slide_steps
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, rounded_up
+from dpmjax.registration2d.range_profiles import WEAK_SCORE, RangeProfiles, make_profiles, pair_scores
+from dpmjax.registration2d.step_prior import StepPrior, pose_steps, prior_steps
+from dpmjax.registration2d.step_slides import held_steps, slide_steps
 
 # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
@@ -31,10 +34,13 @@ _ROUND_DISTANCES = 1.5e9
 _PAIRS_AT_ONCE = 128
 # The number of pairs is rounded up to a power of two up to this one, then to its multiples, so that few shapes compile.
 _PAIRS_ROUNDED = 1024
-# Gates and kernels of the rounds.
-_ROUNDS = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14)
-# Gauss-Newton steps that restore unconstrained directions after the adjustment to lines.
-_NUM_RESTORATIONS = 3
+# Gates and kernels of the rounds, and number of rounds after which the neighbours are chosen anew.
+_ROUNDS, _REFRESH = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14), 4
+# Gauss-Newton steps that restore unconstrained directions after the adjustment to lines, and torn steps.
+_NUM_OPEN_ROUNDS, _NUM_TORN_ROUNDS = 3, 5
+# A step is torn by a refinement where its score has fallen by this much, from a score that was not weak. Least weight
+# of a step, whose score may be negative.
+_LOST_SCORE, _LEAST_WEIGHT = 0.25, 0.01
 # Offsets of the neighbours in time, of ordered scans; largest difference of heading of neighbours in space, radians.
 _TEMPORAL, _MAX_TURN = (1, 2, 3), 2.0
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -47,12 +53,10 @@ class JointAlignmentConfig:
     Attributes:
         num_spatial: largest number of neighbours in space, each from another visit.
         radius: largest distance of neighbours in space.
-        refresh: number of rounds after which the neighbours are chosen anew.
     """
 
     num_spatial: int = 8
     radius: float = 0.6
-    refresh: int = 4
 
 
 def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None) -> Floats:
@@ -72,17 +76,13 @@ def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, p
     # In units of one beam's information, as the systems of the pairs are.
     trust = 1e-9 if prior is None else max(scans.noise, 0.00075 * scans.typical_range) ** 2
     for round_number, scale in enumerate(zip(*scales, strict=True)):
-        if round_number % config.refresh == 0:
+        if round_number % _REFRESH == 0:
             pairs = _choose_aligned(profiles, poses, config, prior)
             steps = join_edges(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
-        edges, system = _linearise(scans, pairs.source, pairs.target, poses, scale)
-        edges = edges._replace(information=pairs.across @ edges.information @ pairs.across)
-        here = se2.relative(poses[steps.target], poses[steps.source])
-        pull = np.einsum("eij,ej->ei", steps.information, se2.relative(steps.measurements, here))
-        gradient = np.einsum("eij,ej->ei", pairs.across, np.asarray(system.gradient))
-        edges, gradient = join_edges(edges, steps._replace(measurements=here)), np.concatenate([gradient, pull])
-        poses = se2.compose(poses, solve_step(len(poses), edges, gradient))
+        edges, gradient = _linearise(scans, pairs, poses, scale)
+        held, pull = _linearise_edges(steps, poses)
+        poses = se2.compose(poses, solve_step(len(poses), join_edges(edges, held), np.concatenate([gradient, pull])))
     return poses
 
 
@@ -101,21 +101,70 @@ def restore_open(
     Returns:
         (n, 3) adjusted poses; along the unconstrained directions the relative poses are those of `aligned`.
     """
-    scans, unit = profiles.scans, profiles.scans.typical_range
-    pairs, poses = _choose_aligned(profiles, aligned, config, prior), adjusted
+    scans, pairs = profiles.scans, _choose_aligned(profiles, aligned, config, prior)
     if not len(pairs.held.source):
         return adjusted
-    scale = tuple(x[-1] for x in _ROUNDS.gates_and_kernels(unit, 1.25 * scans.noise))
-    edges, _ = _linearise(scans, pairs.source, pairs.target, adjusted, (scale[0], scale[1]))
-    edges = edges._replace(information=pairs.across @ edges.information @ pairs.across)
+    gates, kernels = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
+    edges, _ = _linearise(scans, pairs, adjusted, (gates[-1], kernels[-1]))
     kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
     # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
-    edges = join_edges(edges, Edges(pairs.held.source, pairs.held.target, kept, information))
-    for _ in range(_NUM_RESTORATIONS):
-        here = se2.relative(poses[edges.target], poses[edges.source])
-        pull = np.einsum("eij,ej->ei", edges.information, se2.relative(edges.measurements, here))
-        poses = se2.compose(poses, solve_step(len(poses), edges._replace(measurements=here), pull))
+    edges = join_edges(edges, pairs.held._replace(measurements=kept, information=information))
+    return _relax(edges, adjusted, _NUM_OPEN_ROUNDS)
+
+
+def restore_torn(
+    profiles: RangeProfiles, steps: Floats, poses: Floats, config: JointAlignmentConfig, prior: StepPrior
+) -> Floats | None:
+    """Restores torn steps and distributes the difference over the pairs that constrain the map.
+
+    Args:
+        profiles: n scans in time order.
+        steps: (n - 1, 3) T_scan_next before the refinement.
+        poses: (n, 3) T_world_scan after the refinement.
+        config: of the pairs in space.
+        prior: of the steps; a step that is torn in `Slides` with this prior is shifted to its mode.
+
+    Returns:
+        (n, 3) T_world_scan, to be aligned again; None where no step is torn.
+    """
+    later, kept = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
+    before, after = (pair_scores(profiles, later, later - 1, found) for found in (steps, kept))
+    is_lost = (before > WEAK_SCORE) & (after < before - _LOST_SCORE)
+    slides = slide_steps(profiles, kept, prior)
+    is_slid = slides.is_torn & (slides.scores > WEAK_SCORE) & ~is_lost
+    if not (is_lost | is_slid).any():
+        return None
+    weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
+    restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
+    edges = join_edges(_fitting_pairs(profiles, poses, config), Edges(later, later - 1, restored, weights))
+    scale = np.diag([1.0, 1.0, profiles.scans.typical_range**2])
+    edges = edges._replace(information=edges.information[:, None, None] * scale)
+    return _relax(edges, poses, _NUM_TORN_ROUNDS)
+
+
+def _fitting_pairs(profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig) -> Edges:
+    """Returns edges of the pairs that fit, without steps; their information is the scores (e,)."""
+    source, target = choose_pairs(profiles.scans, poses, config)
+    is_pair = source != target + 1
+    source, target = source[is_pair], target[is_pair]
+    relative = np.asarray(se2.relative(poses[target], poses[source]))
+    scores = pair_scores(profiles, source, target, relative)
+    fits = scores > WEAK_SCORE
+    return Edges(source[fits], target[fits], relative[fits], scores[fits])
+
+
+def _linearise_edges(edges: Edges, poses: Floats) -> tuple[Edges, Floats]:
+    """Returns the edges at the relative poses of these poses, and J^T W r (e, 3), as `solve_step` takes them."""
+    here = se2.relative(poses[edges.target], poses[edges.source])
+    pull = np.einsum("eij,ej->ei", edges.information, se2.relative(edges.measurements, here))
+    return edges._replace(measurements=here), pull
+
+
+def _relax(edges: Edges, poses: Floats, num_rounds: int) -> Floats:
+    """Returns the poses after Gauss-Newton steps towards the measurements of the edges."""
+    for _ in range(num_rounds):
+        poses = np.asarray(se2.compose(poses, solve_step(len(poses), *_linearise_edges(edges, poses))))
     return poses
 
 
@@ -139,18 +188,16 @@ def _choose_aligned(
     profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None
 ) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
-    scans, later = profiles.scans, np.arange(1, len(poses))
-    source, target = choose_pairs(scans, poses, config)
-    steps = se2.relative(poses[:-1], poses[1:])
+    source, target = choose_pairs(profiles.scans, poses, config)
     if prior is None:
         return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
-    slides = slide_steps(profiles, later, later - 1, steps, prior)
+    slides = slide_steps(profiles, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
     is_kept = (crossed[source] == crossed[target]) | (source - target > max(_TEMPORAL))
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
-    across = open_projections(slide_steps(profiles, source, target, relative), relative)
-    return _AlignedPairs(source, target, across, held_steps(slides, poses, scans.typical_range))
+    across = np.eye(3) - slide_steps(profiles, relative, pairs=(source, target)).open_directions(relative)
+    return _AlignedPairs(source, target, across, held_steps(slides, poses))
 
 
 def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
@@ -211,20 +258,14 @@ def _linearise_pairs(
 
 
 def _linearise(
-    scans: PlanarScans, source: Indices, target: Indices, poses: Floats, scale: tuple[jax.Array, jax.Array]
-) -> tuple[Edges, PairSystem]:
+    scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: tuple[Array, Array]
+) -> tuple[Edges, Floats]:
     """Linearises all pairs at these poses, gate and kernel; their number is rounded up, so that few shapes compile."""
+    source, target, across, _ = pairs
     relative = se2.relative(poses[target], poses[source])
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
-    filled = np.resize(np.arange(len(source)), _rounded_up(len(source)))
-    pairs = source[filled], target[filled], relative[filled].astype(np.float32)
-    system = _linearise_pairs(scans.replace(is_ordered=False), pairs, scale, source_stride=stride)
-    system = jax.tree.map(lambda x: np.asarray(x, np.float64)[: len(source)], system)
-    return Edges(source, target, relative, np.asarray(system.information)), system
-
-
-def _rounded_up(num_pairs: int) -> int:
-    """Returns the padded number of pairs."""
-    if num_pairs > _PAIRS_ROUNDED:
-        return _PAIRS_ROUNDED * -(-num_pairs // _PAIRS_ROUNDED)
-    return max(_PAIRS_AT_ONCE, 1 << (num_pairs - 1).bit_length())
+    filled = np.resize(np.arange(len(source)), rounded_up(len(source), _PAIRS_AT_ONCE, _PAIRS_ROUNDED))
+    rows = source[filled], target[filled], relative[filled].astype(np.float32)
+    system = _linearise_pairs(scans.replace(is_ordered=False), rows, scale, source_stride=stride)
+    information, gradient, _ = (np.asarray(x, np.float64)[: len(source)] for x in system)
+    return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)

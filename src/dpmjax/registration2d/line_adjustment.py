@@ -7,7 +7,6 @@ because its noise is parallel to the wall. The lines are eliminated, so each res
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -36,24 +35,11 @@ _OUTLIER = 3.0
 _MAX_CHI2 = 1.15
 # Points are a line if their variance along it is this many times the variance across it.
 _MIN_SLENDERNESS = 2.0
-# Gauss-Newton steps of each round.
-_NUM_ITERATIONS = 2
-
-
-@dataclass(frozen=True)
-class LineAdjustmentConfig:
-    """Settings of the line adjustment.
-
-    Attributes:
-        num_neighbours: number of neighbouring scans that share lines with a scan, spread evenly by nearness within
-            `radius`.
-        radius: within which scans share lines, in typical ranges of the scans.
-        num_rounds: number of times that the beams of a line are chosen.
-    """
-
-    num_neighbours: int = 48
-    radius: float = 1.2
-    num_rounds: int = 2
+# Number of neighbouring scans that share lines with a scan, spread evenly by nearness within the radius, typical
+# ranges.
+_NUM_NEIGHBOURS, _RADIUS = 48, 1.2
+# Number of times that the beams of the lines are chosen, and Gauss-Newton steps after each choice.
+_NUM_ROUNDS, _NUM_ITERATIONS = 2, 2
 
 
 class _Beams(NamedTuple):
@@ -186,10 +172,10 @@ def _linearise_all(
     return jax.lax.map(linearise, (around, nearest, poses))
 
 
-def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices:
+def _choose_around(poses: Floats, radius: float) -> Indices:
     """Returns the row of each scan and those of neighbours within the radius, spread evenly by nearness."""
     num_scans = len(poses)
-    count = min(num_neighbours, num_scans - 1)
+    count = min(_NUM_NEIGHBOURS, num_scans - 1)
     tree = scipy.spatial.cKDTree(poses[:, :2])
     around = np.empty((num_scans, count + 1), np.int64)
     for scan, pose in enumerate(poses):
@@ -201,24 +187,21 @@ def _choose_around(poses: Floats, num_neighbours: int, radius: float) -> Indices
     return around
 
 
-def adjust_to_lines(scans: PlanarScans, poses: Floats, config: LineAdjustmentConfig | None = None) -> Floats:
+def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
     """Optimises all poses by Gauss-Newton against lines that all scans share.
 
     Args:
         scans: n scans with a range noise above zero.
         poses: (n, 3) initial poses T_world_scan, within a few standard deviations of the noise.
-        config: settings.
 
     Returns:
         (n, 3) poses; the first is the initial one. Without noise all are the initial ones, since weights are undefined.
     """
-    config = config or LineAdjustmentConfig()
-    poses = np.asarray(poses, np.float64)
     if len(poses) < 2 or scans.noise <= 0:
         return poses
-    radius, scans = config.radius * scans.typical_range, scans.replace(is_ordered=False)
-    for _ in range(config.num_rounds):
-        around = _choose_around(poses, config.num_neighbours, radius)
+    radius, scans = _RADIUS * scans.typical_range, scans.replace(is_ordered=False)
+    for _ in range(_NUM_ROUNDS):
+        around = _choose_around(poses, radius)
         nearest = _find_nearest(scans, around, _relative_to_own(poses, around))
         for _ in range(_NUM_ITERATIONS):
             system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around))

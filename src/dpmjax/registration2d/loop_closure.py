@@ -19,11 +19,10 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.held_steps import BEAM_DEVIATION, pose_steps
 from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, batches
-from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
-from dpmjax.registration2d.step_scores import weak_steps
+from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles, weak_steps
+from dpmjax.registration2d.step_prior import BEAM_DEVIATION, pose_steps
 
 _SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
 _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
@@ -126,7 +125,7 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
 
 def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
     """Finds pairs of scans that may overlap: a later one (source) and an earlier one (target)."""
-    way, nearby = _way_along(poses), 2.0 * _NEARBY * typical_range
+    way, nearby = se2.path_lengths(poses), 2.0 * _NEARBY * typical_range
     radius = min(_MAX_RADIUS * typical_range, nearby + config.drift * way[-1])
     first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
     apart = way[second] - way[first]
@@ -141,14 +140,9 @@ def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> 
     return source.astype(np.int64), target.astype(np.int64)
 
 
-def _way_along(poses: Floats) -> Floats:
-    """Computes the length (n,) of the trajectory up to each pose."""
-    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-
-
 def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, config: LoopConfig) -> PairMatches:
     """Matches scans to submaps around their targets, one batch of candidates."""
-    unit, way = scans.typical_range, _way_along(poses)
+    unit, way = scans.typical_range, se2.path_lengths(poses)
     submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
     predicted = se2.relative(poses[target], poses[source])
     # The prior has the standard deviation of the drift: it constrains the position along a corridor.
@@ -201,6 +195,5 @@ def count_support(edges: Edges, poses: Floats, typical_range: float) -> Indices:
     step_source = se2.relative(poses[edges.source[other]], poses[edges.source[one]])
     through = se2.compose(se2.compose(step_target, edges.measurements[other]), step_source)
     error = se2.relative(edges.measurements[one], through)
-    agrees = np.hypot(error[:, 0], error[:, 1]) < _AGREEMENT[0] * typical_range
-    agrees &= np.abs(error[:, 2]) < _AGREEMENT[1]
+    agrees = se2.is_within(error, _AGREEMENT[0] * typical_range, _AGREEMENT[1])
     return np.bincount(one[agrees], minlength=len(edges.source))

@@ -20,7 +20,7 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.pose_graph.graph import PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.pair_search import (
     AGREEMENT,
@@ -131,7 +131,7 @@ def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
 
-def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: bool = False) -> Floats:
+def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: bool) -> Floats:
     """Assembles one map of all scans from candidates of their pairs, without initial poses.
 
     Args:
@@ -143,7 +143,7 @@ def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: boo
         (n, 3) T_world_scan; the first pose is zero.
     """
     scorer = PoseScorer(profiles, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
-    hypotheses, everyone = Hypotheses.of(candidates), np.arange(len(profiles))
+    hypotheses, everyone = Hypotheses.of(candidates, 0.0).in_both_directions(), np.arange(len(profiles))
     maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
     scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
     poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(profiles), 3))
@@ -159,7 +159,7 @@ def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
     chosen: list[int] = []
     used: set[int] = set()
     for row in np.argsort(-hypotheses.scores, kind="stable"):
-        pair = {int(hypotheses.scan[row]), int(hypotheses.anchor[row])}
+        pair = {int(hypotheses.source[row]), int(hypotheses.target[row])}
         if len(chosen) < _NUM_SEEDS and not pair & used:
             chosen.append(int(row))
             used |= pair
@@ -168,7 +168,7 @@ def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
 
 def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
     """Places all scans one by one, from the anchor of one hypothesis."""
-    scan, anchor, num_scans = hypotheses.scan, hypotheses.anchor, len(scorer.profiles)
+    scan, anchor, num_scans = hypotheses.source, hypotheses.target, len(scorer.profiles)
     poses, is_placed = np.zeros((num_scans, 3)), np.zeros(num_scans, bool)
     # World pose of each usable hypothesis, and its score against each placed scan.
     worlds, scores = np.zeros((len(scan), 3)), np.zeros((len(scan), num_scans))
@@ -203,18 +203,17 @@ def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[
     """Moves each scan, the lowest score first, to its hypothesis with the best score, and counts the moves."""
     poses, everyone, num_moved = poses.copy(), np.arange(len(poses)), 0
     support = scorer.score(everyone, poses, everyone, poses)
-    score = scorer.score(hypotheses.scan, hypotheses.world_poses(poses), everyone, poses)
+    score = scorer.score(hypotheses.source, hypotheses.world_poses(poses), everyone, poses)
     # A scan without a better hypothesis now is not compared again.
-    is_better = np.isin(everyone, hypotheses.scan[is_firmly_more(score, support[hypotheses.scan])])
+    is_better = np.isin(everyone, hypotheses.source[is_firmly_more(score, support[hypotheses.source])])
     for scan in (scan for scan in np.argsort(support) if is_better[scan]):
-        own = hypotheses.take(np.flatnonzero(hypotheses.scan == scan))
+        own = hypotheses.take(np.flatnonzero(hypotheses.source == scan))
         candidates = np.concatenate([poses[scan][None], own.world_poses(poses)])
         score = scorer.score(np.full(len(candidates), scan), candidates, everyone, poses)
         best = int(score.argmax())
         if is_firmly_more(score[best], score[0]):
-            off = se2.relative(poses[scan], candidates[best])
             far = AGREEMENT[0] * scorer.profiles.scans.typical_range
-            num_moved += bool(np.hypot(off[0], off[1]) > far)
+            num_moved += bool(np.hypot(*(candidates[best] - poses[scan])[:2]) > far)
             poses[scan] = candidates[best]
     return poses, num_moved
 
@@ -259,8 +258,7 @@ def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
     blocks = []
     for edge in np.argsort(-tree.data)[:count]:
         keep = np.arange(len(tree.data)) != edge
-        rest = scipy.sparse.coo_matrix((tree.data[keep], (tree.row[keep], tree.col[keep])), shape=tree.shape)
-        _, label = scipy.sparse.csgraph.connected_components(rest, directed=False)
+        label = label_parts(len(values), tree.row[keep], tree.col[keep])
         side = label == label[tree.row[edge]]
         blocks.append(side if 2 * side.sum() <= len(values) else ~side)
     return blocks
@@ -270,10 +268,10 @@ def _better_motion(
     poses: Floats, block: NDArray[np.bool_], hypotheses: Hypotheses, scorer: PoseScorer, values: Floats
 ) -> Floats | None:
     """Finds the best motion (3,) of the block in the world, proposed by a pair across the cut; None: none is better."""
-    across = np.flatnonzero(block[hypotheses.scan] & ~block[hypotheses.anchor])
+    across = np.flatnonzero(block[hypotheses.source] & ~block[hypotheses.target])
     across = across[np.argsort(-hypotheses.scores[across], kind="stable")[:_NUM_BLOCK_POSES]]
     best = hypotheses.take(across)
-    motions = se2.compose(best.world_poses(poses), se2.inverse(poses[best.scan]))
+    motions = se2.compose(best.world_poses(poses), se2.inverse(poses[best.source]))
     motions = np.concatenate([np.zeros((1, 3)), motions])
     inside, outside = np.flatnonzero(block), np.flatnonzero(~block)
     moved = se2.compose(motions[:, None], poses[inside][None])

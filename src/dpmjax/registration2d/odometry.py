@@ -118,8 +118,7 @@ def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
     rough = match_pairs(source, target, np.where(is_within[..., None], told, 0.0), COARSE).poses
     guesses = np.stack([match_near(source, target, "plane").poses, rough], axis=1)
     steps = match_pairs(source, target, guesses, FINE).poses
-    profiles, later = make_profiles(scans), np.arange(1, len(scans))
-    slides = slide_steps(profiles, later, later - 1, steps)
+    slides = slide_steps(make_profiles(scans), steps)
     is_clear = (slides.scores > _CLEAR_SCORE) & ~slides.is_torn & ~slides.is_open
     return ClearSteps(np.flatnonzero(is_clear), steps[is_clear])
 
@@ -140,12 +139,10 @@ def _agreement(clear: ClearSteps, odometry: Floats, unit: float) -> tuple[float,
     Steps with a turn are used; if they are too few, steps with a translation.
     """
     expected = se2.relative(odometry[clear.rows], odometry[clear.rows + 1])
-    off = clear.steps - expected
-    off[:, 2] = se2.wrap_angle(off[:, 2])
     moves = np.maximum(*(np.hypot(x[:, 0], x[:, 1]) for x in (expected, clear.steps)))
     turns = np.maximum(*(np.abs(x[:, 2]) for x in (expected, clear.steps)))
-    agrees = np.hypot(off[:, 0], off[:, 1]) < _MOVE_AGREEMENT[0] * moves + _MOVE_AGREEMENT[1] * unit
-    agrees &= np.abs(off[:, 2]) < _TURN_AGREEMENT[0] * turns + _TURN_AGREEMENT[1]
+    limits = _MOVE_AGREEMENT[0] * moves + _MOVE_AGREEMENT[1] * unit, _TURN_AGREEMENT[0] * turns + _TURN_AGREEMENT[1]
+    agrees = se2.is_within(clear.steps - expected, *limits)
     tells = turns > _LEAST_TURN
     if tells.sum() < _LEAST_STEPS:
         tells = moves > _LEAST_MOVE * unit

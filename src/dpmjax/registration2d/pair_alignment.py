@@ -46,10 +46,6 @@ class Schedule:
     source_stride: int = 1
     target_stride: int = 1
 
-    def __post_init__(self) -> None:
-        if min(*self.gate, *self.kernel) <= 0 or self.num_iterations < 1:
-            raise ValueError(f"schedule: gates, kernels and iterations must be positive, got {self}")
-
     def gates_and_kernels(self, typical_range: float, noise: float) -> tuple[jax.Array, jax.Array]:
         """Returns gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
         gates, kernels = (typical_range * np.geomspace(*x, self.num_iterations) for x in (self.gate, self.kernel))

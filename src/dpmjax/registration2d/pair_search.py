@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.registration2d.planar_scans import Floats, Indices, Tolerances, batches
+from dpmjax.registration2d.planar_scans import Floats, Indices, Tolerances, batches, rounded_up
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
 # The number of pairs of one turn is rounded up to a power of two, at least this, so that few shapes compile; the number
@@ -125,31 +125,36 @@ def noisy_share(profiles: RangeProfiles, candidates: Candidates) -> float:
 
 
 class Hypotheses(NamedTuple):
-    """Pose hypotheses: every candidate in both directions, the pose of `scan` in the frame of `anchor`."""
+    """Scored relative poses of pairs: (h,) rows, (h, 3) T_target_source, (h,) scores; a pair may have several."""
 
-    scan: Indices
-    anchor: Indices
+    source: Indices
+    target: Indices
     poses: Floats
     scores: Floats
 
     @classmethod
-    def of(cls, candidates: Candidates) -> Hypotheses:
-        """Makes hypotheses of all candidates with a positive score."""
-        count = candidates.scores.shape[1]
-        source, target = np.repeat(candidates.source, count), np.repeat(candidates.target, count)
-        poses, scores = candidates.poses.reshape(-1, 3), candidates.scores.reshape(-1)
-        keep = np.isfinite(scores) & (scores > 0.0)
-        source, target, poses, scores = source[keep], target[keep], poses[keep], scores[keep]
-        both = (source, target), (target, source), (poses, se2.inverse(poses)), (scores, scores)
-        return cls(*(np.concatenate(x) for x in both))
+    def of(cls, candidates: Candidates, least_score: float = -np.inf) -> Hypotheses:
+        """Makes hypotheses of all candidates with a score above `least_score`."""
+        row, column = np.nonzero(candidates.scores > least_score)
+        poses, scores = candidates.poses[row, column], candidates.scores[row, column]
+        return cls(candidates.source[row], candidates.target[row], poses, scores)
 
-    def take(self, rows: NDArray[np.integer]) -> Hypotheses:
-        """Returns the hypotheses of these rows."""
+    @classmethod
+    def joined(cls, *hypotheses: Hypotheses) -> Hypotheses:
+        """Joins lists of hypotheses into one list."""
+        return cls(*(np.concatenate(parts) for parts in zip(*hypotheses, strict=True)))
+
+    def in_both_directions(self) -> Hypotheses:
+        """Returns each hypothesis, then each with its scans exchanged."""
+        return self.joined(self, Hypotheses(self.target, self.source, se2.inverse(self.poses), self.scores))
+
+    def take(self, rows: NDArray[Any]) -> Hypotheses:
+        """Returns the hypotheses of these rows, or those where a mask is True."""
         return Hypotheses(*(x[rows] for x in self))
 
     def world_poses(self, poses: Floats) -> Floats:
-        """Computes the world pose (h, 3) of each scan from the world pose of its anchor."""
-        return np.asarray(se2.compose(poses[self.anchor], self.poses))
+        """Computes the world pose (h, 3) of each source from the world pose of its target."""
+        return np.asarray(se2.compose(poses[self.target], self.poses))
 
 
 @partial(jax.jit, static_argnames="config")
@@ -209,7 +214,7 @@ def search_pairs(
     profiles: RangeProfiles,
     source: Indices,
     target: Indices,
-    config: CorrelativeConfig | None = None,
+    config: CorrelativeConfig,
     *,
     turns: NDArray[np.bool_] | None = None,
 ) -> Candidates:
@@ -225,9 +230,8 @@ def search_pairs(
     Returns:
         Candidates.
     """
-    config, found = config or CorrelativeConfig(), []
     # Pairs with one source lie side by side, so that few scans are turned for a batch.
-    order = np.lexsort((target, source))
+    order, found = np.lexsort((target, source)), []
     for start in range(0, max(len(order), 1), _SEARCH_BATCH):
         rows = order[start : start + _SEARCH_BATCH]
         tried = None if turns is None else turns[rows]
@@ -255,7 +259,7 @@ def _search_batch(
             continue
         turn = 2 * np.pi * number / config.num_turns
         turned = _spectra(sources, jnp.asarray(turn, jnp.float32), cell_side, config=config)
-        filled = np.resize(rows, max(_SMALLEST, 1 << (len(rows) - 1).bit_length()))
+        filled = np.resize(rows, rounded_up(len(rows), _SMALLEST, _SEARCH_BATCH))
         score, shift = _search_turn(turned, still, (compact_source[filled], compact_target[filled]), config=config)
         scores[rows, number] = score[: len(rows)]
         poses[rows, number, :, :2] = cell * np.asarray(shift, np.float64)[: len(rows)]
@@ -268,10 +272,7 @@ def _search_batch(
 def _used_profiles(profiles: RangeProfiles, rows: Indices) -> tuple[RangeProfiles, Indices]:
     """Returns the distinct profiles of these rows, padded so that few shapes compile, and the index of each row."""
     used, compact = np.unique(rows, return_inverse=True)
-    filled = (
-        1 << max(len(used) - 1, 0).bit_length() if len(used) < _SMALLEST else _SMALLEST * -(-len(used) // _SMALLEST)
-    )
-    return profiles.take(np.resize(used, filled)), compact
+    return profiles.take(np.resize(used, rounded_up(len(used), 1, _SMALLEST))), compact
 
 
 def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
@@ -282,9 +283,7 @@ def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: flo
     for k in range(config.num_candidates):
         first = scores.argmax(axis=1)
         best[:, k], values[:, k] = poses[rows, first], scores[rows, first]
-        off = poses - best[:, k][:, None]
-        is_near = np.hypot(off[..., 0], off[..., 1]) < APART * typical_range
-        scores[is_near & (np.abs(se2.wrap_angle(off[..., 2])) < APART)] = -np.inf
+        scores[se2.is_within(poses - best[:, k][:, None], APART * typical_range, APART)] = -np.inf
     return found._replace(poses=best, scores=values)
 
 

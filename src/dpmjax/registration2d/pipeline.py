@@ -211,9 +211,8 @@ def register_scans(
         found |= _refined_candidates(lines, found, evidence, hooks)
     hooks.report(_CHOICE, "choice and assessment")
     kept, scores, assessment = _choose(lines, found, evidence)
-    has_other = isinstance(start, str) and start == "auto" and config.refine and odometry_poses is not None
-    has_other = has_other and not (evidence is not None and evidence.is_mirrored)
-    if has_other and not assessment.is_trusted and not hooks.stop():
+    is_doubtful = evidence is not None and not evidence.is_mirrored and not assessment.is_trusted
+    if is_doubtful and isinstance(start, str) and start == "auto" and config.refine and not hooks.stop():
         retrial = "the map from odometry cannot be trusted: registration without it"
         hooks.report(_RETRIAL, retrial)
         name = START_NAMES["icp-plane"]
@@ -234,14 +233,12 @@ def _choose(
     scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None
 ) -> tuple[str, dict[str, Score], Assessment]:
     """Returns the name of the best candidate, the scores of all, and the assessment of the best."""
-    if evidence is None:
-        kept, scores = choose_trajectory(scans, candidates)
-        return kept, scores, assess_trajectory(scans, candidates[kept])
-    kept, scores = choose_trajectory(scans, candidates, prior=evidence.prior)
+    prior = None if evidence is None else evidence.prior
     # Units are corrected; in a mirrored log either the scans or the odometry may be wrong.
-    fault = evidence.fault if evidence.is_mirrored else None
-    assessment = assess_trajectory(scans, candidates[kept], prior=evidence.prior, fault=fault)
-    return kept, scores, assessment._replace(fault=evidence.fault)
+    fault = evidence.fault if evidence is not None and evidence.is_mirrored else None
+    kept, scores = choose_trajectory(scans, candidates, prior=prior)
+    assessment = assess_trajectory(scans, candidates[kept], prior=prior, fault=fault)
+    return kept, scores, assessment if evidence is None else assessment._replace(fault=evidence.fault)
 
 
 def _find_evidence(
@@ -302,14 +299,12 @@ def _start_poses(
     name = START_NAMES[start]
     hooks.report(_START, f"start: {name}")
     match start:
-        case "zero":
-            return name, np.zeros((len(scans), 3))
         case "global":
             return name, register_globally(scans).poses
         case "icp-plane" | "icp-point":
             return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
-    assert evidence is not None
-    return name, evidence.poses
+    # Zero poses, and one scan alone, have no odometry.
+    return name, np.zeros((len(scans), 3)) if evidence is None else evidence.poses
 
 
 def fit_in_order(

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
+from dpmjax.checks import as_mask
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.sequences import has_angular_order
 from dpmjax.types import AnyArray, ScanSet
@@ -132,9 +133,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     values = np.asarray(points, np.float32)
     if values.ndim != 3 or values.shape[2] != 2 or len(values) < 1 or values.shape[1] < 3:
         raise ValueError(f"points: expected shape (n, b, 2) with at least one scan and three beams, got {values.shape}")
-    valid = np.ones(values.shape[:2], bool) if mask is None else np.asarray(mask)
-    if valid.dtype != bool or valid.shape != values.shape[:2]:
-        raise ValueError(f"mask: expected bool of shape {values.shape[:2]}, got {valid.dtype} of {valid.shape}")
+    valid = as_mask("mask", mask, values.shape[:2], np)
     if not valid.any():
         raise ValueError("mask: expected at least one valid beam, got none")
     if not np.isfinite(values[valid]).all():
@@ -166,6 +165,27 @@ def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
     for start in range(0, count, size):
         stop = min(start + size, count)
         yield slice(start, stop), np.resize(np.arange(start, stop), size)
+
+
+def rounded_up(count: int, least: int, largest: int) -> int:
+    """Rounds a number of rows up so that few shapes compile.
+
+    Args:
+        count: number of rows.
+        least: least result, a power of two.
+        largest: largest power of two; beyond it, the result is a multiple of it.
+
+    Returns:
+        The padded number.
+    """
+    if count > largest:
+        return largest * -(-count // largest)
+    return max(least, 1 << max(count - 1, 0).bit_length())
+
+
+def spread_evenly(num_scans: int, count: int) -> Indices:
+    """Returns up to `count` evenly spaced rows, the first and the last among them."""
+    return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
 
 
 def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:

@@ -1,7 +1,8 @@
 """Range profiles: range as a function of the bearing, and hits of one scan that match or contradict another scan.
 
 A profile has, for each bearing, the range and the slant of the surface, and the free space in front of it. A hit of
-another scan lies on that surface (a match), in that free space (a contradiction), or in an unobserved region.
+another scan lies on that surface (a match), in that free space (a contradiction), or in an unobserved region. The score
+of two scans is the agreement of their visible beams.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, Tolerances, batches
@@ -30,6 +32,12 @@ _MAX_AVERTED = 0.1
 _ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
 # Bearings of a profile.
 _NUM_BEARINGS = 512
+# Number of matched beams that outweigh a contradicting one; share of visible beams that noise makes contradictory.
+_CONTRADICTION_WEIGHT, _NOISY_SHARE = 2.5, 0.02
+# Regularisation of the score where few beams are visible, as a share of all beams.
+LEAST_VISIBLE = 0.3
+# A step with a lower score is weak.
+WEAK_SCORE = 0.25
 # Pairs that are compared at a time, all batches of one shape; many calls have only a few hundred.
 _BATCH = 256
 
@@ -217,3 +225,36 @@ def contradicted_share(profiles: RangeProfiles, source: Indices, target: Indices
     """Computes the share (p,) of the visible beams of two scans that contradict each other, of at least 20 beams."""
     views = compare_pairs(profiles, source, target, poses, stride=1)
     return np.asarray(views.contradicted, np.float64) / np.maximum(np.asarray(views.visible, np.float64), 20.0)
+
+
+def find_evidence(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> tuple[Floats, Floats]:
+    """Compares pairs of scans at T_target_source (p, 3).
+
+    Args:
+        profiles: n scans.
+        source: (p,) rows.
+        target: (p,) rows.
+        poses: (p, 3) T_target_source.
+
+    Returns:
+        Agreement (p,), which is matched less weighted contradicting beams, and beams (p,) that end in the visible
+        region of their partner scan; shares of all beams of both scans.
+    """
+    views = compare_pairs(profiles, source, target, poses, stride=4)
+    contradicted = np.maximum(views.contradicted - _NOISY_SHARE * views.visible, 0.0)
+    num_beams = np.asarray(profiles.scans.mask.sum(1), np.float64)
+    beams = np.maximum(num_beams[source] + num_beams[target], 1.0)
+    agreement = np.asarray(views.matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
+    return agreement / beams, np.asarray(views.visible, np.float64) / beams
+
+
+def pair_scores(profiles: RangeProfiles, source: Indices, target: Indices, poses: Floats) -> Floats:
+    """Computes the scores (p,) of pairs at T_target_source, at most 1: the agreement of the visible beams."""
+    agreement, visible = find_evidence(profiles, source, target, poses)
+    return agreement / (visible + LEAST_VISIBLE)
+
+
+def weak_steps(profiles: RangeProfiles, poses: Floats, rows: Indices) -> NDArray[np.bool_]:
+    """Returns True for each of the k - 1 steps whose scan-match score is below `WEAK_SCORE`."""
+    before, after = rows[:-1], rows[1:]
+    return pair_scores(profiles, after, before, se2.relative(poses[before], poses[after])) < WEAK_SCORE

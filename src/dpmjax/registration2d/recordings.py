@@ -32,6 +32,8 @@ _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 _STANDING = 0.02
 # Scans that are aligned at a time.
 _BLOCK = 1024
+# Range noise, in typical ranges, above which no two scans are equal.
+_LEAST_NOISE = 1.5e-4
 
 
 class Recording(NamedTuple):
@@ -52,20 +54,19 @@ class Recording(NamedTuple):
 
     def between(self, poses: Floats) -> Floats:
         """Returns poses of all scans from those of the registered scans and the motion between them."""
-        rows = np.unique(self.originals)
+        rows, copies = np.unique(self.originals, return_inverse=True)
         if self.motion is not None:
             poses = fill_between(np.searchsorted(rows, self.chosen), poses, self.motion[rows])
-        return poses[np.searchsorted(rows, self.originals)]
+        return poses[copies]
 
     def aligned(self, poses: Floats) -> Floats:
         """Returns poses of all scans, each scan aligned with the nearest registered one."""
         poses = self.between(poses)
         if self.motion is None:
             return poses
-        rows = np.unique(self.originals)
+        rows, copies = np.unique(self.originals, return_inverse=True)
         scans = planar_scans(take_scans(self.scans, rows))
-        aligned = align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])
-        return aligned[np.searchsorted(rows, self.originals)]
+        return align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])[copies]
 
 
 def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
@@ -166,12 +167,21 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     # In the frame of the chosen scan before: the next chosen scan by odometry, and the error of odometry there.
     T_before_after = se2.relative(odometry[start], odometry[end])
     error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
-    part = _exp(_share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64))
+    part = _share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64)
+    part = se2.from_matrix(np.asarray(se2.exp(part), np.float64))
     correction = se2.compose(se2.compose(T_before_after, part), se2.inverse(T_before_after))
     T_before_scan = se2.compose(correction, se2.relative(odometry[start], odometry))
     filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)
     filled[chosen] = poses
     return filled
+
+
+def interpolate(num_scans: int, rows: Indices, poses: Floats) -> Floats:
+    """Interpolates poses of all scans from those (k, 3) of `rows` (k,); both ends of the sequence are constant."""
+    at_start, at_end = rows[:1] * 0, rows[-1:] * 0 + num_scans - 1
+    chosen, first = np.unique(np.concatenate([rows, at_start, at_end]), return_index=True)
+    known = np.concatenate([poses, poses[:1], poses[-1:]])[first]
+    return fill_between(chosen, known, np.zeros((num_scans, 3)))
 
 
 def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, "n 3"]) -> Floats:
@@ -235,5 +245,8 @@ def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
     return np.asarray((way - way[start]) / np.maximum(way[end] - way[start], 1e-9), np.float64)
 
 
-def _exp(tangent: Floats) -> Floats:
-    return np.asarray(se2.from_matrix(np.asarray(se2.exp(tangent), np.float64)), np.float64)
+def distinct_rows(scans: PlanarScans) -> Indices:
+    """Returns rows of the scans that differ from the scan before; all rows for scans without noise."""
+    is_new = np.asarray((np.abs(np.diff(np.asarray(scans.points), axis=0)) > 0).any(axis=(1, 2)))
+    is_new = is_new | (scans.noise < _LEAST_NOISE * scans.typical_range)
+    return np.flatnonzero(np.append(True, is_new))

@@ -14,18 +14,17 @@ from numpy.typing import ArrayLike
 
 from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
-from dpmjax.registration2d.held_steps import matched_steps, settle_steps
 from dpmjax.registration2d.incremental import incremental_icp
-from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, align_all, restore_open
+from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, align_all, restore_open, restore_torn
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
+from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
+from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_scores import fitting_scans, interpolate, pair_scores
-from dpmjax.registration2d.torn_steps import restore_torn
+from dpmjax.registration2d.step_slides import matched_steps, settle_steps
 from dpmjax.types import ScanSet
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
@@ -103,18 +102,18 @@ def refine(
     fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
-        # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
-        chained, steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range))
-        rows = np.flatnonzero(fitting_scans(scans, chained))
+        rows = distinct_rows(scans)
         if len(rows) < len(scans):
             some = scans.take(rows).replace(is_ordered=True)
             fitting = refine(some, start[rows], config, prior=prior.through(rows), on_progress=on_progress)
             whole = interpolate(len(scans), rows, fitting.poses)
             return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
+        # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
+        steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range)).steps
         on_progress(_STEPS_SHARE)
         settled, slides = settle_steps(scans, steps, prior)
-        matched = matched_steps(settled, slides, scans.typical_range)
-        candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), config.loops, steps=matched)
+        edges = matched_steps(settled, slides)
+        candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), config.loops, steps=edges)
         num_loops["loops"] = int((weights > 0.25).sum())
         fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
     aligned: dict[str, Floats] = {}

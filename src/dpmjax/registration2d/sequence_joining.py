@@ -11,14 +11,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.pair_search import CorrelativeConfig, search_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
-from dpmjax.registration2d.step_scores import MotionPrior, pair_scores, weak_steps
-from dpmjax.registration2d.submaps import along_way, submap_scans
+from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, search_pairs
+from dpmjax.registration2d.planar_scans import Floats, Indices, planar_scans, spread_evenly
+from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores, weak_steps
+from dpmjax.registration2d.step_prior import MotionPrior
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Length of the submaps on either side of a weak step along the trajectory, typical ranges, so that both may see the end
@@ -39,6 +39,8 @@ _OWN_WEIGHT, _LEAST_GAIN = 4.0, 0.4
 # Smaller corrections are left to the loop closure: typical ranges, radians.
 _LEAST_MOVE = (0.25, 0.25)
 _NUM_ROUNDS = 2
+# Number of beams of a submap, and largest number of its scans, spread evenly along the trajectory.
+_NUM_BEAMS, _NUM_MEMBERS = 360, 12
 
 
 class _Sequence(NamedTuple):
@@ -57,15 +59,6 @@ class _Submaps(NamedTuple):
     centres: Indices
     parts: Indices
     ways: Floats
-
-
-class _Votes(NamedTuple):
-    """Pairs of submaps (v,): later one, earlier one, T_earlier_later (v, 3), score."""
-
-    later: Indices
-    earlier: Indices
-    poses: Floats
-    scores: Floats
 
 
 def join_parts(
@@ -103,13 +96,10 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
     ends = np.concatenate([[-1], steps, [len(rows) - 1]])
     sides = []
     for number, step in enumerate(steps):
-        head, tail = rows[ends[number] + 1 : step + 1], rows[step + 1 : ends[number + 2] + 1]
-        sides += [along_way(poses, side, _SIDE_LENGTH * unit) for side in (head[::-1], tail)]
+        before, after = rows[ends[number] + 1 : step + 1], rows[step + 1 : ends[number + 2] + 1]
+        sides += [side[se2.path_lengths(poses[side]) <= _SIDE_LENGTH * unit] for side in (before[::-1], after)]
     centres = np.array([side[0] for side in sides])
-    profiles, target = (
-        make_profiles(submap_scans(sequence.profiles.scans, poses, centres, sides)),
-        2 * np.arange(len(steps)),
-    )
+    profiles, target = _submap_profiles(sequence, centres, sides), 2 * np.arange(len(steps))
     config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
     turns = np.abs(se2.wrap_angle(2 * np.pi * np.arange(config.num_turns) / config.num_turns)) < _MAX_TURN
     found = search_pairs(profiles, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
@@ -134,7 +124,7 @@ def _move_behind(sequence: _Sequence, step: int, way: Floats) -> None:
 def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
     """Makes submaps about a typical range apart, none across a weak step."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
-    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[rows, :2], axis=0).T)))
+    way = se2.path_lengths(poses[rows])
     spacing = max(unit, way[-1] / _MAX_SUBMAPS)
     middles, members = [], []
     for number in range(part[-1] + 1):
@@ -144,12 +134,42 @@ def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
             middles.append(own[np.abs(way[own] - place).argmin()])
             members.append(rows[own[np.abs(way[own] - way[middles[-1]]) < unit]])
     middle = np.array(middles)
-    profiles = make_profiles(submap_scans(sequence.profiles.scans, poses, rows[middle], members))
+    profiles = _submap_profiles(sequence, rows[middle], members)
     return _Submaps(profiles, rows[middle], part[middle], way[middle])
 
 
-def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfig) -> _Votes:
-    """Finds relative poses of submaps of different parts that may overlap."""
+def _submap_profiles(sequence: _Sequence, centres: Indices, members: list[Indices]) -> RangeProfiles:
+    """Makes a scan with a full field of view of each submap, and its profile.
+
+    A scan of a limited field of view shares few beams with the scan before where the robot turns or passes a door.
+    Merged scans on either side share more. Of each submap, the nearest hit at each bearing of the centre is kept.
+
+    Args:
+        sequence: its poses are correct within a submap.
+        centres: (s,) rows of the scans whose frames are those of the submaps.
+        members: rows of the scans of each submap, s arrays.
+
+    Returns:
+        Profiles of s scans in no order, with the noise and the typical range of the scans.
+    """
+    scans, poses = sequence.profiles.scans, sequence.poses
+    points, mask = np.zeros((len(centres), _NUM_BEAMS, 2), np.float32), np.zeros((len(centres), _NUM_BEAMS), bool)
+    hits, valid = np.asarray(scans.points, np.float64), np.asarray(scans.mask)
+    for row, (centre, rows) in enumerate(zip(centres, members, strict=True)):
+        used = rows[spread_evenly(len(rows), _NUM_MEMBERS)]
+        seen = se2.transform_points(se2.relative(poses[centre], poses[used]), hits[used])[valid[used]]
+        bearing = np.arctan2(seen[:, 1], seen[:, 0]) % (2 * np.pi)
+        beam = np.minimum((bearing * _NUM_BEAMS / (2 * np.pi)).astype(np.int64), _NUM_BEAMS - 1)
+        order = np.lexsort((np.hypot(seen[:, 0], seen[:, 1]), beam))
+        beams, first = np.unique(beam[order], return_index=True)
+        points[row, beams], mask[row, beams] = seen[order[first]], True
+    made = planar_scans(points, mask, is_ordered=False)
+    ones = jnp.ones(len(centres))
+    return make_profiles(made.replace(noises=scans.noise * ones, typical_ranges=scans.typical_range * ones))
+
+
+def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfig) -> Hypotheses:
+    """Finds relative poses of submaps of different parts that may overlap: the votes."""
     unit, poses = sequence.profiles.scans.typical_range, sequence.poses[submaps.centres]
     later, earlier = np.tril_indices(len(poses), k=-1)
     way, crossed = submaps.ways[later] - submaps.ways[earlier], submaps.parts[later] - submaps.parts[earlier]
@@ -158,28 +178,26 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
     keep &= (crossed > 0) & ((way > _LEAST_WAY * unit) | (crossed > 1))
     later, earlier = later[keep], earlier[keep]
     if not len(later):
-        return _Votes(later, earlier, np.zeros((0, 3)), np.zeros(0))
+        return Hypotheses(later, earlier, np.zeros((0, 3)), np.zeros(0))
     turns = WallDirections(submaps.profiles.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
     found = search_pairs(submaps.profiles, later, earlier, replace(config, num_candidates=4), turns=turns)
-    row, column = np.nonzero(np.isfinite(found.scores))
-    later, earlier, ways = later[row], earlier[row], found.poses[row, column]
-    scores = pair_scores(submaps.profiles, later, earlier, ways)
-    is_vote = scores > _LEAST_VOTE
-    return _Votes(later[is_vote], earlier[is_vote], ways[is_vote], scores[is_vote])
+    votes = Hypotheses.of(found)
+    votes = votes._replace(scores=pair_scores(submaps.profiles, votes.source, votes.target, votes.poses))
+    return votes.take(votes.scores > _LEAST_VOTE)
 
 
-def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: _Votes, step: int) -> None:
+def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: Hypotheses, step: int) -> None:
     """Corrects a weak step to the relative pose that most loops across it agree on."""
     poses, unit, prior = sequence.poses, sequence.profiles.scans.typical_range, sequence.prior
     before, after = sequence.rows[step], sequence.rows[step + 1]
     here, gap = se2.relative(poses[before], poses[after]), int(after - before)
-    across = (submaps.centres[votes.later] >= after) & (submaps.centres[votes.earlier] <= before)
-    later, earlier = submaps.centres[votes.later[across]], submaps.centres[votes.earlier[across]]
-    motion = se2.compose(se2.compose(poses[earlier], votes.poses[across]), se2.inverse(poses[later]))
+    votes = votes._replace(source=submaps.centres[votes.source], target=submaps.centres[votes.target])
+    votes = votes.take((votes.source >= after) & (votes.target <= before))
+    motion = se2.compose(votes.world_poses(poses), se2.inverse(poses[votes.source]))
     ways = se2.relative(poses[before], se2.compose(motion, poses[after]))
     is_near = np.hypot(ways[:, 0], ways[:, 1]) < _WEAK_STEP * unit
     ways = np.concatenate([here[None], ways[is_near]])
-    weight = np.append(0.0, votes.scores[across][is_near])
+    weight = np.append(0.0, votes.scores[is_near])
     off = se2.relative(ways[:, None], ways[None])
     distance = np.hypot(off[..., 0], off[..., 1]) / (_AGREEMENT[0] * unit)
     total = np.exp(-0.5 * (distance**2 + (off[..., 2] / _AGREEMENT[1]) ** 2)) @ weight
@@ -187,6 +205,6 @@ def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: _Votes, step: i
     own = pair_scores(sequence.profiles, np.array([after]), np.array([before]), here[None])
     total[0] += _OWN_WEIGHT * max(0.0, float(own[0]))
     best = int(total.argmax())
-    is_far = np.hypot(off[0, best, 0], off[0, best, 1]) > _LEAST_MOVE[0] * unit or abs(off[0, best, 2]) > _LEAST_MOVE[1]
+    is_far = not se2.is_within(off[0, best], _LEAST_MOVE[0] * unit, _LEAST_MOVE[1])
     if is_far and total[best] > total[0] + _LEAST_GAIN:
         _move_behind(sequence, step, ways[best])

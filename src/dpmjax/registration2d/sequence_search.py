@@ -17,20 +17,21 @@ from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
-from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, refine_candidates, search_pairs
+from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles, contradicted_share, make_profiles
-from dpmjax.registration2d.sequence_joining import join_parts
-from dpmjax.registration2d.step_scores import (
+from dpmjax.registration2d.range_profiles import (
     LEAST_VISIBLE,
     WEAK_SCORE,
-    MotionPrior,
-    distinct_rows,
+    RangeProfiles,
+    contradicted_share,
     find_evidence,
-    interpolate,
+    make_profiles,
     pair_scores,
     weak_steps,
 )
+from dpmjax.registration2d.recordings import distinct_rows, interpolate
+from dpmjax.registration2d.sequence_joining import join_parts
+from dpmjax.registration2d.step_prior import MotionPrior
 
 # Turns of a step that are searched, radians for each scan that it spans.
 _MAX_TURN = 1.7
@@ -60,28 +61,7 @@ _PRIOR_WEIGHT = 0.1
 _NUM_ARCS = 3
 
 
-class SequenceResult(NamedTuple):
-    """Result of `search_sequence`.
-
-    Attributes:
-        poses: (n, 3) T_world_scan, the first one zero; of unregistered scans an interpolation.
-        is_registered: (n,) False for scans that fit none of the scans around them.
-    """
-
-    poses: Floats
-    is_registered: NDArray[np.bool_]
-
-
-class StepHypotheses(NamedTuple):
-    """Relative poses of pairs: (h,) rows, (h, 3) T_target_source, (h,) scores of the pair alone."""
-
-    source: Indices
-    target: Indices
-    poses: Floats
-    scores: Floats
-
-
-def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
+def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
     """Finds the poses of scans in time order.
 
     Args:
@@ -89,7 +69,7 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
         steps: the n - 1 steps T_scan_next that an ICP has found.
 
     Returns:
-        SequenceResult.
+        (n, 3) T_world_scan, the first one zero; an interpolation for scans that fit none of the scans around them.
     """
     rows = distinct_rows(scans)
     some, profiles = scans.take(rows), make_profiles(scans.take(rows))
@@ -98,13 +78,11 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> SequenceResult:
     hypotheses = _find_hypotheses(some, profiles, matched)
     is_clear = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
     prior = MotionPrior.of(hypotheses.poses[is_clear], scans.typical_range)
-    found = _Beam(profiles, hypotheses, prior).run()
-    kept = np.flatnonzero(found.is_registered)
-    kept = kept[~_is_alone(weak_steps(profiles, found.poses, kept))]
-    poses = join_parts(profiles, found.poses, kept, prior, _SEARCH)
-    is_registered = np.zeros(len(scans), bool)
-    is_registered[rows[kept]] = True
-    return SequenceResult(interpolate(len(scans), rows[kept], poses[kept]), is_registered)
+    poses, is_registered = _Beam(profiles, hypotheses, prior).run()
+    kept = np.flatnonzero(is_registered)
+    kept = kept[~_is_alone(weak_steps(profiles, poses, kept))]
+    poses = join_parts(profiles, poses, kept, prior, _SEARCH)
+    return interpolate(len(scans), rows[kept], poses[kept])
 
 
 def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -113,7 +91,7 @@ def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
 
 
-def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches) -> StepHypotheses:
+def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches) -> Hypotheses:
     """Returns the steps, and candidates of a search for steps that are not clear."""
     num_scans = len(scans)
     later = np.arange(1, num_scans)
@@ -123,7 +101,7 @@ def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMat
     is_clear = (best > _CLEAR_SCORE) & (steps.fitness > _CLEAR_FITNESS)
     is_clear &= contradicted_share(profiles, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
     is_clear &= steps.weakest_eigenvalue() > _CLEAR_EIGENVALUE * num_beams
-    found = [StepHypotheses(later, later - 1, steps.poses, scores)]
+    found = [Hypotheses(later, later - 1, steps.poses, scores)]
     usual = MotionPrior.of(steps.poses[is_clear], scans.typical_range)
     found.append(align_arcs(scans, profiles, later[~is_clear & (scores < _CLEAR_SCORE)], usual))
     open_steps, searched = later[~is_clear], set[tuple[int, int]]()
@@ -144,28 +122,24 @@ def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMat
         for source, target, score in zip(found[-1].source, found[-1].target, found[-1].scores, strict=True):
             across = slice(target, source)
             best[across] = np.maximum(best[across], score)
-    source, target = (np.concatenate([getattr(x, name) for x in found]) for name in ("source", "target"))
-    poses, scores = (np.concatenate([getattr(x, name) for x in found]) for name in ("poses", "scores"))
-    order = np.lexsort((-scores, source))
-    return StepHypotheses(source[order], target[order], poses[order], scores[order])
+    joined = Hypotheses.joined(*found)
+    return joined.take(np.lexsort((-joined.scores, joined.source)))
 
 
-def _search(scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64]) -> StepHypotheses:
+def _search(scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64]) -> Hypotheses:
     """Finds candidates of pairs (p, 2), each aligned by ICP where the score does not fall."""
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(_SEARCH.num_turns) / _SEARCH.num_turns)
     turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
-    found = search_pairs(profiles, source, target, _SEARCH, turns=turns)
-    row, column = np.nonzero(np.isfinite(found.scores))
-    source, target, poses = source[row], target[row], found.poses[row, column]
+    source, target, poses, _ = Hypotheses.of(search_pairs(profiles, source, target, _SEARCH, turns=turns))
     aligned = match_pairs(scans.take(source), scans.take(target), poses[:, None], FINE).poses
     before, after = (pair_scores(profiles, source, target, x) for x in (poses, aligned))
     is_better = after > before - 0.02
     poses = np.where(is_better[:, None], aligned, poses)
-    return StepHypotheses(source, target, poses, np.where(is_better, after, before))
+    return Hypotheses(source, target, poses, np.where(is_better, after, before))
 
 
-def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usual: MotionPrior) -> StepHypotheses:
+def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usual: MotionPrior) -> Hypotheses:
     """Aligns steps from the arcs of the usual motion.
 
     Args:
@@ -188,28 +162,24 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     for _ in range(_NUM_ARCS):
         best = values.argmax(axis=1)
         kept.append(rows * len(arcs) + best)
-        apart = np.abs(off - off[rows, best][:, None])
-        is_same = np.hypot(apart[..., 0], apart[..., 1]) < _SAME_SHAPE[0] * scans.typical_range
-        values = np.where(is_same & (np.abs(se2.wrap_angle(apart[..., 2])) < _SAME_SHAPE[1]), -np.inf, values)
-    chosen = np.concatenate(kept)
-    source, poses, scores = source[chosen], poses[chosen], scores[chosen]
+        is_same = se2.is_within(off - off[rows, best][:, None], _SAME_SHAPE[0] * scans.typical_range, _SAME_SHAPE[1])
+        values = np.where(is_same, -np.inf, values)
+    found = Hypotheses(source, source - 1, poses, scores).take(np.concatenate(kept))
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
     # of two scans alone may lie beside the right pose, too: the last placed scans choose.
-    near = Candidates(source, source - 1, poses[:, None], scores[:, None])
+    near = Candidates(found.source, found.target, found.poses[:, None], found.scores[:, None])
     shifted = refine_candidates(profiles, near, _SEARCH).poses[:, 0]
-    after = pair_scores(profiles, source, source - 1, shifted)
-    is_better = after > scores
-    source = np.concatenate([source, source[is_better]])
-    poses, scores = np.concatenate([poses, shifted[is_better]]), np.concatenate([scores, after[is_better]])
-    return StepHypotheses(source, source - 1, poses, scores)
+    after = pair_scores(profiles, found.source, found.target, shifted)
+    is_better = after > found.scores
+    return Hypotheses.joined(found, found._replace(poses=shifted, scores=after).take(is_better))
 
 
 class _Sequences(NamedTuple):
-    """The s best sequences of poses up to some scan, the best first.
+    """The s best sequences of poses of the first m scans, the best first.
 
     Attributes:
-        poses: (s, w, 3) T_world_scan of the last w scans.
-        is_placed: (s, w) True for registered scans.
+        poses: (s, m, 3) T_world_scan.
+        is_placed: (s, m) True for registered scans.
         scores: (s,) totals.
     """
 
@@ -226,86 +196,55 @@ def _with_second_start(now: _Sequences) -> _Sequences:
     return _Sequences(np.concatenate([now.poses, poses]), np.concatenate([now.is_placed, is_placed]), scores)
 
 
-class _Ways(NamedTuple):
-    """Continuations by one scan: (m,) sequence, (m, 3) pose, (m,) score, (m,) True where the scan is registered."""
-
-    parent: Indices
-    poses: Floats
-    scores: Floats
-    is_placed: NDArray[np.bool_]
-
-
 class _Beam:
     """The beam search over the hypotheses of a sequence."""
 
-    def __init__(self, profiles: RangeProfiles, hypotheses: StepHypotheses, prior: MotionPrior) -> None:
+    def __init__(self, profiles: RangeProfiles, hypotheses: Hypotheses, prior: MotionPrior) -> None:
         self.profiles, self.hypotheses, self.prior = profiles, hypotheses, prior
-        self.unit, self.width = profiles.scans.typical_range, _NUM_COMPARED + _BAD_SPAN
+        self.unit = profiles.scans.typical_range
         self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
 
-    def run(self) -> SequenceResult:
-        """Runs the search over all scans and traces the best sequence back."""
-        num_scans = len(self.profiles)
-        poses, is_placed = np.zeros((1, self.width, 3)), np.zeros((1, self.width), bool)
-        is_placed[:, -1] = True
-        now = _Sequences(poses, is_placed, np.zeros(1))
-        history: list[tuple[Indices, Floats, NDArray[np.bool_]]] = []
-        for scan in range(1, num_scans):
-            now, parents = self.advance(now, scan)
+    def run(self) -> tuple[Floats, NDArray[np.bool_]]:
+        """Runs the search over all scans and returns the best sequence: poses (n, 3), and True for registered scans."""
+        now = _Sequences(np.zeros((1, 1, 3)), np.ones((1, 1), bool), np.zeros(1))
+        for scan in range(1, len(self.profiles)):
+            now = self.advance(now, scan)
             if scan == 1:
                 # The first scan may fit no other scan.
-                now, parents = _with_second_start(now), np.append(parents, 0)
-            history.append((parents, now.poses[:, -1], now.is_placed[:, -1]))
-        world, is_registered, which = np.zeros((num_scans, 3)), np.ones(num_scans, bool), 0
-        for scan in range(num_scans - 1, 0, -1):
-            parents, last, placed = history[scan - 1]
-            world[scan], is_registered[scan] = last[which], placed[which]
-            is_registered[0] = scan > 1 or which < len(parents) - 1
-            which = int(parents[which])
-        return SequenceResult(world, is_registered)
+                now = _with_second_start(now)
+        return now.poses[0], now.is_placed[0]
 
-    def advance(self, now: _Sequences, scan: int) -> tuple[_Sequences, Indices]:
-        """Returns the best sequences with one more scan, and the rows of the sequences that they continue."""
-        ways = self.extend(now, scan)
-        parent, pose, score, placed = ways
-        total = now.scores[parent] + score
-        order = np.argsort(-total, kind="stable")
+    def advance(self, now: _Sequences, scan: int) -> _Sequences:
+        """Returns the best sequences with one more scan."""
+        longer = self.extend(now, scan)
         chosen: list[int] = []
-        for row in order.tolist():
-            if len(chosen) == _NUM_SEQUENCES:
-                break
-            if not any(self.is_same(now, ways, row, other) for other in chosen):
+        for row in np.argsort(-longer.scores, kind="stable").tolist():
+            if len(chosen) < _NUM_SEQUENCES and not any(self.is_same(longer, row, other) for other in chosen):
                 chosen.append(row)
-        rows = np.array(chosen)
-        parents = parent[rows]
-        poses = np.concatenate([now.poses[parents, 1:], pose[rows, None]], axis=1)
-        is_placed = np.concatenate([now.is_placed[parents, 1:], placed[rows, None]], axis=1)
-        return _Sequences(poses, is_placed, total[rows] - total[rows[0]]), parents
+        scores = longer.scores[chosen]
+        return _Sequences(longer.poses[chosen], longer.is_placed[chosen], scores - scores[0])
 
-    def extend(self, now: _Sequences, scan: int) -> _Ways:
+    def extend(self, now: _Sequences, scan: int) -> _Sequences:
         """Returns all continuations by a scan: its hypotheses, and the scan left out."""
         own = slice(self.starts[scan], self.starts[scan + 1])
-        back = scan - self.hypotheses.target[own]
-        parent, which = np.nonzero(now.is_placed[:, self.width - back])
-        pose = np.asarray(se2.compose(now.poses[parent, self.width - back[which]], self.hypotheses.poses[own][which]))
+        target = self.hypotheses.target[own]
+        parent, which = np.nonzero(now.is_placed[:, target])
+        pose = np.asarray(se2.compose(now.poses[parent, target[which]], self.hypotheses.poses[own][which]))
         keep = self.distinct(parent, pose)
         parent, pose = parent[keep], pose[keep]
-        score = self.score(now, scan, parent, pose)
-        everyone = np.arange(len(now.scores))
-        last = now.poses[:, -1]
         lost = ~now.is_placed[:, -_BAD_SPAN:].any(axis=1)
-        return _Ways(
-            np.concatenate([parent, everyone]),
-            np.concatenate([pose, last]),
-            np.concatenate([score, np.where(lost, _GUESSED, _LEFT_OUT)]),
-            np.concatenate([np.ones(len(parent), bool), lost]),
+        score = np.append(self.score(now, scan, parent, pose), np.where(lost, _GUESSED, _LEFT_OUT))
+        is_placed, pose = np.append(np.ones(len(keep), bool), lost), np.concatenate([pose, now.poses[:, -1]])
+        parent = np.append(parent, np.arange(len(now.scores)))
+        return _Sequences(
+            np.concatenate([now.poses[parent], pose[:, None]], axis=1),
+            np.concatenate([now.is_placed[parent], is_placed[:, None]], axis=1),
+            now.scores[parent] + score,
         )
 
     def distinct(self, parent: Indices, pose: Floats) -> Indices:
         """Returns rows of the hypotheses that differ from all earlier ones of the same sequence."""
-        off = pose[:, None] - pose
-        near = np.hypot(off[..., 0], off[..., 1]) < _SAME[0] * self.unit
-        near &= (np.abs(se2.wrap_angle(off[..., 2])) < _SAME[1]) & (parent[:, None] == parent)
+        near = se2.is_within(pose[:, None] - pose, _SAME[0] * self.unit, _SAME[1]) & (parent[:, None] == parent)
         kept: list[int] = []
         for row in range(len(parent)):
             if not near[row, kept].any():
@@ -314,30 +253,27 @@ class _Beam:
 
     def score(self, now: _Sequences, scan: int, parent: Indices, pose: Floats) -> Floats:
         """Computes the agreement (m,) of a scan with the last placed scans, less the weighted motion prior."""
-        rank = np.cumsum(now.is_placed[:, ::-1], axis=1)[:, ::-1]
-        is_used = (now.is_placed & (rank <= _NUM_COMPARED))[parent]
-        placed = now.poses[parent]
+        first = max(0, scan - _NUM_COMPARED - _BAD_SPAN)
+        is_placed, placed = now.is_placed[:, first:], now.poses[parent, first:]
+        rank = np.cumsum(is_placed[:, ::-1], axis=1)[:, ::-1]
+        is_used = (is_placed & (rank <= _NUM_COMPARED))[parent]
         relative = np.asarray(se2.relative(placed, np.broadcast_to(pose[:, None], placed.shape)))
         row, column = np.nonzero(is_used)
-        pairs = np.full(len(row), scan), scan - self.width + column
+        pairs = np.full(len(row), scan), first + column
         evidence, visible = find_evidence(self.profiles, *pairs, relative[row, column])
         # The newest scan has the largest weight, so that overlap with older scans does not favour short motions.
         weight = 1.0 / rank[parent][row, column]
         total, seen = (np.bincount(row, weight * x, len(parent)) for x in (evidence, visible))
         agreement = total / (seen + LEAST_VISIBLE)
         newest = is_used.shape[1] - 1 - is_used[:, ::-1].argmax(axis=1)
-        step, gap = relative[np.arange(len(parent)), newest], self.width - newest
+        step, gap = relative[np.arange(len(parent)), newest], scan - first - newest
         return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
-    def is_same(self, now: _Sequences, ways: _Ways, row: int, other: int) -> bool:
-        """Returns True if two continuations agree in their last scans."""
-        rows = np.array([row, other])
-        parent = ways.parent[rows]
-        placed = np.concatenate([now.is_placed[parent, 1 - _NUM_SAME :], ways.is_placed[rows, None]], axis=1)
+    def is_same(self, sequences: _Sequences, row: int, other: int) -> bool:
+        """Returns True if two sequences agree in their last scans."""
+        placed = sequences.is_placed[[row, other], -_NUM_SAME:]
         if (placed[0] != placed[1]).any() or not placed[0].any():
             return bool((placed[0] == placed[1]).all())
-        poses = np.concatenate([now.poses[parent, 1 - _NUM_SAME :], ways.poses[rows, None]], axis=1)[:, placed[0]]
+        poses = sequences.poses[[row, other], -_NUM_SAME:][:, placed[0]]
         inside = se2.relative(poses[:, -1:], poses)
-        off = inside[0] - inside[1]
-        is_near = np.hypot(off[:, 0], off[:, 1]) < _SAME_SHAPE[0] * self.unit
-        return bool((is_near & (np.abs(se2.wrap_angle(off[:, 2])) < _SAME_SHAPE[1])).all())
+        return bool(se2.is_within(inside[0] - inside[1], _SAME_SHAPE[0] * self.unit, _SAME_SHAPE[1]).all())

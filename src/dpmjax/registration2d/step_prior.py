@@ -1,13 +1,14 @@
-"""Prior of the steps of a sequence, from odometry, from given poses, or from the usual motion."""
+"""Priors of the steps of a sequence, from odometry, given poses or the usual motion, and pose-graph edges from them."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior
 from dpmjax.registration2d.planar_scans import Floats, Indices
 
@@ -16,13 +17,14 @@ _USUAL_DEVIATION = (0.0225, 0.15)
 # Clear steps predict the translation of another step if the turns differ by less than this, in radians. Least number of
 # such steps; with fewer, all clear steps predict. Least deviation of such a prediction, typical ranges.
 _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_DEVIATION = 0.15, 5, 0.015
+# Scales of the motion prior: deviations backward, forward and sideways in usual steps; radians.
+_SHORT, _LONG, _SIDEWAYS, _TURN = 0.6, 1.5, 0.5, 0.8
+# Turns (radians) of the arcs that a robot may drive in a step, and their lengths in usual steps.
+_ARC_TURNS, _ARC_LENGTHS = np.radians(np.arange(-90.0, 91.0, 15.0)), (0.0, 0.5, 1.0, 1.5)
+# Accuracy of a fitted beam, typical ranges; and of a step without other information: typical ranges, radians.
+BEAM_DEVIATION, _STEP_DEVIATION = 0.03, (0.045, 0.15)
 # Degrees of freedom of Student's t for steps, heavy-tailed because wheels slip and logs have gaps.
 _FREEDOM = 3.0
-
-
-def step_cost(chi2: Any) -> Any:
-    """Returns the negative log-likelihood of a step under Student's t, from its squared Mahalanobis distance."""
-    return 0.5 * (_FREEDOM + 3.0) * np.log1p(chi2 / _FREEDOM)
 
 
 class StepPrior(NamedTuple):
@@ -49,7 +51,8 @@ class StepPrior(NamedTuple):
         off = steps - self.steps.reshape(shape)
         off[..., 2] = se2.wrap_angle(off[..., 2])
         chi2 = ((off / self.deviations.reshape(shape)) ** 2).sum(-1)
-        return np.asarray(step_cost(chi2), np.float64)
+        # The negative log-likelihood under Student's t.
+        return np.asarray(0.5 * (_FREEDOM + 3.0) * np.log1p(chi2 / _FREEDOM), np.float64)
 
     def loosened(self, typical_range: float) -> StepPrior:
         """Returns the prior with at least the usual deviations.
@@ -96,3 +99,56 @@ def usual_motion(matches: PairMatches, typical_range: float) -> StepPrior:
             spread = 1.4826 * np.median(np.abs(alike[:, :2] - steps[row, :2]), axis=0)
             deviations[row, :2] = spread + _LEAST_DEVIATION * typical_range
     return StepPrior(steps, deviations)
+
+
+class MotionPrior(NamedTuple):
+    """The usual motion from one scan to the next.
+
+    Attributes:
+        length: of a step, in the unit of the points.
+        forward: share of the length that is straight ahead, -1 to 1.
+    """
+
+    length: float
+    forward: float
+
+    @classmethod
+    def of(cls, steps: Floats, typical_range: float) -> MotionPrior:
+        """Estimates the prior from clear steps (k, 3); without any it expects no motion."""
+        if not len(steps):
+            return cls(0.05 * typical_range, 0.0)
+        length = max(float(np.median(np.hypot(steps[:, 0], steps[:, 1]))), 0.05 * typical_range)
+        return cls(length, float(np.median(steps[:, 0])) / length)
+
+    def expected(self, gap: int) -> Floats:
+        """Returns the usual motion (3,) over `gap` scans, without a turn."""
+        return np.array([self.forward * self.length * gap, 0.0, 0.0])
+
+    def arcs(self) -> Floats:
+        """Returns the steps (h, 3) along arcs of the usual lengths, for all turns up to a right angle."""
+        turn, length = (x.ravel() for x in np.meshgrid(_ARC_TURNS, np.array(_ARC_LENGTHS) * self.length))
+        # The chord of an arc is turned by half the turn; np.sinc(x) is sin(pi x) / (pi x).
+        chord = length * np.sinc(turn / (2 * np.pi)) * (1.0 if self.forward >= 0 else -1.0)
+        return np.stack([chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn], axis=1)
+
+    def surprise(self, steps: Floats, gap: Indices) -> Floats:
+        """Computes the heavy-tailed cost (m,) of motions (m, 3) over `gap` scans each."""
+        share, turn = steps[:, :2] / self.length, np.abs(se2.wrap_angle(steps[:, 2]))
+        # The expected forward motion decreases with the turn, because a robot may turn on the spot.
+        ahead = share[:, 0] / gap - self.forward * np.cos(np.minimum(turn, 0.5 * np.pi))
+        excess = np.where(ahead < 0, ahead / _SHORT, ahead / _LONG) ** 2
+        excess += (share[:, 1] / gap / _SIDEWAYS) ** 2 + (turn / (_TURN * gap**0.5)) ** 2
+        return np.asarray(np.log1p(excess), np.float64)
+
+
+def pose_steps(poses: Floats, typical_range: float) -> Edges:
+    """Returns edges between neighbours in time of these poses (n, 3), with little information."""
+    relative, later = se2.relative(poses[:-1], poses[1:]), np.arange(1, len(poses))
+    information = np.diag((np.array(_STEP_DEVIATION)[[0, 0, 1]] * [typical_range, typical_range, 1.0]) ** -2.0)
+    return Edges(later, later - 1, relative, np.broadcast_to(information, (len(later), 3, 3)))
+
+
+def prior_steps(prior: StepPrior) -> Edges:
+    """Returns edges between neighbours in time from a prior of n - 1 steps."""
+    later, variances = np.arange(1, len(prior.steps) + 1), prior.deviations**2
+    return Edges(later, later - 1, prior.steps, np.eye(3) / variances[:, None])

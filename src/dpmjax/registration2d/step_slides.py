@@ -3,21 +3,24 @@
 The weak direction is the direction of the least translation information of the walls. Two scans of a corridor fit at
 every shift along it, and a local alignment stops at the first of these. So the scores of a relative pose, called step,
 are computed at shifts far to either side. Scores and prior together give the posterior of the shift. The mode of this
-posterior is the most probable relative pose, and the spread is the uncertainty along the weak direction.
+posterior is the most probable relative pose, and the spread is the uncertainty along the weak direction. The edges of a
+pose graph have the relative pose of the scans where these constrain it, and the posterior along the weak direction.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import Edges
+from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PosePrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_scores import LEAST_VISIBLE, find_evidence
+from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence, make_profiles
+from dpmjax.registration2d.step_prior import BEAM_DEVIATION, StepPrior, pose_steps
 
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
@@ -30,6 +33,8 @@ _LEAST_SHIFT, _LEAST_GAIN = 0.03, 2.5
 # A step is open where its standard deviation along the weak direction, by the scores alone, is above this, in typical
 # ranges.
 _OPEN_DEVIATION = 0.02
+# Least standard deviation of a constrained step, typical ranges and radians.
+_LEAST_DEVIATION = 0.005
 
 
 class Slides(NamedTuple):
@@ -44,7 +49,7 @@ class Slides(NamedTuple):
         is_torn: (k,) True where the mode lies far from the given step and is clearly more probable.
         is_open: (k,) True where the scores alone do not constrain the shift.
         scores: (k,) score after the shift.
-        reach: the largest shift that is tried to either side, in the unit of the points.
+        typical_range: of the scans.
     """
 
     directions: Floats
@@ -53,7 +58,7 @@ class Slides(NamedTuple):
     is_torn: Bool[np.ndarray, " k"]
     is_open: Bool[np.ndarray, " k"]
     scores: Floats
-    reach: float
+    typical_range: float
 
     def moved(self, steps: Floats) -> Floats:
         """Returns the steps (k, 3) after their shifts."""
@@ -64,13 +69,22 @@ class Slides(NamedTuple):
 
         The information of a uniform posterior over the reach is subtracted, so flat scores give 0.
         """
-        flat = 3.0 / self.reach**2
+        flat = 3.0 / (_REACH * self.typical_range) ** 2
         return np.where(self.is_open, np.maximum(np.maximum(self.deviations, 1e-9) ** -2.0 - flat, 0.0), np.inf)
 
-    def axes(self, steps: Floats) -> Floats:
-        """Returns the weak directions as tangents (k, 3) in the frames of the sources of these steps (k, 3)."""
+    def constrained_deviations(self) -> Floats:
+        """Returns the standard deviations (k,), at least that of a constrained step."""
+        return np.maximum(self.deviations, _LEAST_DEVIATION * self.typical_range)
+
+    def open_directions(self, steps: Floats) -> Floats:
+        """Returns projections (k, 3, 3) of tangents, in the source frames of these steps, onto open directions."""
         turned = np.einsum("kji,kj->ki", se2.rotation(steps[:, 2]), self.directions)
-        return np.concatenate([turned, np.zeros((len(steps), 1))], axis=1)
+        axes = np.where(self.is_open[:, None], np.column_stack([turned, np.zeros(len(steps))]), 0.0)
+        return np.asarray(axes[:, :, None] * axes[:, None, :])
+
+    def open_information(self, steps: Floats) -> Floats:
+        """Returns the information (k, 3, 3) of the shifts along open directions, in the source frames."""
+        return self.open_directions(steps) / self.constrained_deviations()[:, None, None] ** 2
 
 
 def weak_directions(scans: PlanarScans) -> Float[np.ndarray, "n 2"]:
@@ -80,24 +94,26 @@ def weak_directions(scans: PlanarScans) -> Float[np.ndarray, "n 2"]:
 
 
 def slide_steps(
-    profiles: RangeProfiles, source: Indices, target: Indices, steps: Floats, prior: StepPrior | None = None
+    profiles: RangeProfiles,
+    steps: Floats,
+    prior: StepPrior | None = None,
+    *,
+    pairs: tuple[Indices, Indices] | None = None,
 ) -> Slides:
     """Computes the posterior of shifts of steps along the weak directions of their targets.
 
     Args:
         profiles: n scans.
-        source: (k,) rows of the scans that are shifted.
-        target: (k,) rows of the scans that the sources are compared with.
         steps: (k, 3) T_target_source.
         prior: of these steps; None: the scores alone.
+        pairs: (k,) rows of the sources, which are shifted, and of the targets, which they are compared with. None: the
+            steps are the n - 1 steps T_scan_next between neighbours in time.
 
     Returns:
         Slides.
     """
     unit, count = profiles.scans.typical_range, round(_REACH / _SPACING)
-    if not len(steps):
-        none = np.zeros(0, bool)
-        return Slides(np.zeros((0, 2)), np.zeros(0), np.zeros(0), none, none, np.zeros(0), _REACH * unit)
+    source, target = pairs or (np.arange(1, len(profiles)), np.arange(len(profiles) - 1))
     directions = weak_directions(profiles.scans)[target]
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
     places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
@@ -107,7 +123,7 @@ def slide_steps(
     # The number of visible beams must not favour short steps. Where all beams are visible, these scores equal
     # `pair_scores`.
     scores = agreement / (np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE))
-    scores = scores.reshape(len(steps), -1)
+    scores = scores.reshape(len(steps), len(shifts))
     shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
     is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
@@ -122,14 +138,15 @@ def slide_steps(
     deviations = deviations if prior is None else 2.0**0.5 * _spread(2.0 * nats, shifts)[1]
     shift = np.where(is_open, means, np.where(is_torn, shifts[best], 0.0))
     nearest = np.abs(shifts - shift[:, None]).argmin(axis=1)
-    return Slides(directions, shift, deviations, is_torn, is_open, scores[row, nearest], _REACH * unit)
+    return Slides(directions, shift, deviations, is_torn, is_open, scores[row, nearest], unit)
 
 
 def _interpolated(values: Floats) -> Floats:
     """Interpolates values (..., s) linearly between each two neighbours."""
     parts = np.arange(_FINER) / _FINER
     between = values[..., :-1, None] + parts * np.diff(values)[..., None]
-    return np.concatenate([between.reshape(*values.shape[:-1], -1), values[..., -1:]], axis=-1)
+    between = between.reshape(*values.shape[:-1], _FINER * (values.shape[-1] - 1))
+    return np.concatenate([between, values[..., -1:]], axis=-1)
 
 
 def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
@@ -138,3 +155,67 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
     probability /= probability.sum(axis=1, keepdims=True)
     means, best = probability @ shifts, shifts[nats.argmax(axis=1)]
     return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
+
+
+def matched_steps(matches: PairMatches, slides: Slides) -> Edges:
+    """Returns edges between neighbours in time from their matches.
+
+    Args:
+        matches: of the n - 1 steps.
+        slides: of the same steps.
+
+    Returns:
+        Edges. Along an unconstrained direction the variance is that of the shift. Elsewhere the information is at
+        least that of `pose_steps`.
+    """
+    loose = pose_steps(se2.chain(matches.poses), slides.typical_range)
+    fixed = matches.information / (BEAM_DEVIATION * slides.typical_range) ** 2
+    across = np.eye(3) - slides.open_directions(matches.poses)
+    information = across @ (fixed + loose.information) @ across + slides.open_information(matches.poses)
+    return loose._replace(information=information)
+
+
+def held_steps(slides: Slides, poses: Floats) -> Edges:
+    """Returns pose-graph edges for ambiguous relative poses (open or torn in `Slides`), at their most probable shifts.
+
+    Args:
+        slides: of the n - 1 steps of the poses.
+        poses: (n, 3) T_world_scan.
+
+    Returns:
+        Edges; a step that is open and not torn has information along its weak direction alone.
+    """
+    steps = pose_steps(poses, slides.typical_range)
+    firm = np.array([slides.typical_range, slides.typical_range, 1.0]) * _LEAST_DEVIATION
+    information = slides.open_information(steps.measurements)
+    across = np.eye(3) - slides.open_directions(steps.measurements)
+    information += np.where(slides.is_torn[:, None, None], across @ np.diag(firm**-2.0) @ across, 0.0)
+    rows = np.flatnonzero(slides.is_torn | slides.is_open)
+    held = steps._replace(measurements=slides.moved(steps.measurements), information=information)
+    return jax.tree.map(lambda x: x[rows], held)
+
+
+def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> tuple[PairMatches, Slides]:
+    """Shifts ambiguous relative poses along their weak direction to the posterior mode, and re-aligns these scans.
+
+    Args:
+        scans: n scans in time order.
+        matches: of the n - 1 steps.
+        prior: of the steps.
+
+    Returns:
+        The matches after the shift and alignment, and the Slides of these.
+    """
+    profiles = make_profiles(scans)
+    slides = slide_steps(profiles, matches.poses, prior)
+    rows = np.flatnonzero(slides.is_torn | slides.is_open)
+    if not len(rows):
+        return matches, slides
+    moved = slides.moved(matches.poses)[rows]
+    information = (3.0 * scans.noise / slides.constrained_deviations()[rows, None] * [1.0, 1.0, 0.0]) ** 2
+    source, target = scans.take(rows + 1), scans.take(rows)
+    found = match_pairs(source, target, moved[:, None], FINE, PosePrior(moved, information))
+    settled = PairMatches(*(x.copy() for x in matches))
+    for kept, new in zip(settled, found, strict=True):
+        kept[rows] = new
+    return settled, slide_steps(profiles, settled.poses, prior)

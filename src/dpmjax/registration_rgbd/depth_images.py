@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import as_mask
 from dpmjax.geometry import rigid
 
 # Largest relative difference of the inverse depths of four pixels on one surface.
@@ -82,9 +83,8 @@ def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthSca
     if cloud.ndim != 4 or cloud.shape[-1] != 3 or len(cloud) < 2:
         raise ValueError(f"points: expected shape (n, h, w, 3) with n >= 2, got {cloud.shape}")
     is_finite = np.isfinite(cloud).all(-1)
-    valid = is_finite & (np.abs(cloud).sum(-1) > 0) if mask is None else np.asarray(mask)
-    if valid.shape != cloud.shape[:3] or valid.dtype != bool:
-        raise ValueError(f"mask: expected bool of shape {cloud.shape[:3]}, got {valid.dtype} of {valid.shape}")
+    measured = is_finite & (np.abs(cloud).sum(-1) > 0)
+    valid = as_mask("mask", measured if mask is None else np.asarray(mask), cloud.shape[:3], np)
     if (valid & ~is_finite).any():
         raise ValueError("points: expected finite coordinates where the mask is True")
     if (cloud[valid][:, 2] <= 0.0).any():

@@ -167,10 +167,9 @@ def preprocess_scan_on_host(
     points = np.asarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
-    if mask is not None and (np.shape(mask) != points.shape[:1] or np.asarray(mask).dtype != bool):
-        raise ValueError(f"mask: expected bool of shape {points.shape[:1]}, got {np.shape(mask)}")
+    mask = as_mask("mask", mask, points.shape[:1], np)
     require_count("num_threads", num_threads)
-    is_kept = _is_within(points, config) if mask is None else _is_within(points, config) & mask
+    is_kept = _is_within(points, config) & mask
     _warn_if_out_of_range(points, mask, int(is_kept.sum()), config)
     kept = points.take(np.flatnonzero(is_kept), axis=0)  # four times faster than by the mask
     kept = kept[first_of_each_voxel(kept, config.voxel_size_m)]
@@ -193,11 +192,11 @@ def _is_within(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Bo
 
 
 def _warn_if_out_of_range(
-    points: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"] | None, num_in_range: int, config: PreprocessConfig
+    points: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_in_range: int, config: PreprocessConfig
 ) -> None:
     if num_in_range >= max(1, MIN_SHARE_IN_RANGE * len(points)):
         return
-    is_there = np.isfinite(points).all(axis=1) if mask is None else np.isfinite(points).all(axis=1) & mask
+    is_there = np.isfinite(points).all(axis=1) & mask
     if is_there.sum() >= MIN_COUNT_TO_WARN and num_in_range < MIN_SHARE_IN_RANGE * is_there.sum():
         # The same text each time, so that Python shows it once.
         limits = f"{config.min_range_m:g} to {config.max_range_m:g} m"

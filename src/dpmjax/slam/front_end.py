@@ -78,8 +78,8 @@ UNKNOWN_M = 1000.0
 
 # Source of a pose. "first": first scan of the map, or of a new part of a loaded one. "tracked": aligned from the
 # predicted pose. "network": aligned from the decoder's pose, or confirmed by it at a low score. "predicted": no
-# alignment was accepted; the pose is a guess. "empty": too few points. "restarted": first scan of a new part at a guessed
-# pose, after several rejected scans, or where the scan meets only such scans; loops may join the part.
+# alignment was accepted; the pose is a guess. "empty": too few points. "restarted": first scan of a new part at a
+# guessed pose, after several rejected scans, or where the scan meets only such scans; loops may join the part.
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 
 
