@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, load_model, metrics
 from dpmjax import deeppointmap as dpm
-from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, measure_pairs
+from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, draw_pairs, measure_pairs
 
 EXPERIMENT = "dpm_confidence"
 # Apart from the seeds of the calibration.
@@ -73,7 +73,7 @@ def main(config: Config) -> list[cli.Row]:
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
         drive = ambiguous_drive(place, kind, beams, LENGTH_M)
-        return measure_pairs(first, drive, BANDS_M, config.pairs, seed=config.seed, on_pair=run.check_stop)
+        return measure_pairs(first, run.until_stopped(draw_pairs(drive, BANDS_M, config.pairs, config.seed)))
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         numbers = [

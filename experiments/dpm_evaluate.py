@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -131,8 +131,8 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
             num_pairs = OVERLAP_FACTOR * config.pairs
             return cli.overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
         if method == "DeepPointMap":
-            return cli.registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
-        return evaluate_matcher(matchers[method], drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
+            return cli.registration_row(model, cli.read_pairs(run, drive, band, config), config.pairs)
+        return evaluate_matcher(matchers[method], cli.read_pairs(run, drive, band, config))
 
     bands = [(method, band) for band in ("near", "middle") for method in methods]
     cases = [
@@ -180,17 +180,14 @@ def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, nu
     return np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
 
 
-def evaluate_matcher(
-    matcher: Matcher, drive: LidarSequence, band: str, num_pairs: int, *, seed: int, on_pair: Callable[[], object]
-) -> cli.Row:
+def evaluate_matcher(matcher: Matcher, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
     """Returns errors and seconds of another matcher on the same pairs."""
     motions, seconds, true = [], [], []
-    for pair in dpm.read_scan_pairs(drive, dpm.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
+    for pair in pairs:
         started = time.perf_counter()
         motions.append(matcher(pair.source, pair.target))
         seconds.append(time.perf_counter() - started)
         true.append(pair.T_target_source)
-        on_pair()
     errors = registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
     row = cli.error_columns(errors, "_refined")
     row["is_right"] = row.pop("is_right_refined")

@@ -93,8 +93,7 @@ def measure_scene(config: Config, model: dpm.Model, run: cli.TableRun, **case: A
         )
     ]
     pairs = []
-    for band, rows in drawn:
-        run.check_stop()
+    for band, rows in run.until_stopped(drawn):
         clouds, poses = [], []
         for row in rows:
             rng = np.random.default_rng([config.seed, row])

@@ -17,6 +17,7 @@ from .evaluate import evaluation_towns as evaluation_towns
 from .evaluate import length_text as length_text
 from .evaluate import open_evaluation_drives as open_evaluation_drives
 from .evaluate import overlap_row as overlap_row
+from .evaluate import read_pairs as read_pairs
 from .evaluate import registration_row as registration_row
 from .info import environment as environment
 from .info import peak_rss_gb as peak_rss_gb

@@ -15,11 +15,11 @@ where the drive has some) with pairs more than 40 m apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -76,7 +76,7 @@ def main(config: Config) -> list[Row]:
         if band == "overlap":
             num_pairs = OVERLAP_FACTOR * config.pairs
             return overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
-        return registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
+        return registration_row(model, read_pairs(run, drive, band, config), config.pairs)
 
     def report(rows: list[Row]) -> Summary:
         numbers, text = calibration_numbers(rows), table(rows)
@@ -121,23 +121,18 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list
     return drives
 
 
-def registration_row(
-    model: deeppointmap.Model,
-    drive: LidarSequence,
-    band: str,
-    num_pairs: int,
-    *,
-    seed: int,
-    on_pair: Callable[[], object],
-) -> Row:
+def read_pairs(run: TableRun, drive: LidarSequence, band: str, config: Any) -> Iterator[deeppointmap.ScanPair]:
+    """Yields random pairs of scans of a band of distances; `config` has their number, `pairs`, and the seed."""
+    drawn = deeppointmap.draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
+    return run.until_stopped(deeppointmap.read_scan_pairs(drive, drawn, seed=config.seed))
+
+
+def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.ScanPair], num_asked: int) -> Row:
     """Returns errors by stage, confidence and seconds of the registrations of a band of distances."""
-    pairs = deeppointmap.read_scan_pairs(
-        drive, deeppointmap.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed
-    )
-    found = deeppointmap.evaluate_scan_pairs(model, pairs, on_pair=on_pair)
+    found = deeppointmap.evaluate_scan_pairs(model, pairs)
     row: Row = {
         "is_calibrated": model.config.calibration is not None,
-        "num_asked": num_pairs,
+        "num_asked": num_asked,
         "confidence": found.confidence.tolist(),
     }
     for stage in STAGES:

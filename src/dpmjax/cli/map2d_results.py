@@ -209,6 +209,6 @@ def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: Register
     picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
     kept, reference = result.candidates[result.kept].poses, registered.reference_poses
     anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
-    T_view_fit = metrics.align_rigid(trajectory, anchor[:, :2])
+    T_view_fit = np.asarray(metrics.align_rigid(trajectory, anchor[:, :2]))
     figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
     viz.save_figure(figure, folder / "occupancy.png")
