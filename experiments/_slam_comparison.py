@@ -77,9 +77,7 @@ def open_drives(
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [cli.open_drive(Path(entry), options, name) for name in names]
-    titles = [drive.name for drive in drives]
-    if len(set(titles)) < len(titles):
-        raise ValueError(f"two drives have the same name ({', '.join(sorted(titles))}); evaluate them one by one")
+    cli.check_names_differ(drives)
     return drives
 
 
@@ -154,9 +152,8 @@ def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precisi
         seconds.append(time.perf_counter() - clock)
         clock = time.perf_counter()
     errors = cli.localization_errors(found, slam_map, known, drive.reference[chosen])
-    keyframes = drive.reference[sorted(taken), :3, 3]
-    apart = np.linalg.norm(drive.reference[chosen][:, None, :3, 3] - keyframes[None], axis=2).min(axis=1)
-    is_inside, is_found, is_right = apart <= drive.scale.reach_m, errors.is_found, errors.is_right
+    is_found, is_right = errors.is_found, errors.is_right
+    is_inside = errors.keyframe_distance_m <= drive.scale.reach_m
     return {
         "num_scans": len(found),
         "num_keyframes": len(slam_map),

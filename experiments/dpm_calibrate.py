@@ -267,11 +267,8 @@ def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int
     drawn.append(dpm.draw_rows(np.array(hard, int).reshape(-1, 2), num_pairs // 4, rng))
     pairs = np.concatenate(drawn)
     sources, targets = ([clouds[row] for row in side] for side in pairs.T)
-    is_overlap, is_hard = (
-        distances[tuple(pairs.T)] < dpm.OVERLAP_M,
-        np.arange(len(pairs)) >= len(pairs) - len(drawn[-1]),
-    )
-    return LabelledPairs(sources, targets, is_overlap, is_hard)
+    is_hard = np.arange(len(pairs)) >= len(pairs) - len(drawn[-1])
+    return LabelledPairs(sources, targets, distances[tuple(pairs.T)] < dpm.OVERLAP_M, is_hard)
 
 
 def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:

@@ -80,17 +80,12 @@ def main(config: Config) -> list[cli.Row]:
             {"model": name, "rated": rated, "kind": kind, **rate(some, calibration, rated)}
             for rated in RATED
             for name, calibration in calibrations.items()
-            for kind, some in _by_kind(rows).items()
+            for (kind,), some in {**cli.group_rows(rows, "kind"), ("all",): rows}.items()
         ]
         return cli.Summary({"models": list(config.models)}, table(numbers), rows=numbers)
 
     cases = [ambiguous_case(number, FIRST_PLACE) for number in range(config.places)]
     return cli.run_table(config, EXPERIMENT, cases, work, report)
-
-
-def _by_kind(rows: Sequence[cli.Row]) -> dict[str, list[cli.Row]]:
-    kinds = dict.fromkeys(row["kind"] for row in rows)
-    return {**{kind: [row for row in rows if row["kind"] == kind] for kind in kinds}, "all": list(rows)}
 
 
 def rate(rows: Sequence[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.Row:

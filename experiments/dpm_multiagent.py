@@ -61,7 +61,7 @@ class Config(cli.DriveOptions):
 def main(config: Config) -> Any:
     """Lets the agents of each run map, joins their maps, writes; returns the numbers, or a row for each drive."""
     started = time.perf_counter()
-    methods, runs = agent_methods(config), open_runs(config)
+    methods, runs = make_methods(load_model(config.weights)), open_runs(config)
     if not config.cut:
         folder = cli.open_run_folder(config, EXPERIMENT)
         with cli.recording(folder), cli.StopFlag() as stop:
@@ -106,18 +106,12 @@ def map_agents(
     return numbers
 
 
-def agent_methods(config: Config) -> SlamMethods:
-    """Returns the methods of the model, which all agents share."""
-    return make_methods(load_model(config.weights))
-
-
 def open_runs(config: Config) -> list[list[LidarSequence]]:
     """Opens the scans of the agents of each run; bad input that can be known before a run is a `ValueError`."""
     drives = [cli.open_drive(data, config, config.sequence) for data in config.data or (None,)]
     if len(drives) > 1 and not config.cut:
         return [drives]
-    if len({drive.name for drive in drives}) < len(drives):
-        raise ValueError(f"two drives have the same name ({', '.join(drive.name for drive in drives)})")
+    cli.check_names_differ(drives)
     return [cut_sequence(drive, config.agents, config.overlap) for drive in drives]
 
 

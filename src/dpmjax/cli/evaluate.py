@@ -26,8 +26,8 @@ from tyro.conf import Positional, arg
 
 from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
-from dpmjax.cli.drives import Source, find_sources
-from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, markdown, run_table
+from dpmjax.cli.drives import Source, check_names_differ, find_sources
+from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, group_rows, markdown, run_table
 from dpmjax.cli.run_folder import ModelOptions, RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 
@@ -115,9 +115,7 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list
     for drive in drives:
         if not len(deeppointmap.draw_scan_pairs(drive, "near", 1)):
             raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")
-    names = [drive.name for drive in drives]
-    if len(set(names)) < len(names):
-        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
+    check_names_differ(drives)
     return drives
 
 
@@ -181,8 +179,7 @@ def calibration_numbers(rows: Sequence[Row]) -> Row:
         confidence, is_right = (np.concatenate([row[name] for row in some]) for name in ("confidence", "is_right"))
         return metrics.brier_score(confidence, is_right.astype(bool))
 
-    bands = dict.fromkeys(row["band"] for row in known)
-    numbers = {f"brier_{band}": brier([row for row in known if row["band"] == band]) for band in bands}
+    numbers = {f"brier_{band}": brier(some) for (band,), some in group_rows(known, "band").items()}
     is_calibrated = all(row["is_calibrated"] for row in known)
     return {"brier": brier(known), **numbers, "is_calibrated": is_calibrated} if known else {}
 

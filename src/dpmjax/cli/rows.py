@@ -102,6 +102,14 @@ def run_table(
     return rows
 
 
+def group_rows(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Returns the rows by the values of some keys, in the order in which they first appear."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
+
+
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Returns a table as Markdown; floats have two decimals, None and floats that are not finite a dash."""
     lines = [columns, *([cell_text(cell) for cell in row] for row in rows)]
