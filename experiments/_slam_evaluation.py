@@ -148,8 +148,7 @@ def tenths(scan_s: Sequence[float]) -> list[float]:
 
 def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
     """Measures our odometry in the same run, before loops: its time is that of its stages."""
-    numbers = common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), [])
-    return {**numbers, "scan_s": ours["scan_odometry_s"]}
+    return common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), []) | {"scan_s": ours["scan_odometry_s"]}
 
 
 def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:

@@ -38,8 +38,7 @@ Bands = tuple[tuple[float, float], ...]
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
-LIDARS = (VLP16, HDL32E, OS1_64)
-BEAMS = {len(lidar.elevations_deg): lidar for lidar in LIDARS}
+BEAMS = {len(lidar.elevations_deg): lidar for lidar in (VLP16, HDL32E, OS1_64)}
 KINDS = ("of_clouds", "of_scans", "of_weak_scans")
 # Elements of a scan in the map of SLAM, and in `register(..., refine=True)` with a cloud.
 NUM_ELEMENTS = 1024
@@ -89,8 +88,7 @@ def main(config: Config) -> list[cli.Row]:
             drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
             return measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
         drive, bands_m = open_place(**case)
-        pairs = run.until_stopped(draw_pairs(drive, bands_m, NUM_PAIRS, config.seed))
-        return measure_pairs(model, pairs)
+        return measure_pairs(model, run.until_stopped(draw_pairs(drive, bands_m, NUM_PAIRS, config.seed)))
 
     cases = list_cases(config)
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))
@@ -206,8 +204,7 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
         Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
         true distance, metres.
     """
-    names = (*KINDS, "is_right_of_clouds", "is_right", "distance_m")
-    found: dict[str, list[Any]] = {name: [] for name in names}
+    found: cli.Row = {name: [] for name in (*KINDS, "is_right_of_clouds", "is_right", "distance_m")}
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
     for pair in pairs:
         result = dpm.register_in_stages(model, pair)

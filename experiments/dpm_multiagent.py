@@ -16,7 +16,7 @@ of each drive, and table.md a row a drive. A file of poses (TUM, KITTI) stands f
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -65,7 +65,7 @@ def main(config: Config) -> Any:
     if not config.cut:
         folder = cli.open_run_folder(config, EXPERIMENT)
         with cli.recording(folder), cli.StopFlag() as stop:
-            numbers = map_agents(folder, config, methods, runs[0], lambda: stop.is_requested)
+            numbers = map_agents(cli.TableRun(folder, lambda: stop.is_requested), config, methods, runs[0])
             numbers |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
             cli.write_metrics(folder, numbers, seed=config.seed)
             print(f"{summary(numbers)}\nresults in {folder.path}")
@@ -73,8 +73,8 @@ def main(config: Config) -> Any:
     by_name = {sequences[0].name: sequences for sequences in runs}
 
     def work(run: cli.TableRun, sequence: str) -> cli.Row:
-        part = run.folder.part("drives", sequence)
-        row = map_agents(part, config, methods, by_name[sequence], run.is_stopped)
+        part = run._replace(folder=run.folder.part("drives", sequence))
+        row = map_agents(part, config, methods, by_name[sequence])
         run.check_stop()
         return row
 
@@ -82,19 +82,13 @@ def main(config: Config) -> Any:
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(weights, table(rows)))
 
 
-def map_agents(
-    folder: cli.RunFolder,
-    config: Config,
-    methods: SlamMethods,
-    sequences: list[LidarSequence],
-    is_stopped: Callable[[], bool],
-) -> dict[str, Any]:
+def map_agents(run: cli.TableRun, config: Config, methods: SlamMethods, sequences: list[LidarSequence]) -> cli.Row:
     """Lets the agents of one run map, joins their maps, writes their files; returns the numbers."""
-    agents = []
+    agents, folder = [], run.folder
     for number, sequence in enumerate(sequences, start=1):
-        if not is_stopped():
+        if not run.is_stopped():
             part = folder.part("agents", f"agent_{number}")
-            agents.append(cli.map_drive(part, sequence, methods, is_stopped)[1])
+            agents.append(cli.map_drive(part, sequence, methods, run.is_stopped)[1])
     mapped = [sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)]
     with cli.progress_bar("loops between agents", " keyframes") as on_keyframe:
         result = join_agents(methods, agents, on_keyframe=on_keyframe)

@@ -69,8 +69,7 @@ def main(config: Config) -> dict[str, Any]:
         print(f"{sequence.name}: {len(sequence)} images", "search of first poses ...", sep="\n", flush=True)
         recorder = FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
         settings = deepmapping.preset(config.preset, "depth", motion="planar" if sequence.is_planar else "full")
-        key = jax.random.key(config.seed)
-        found = deepmapping.register_depth(images, settings, key=key, engine=recorder)
+        found = deepmapping.register_depth(images, settings, key=jax.random.key(config.seed), engine=recorder)
         metrics = {
             **depth_numbers(sequence, found),
             **recorder.numbers,
@@ -166,8 +165,7 @@ def draw(folder: RunFolder, sequence: DepthSequence, found: Registered) -> None:
     panels = [("search of first poses", found.start), ("DeepMapping", found.fitted.T_world_scan)]
     if sequence.T_world_camera is not None:
         panels.append(("reference", sequence.T_world_camera))
-    figure = viz.from_above_figure(panels, sequence.points, sequence.mask)
-    viz.save_figure(figure, folder / "map.png", dpi=110)
+    viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), folder / "map.png", dpi=110)
     draw_loss(folder, "m")
 
 

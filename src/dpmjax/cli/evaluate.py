@@ -74,8 +74,7 @@ def main(config: Config) -> list[Row]:
     def work(run: TableRun, sequence: str, band: str) -> Row:
         drive = by_name[sequence]
         if band == "overlap":
-            num_pairs = OVERLAP_FACTOR * config.pairs
-            return overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
+            return overlap_row(model, drive, OVERLAP_FACTOR * config.pairs, seed=config.seed, on_scan=run.check_stop)
         return registration_row(model, read_pairs(run, drive, band, config), config.pairs)
 
     def report(rows: list[Row]) -> Summary:
@@ -214,8 +213,7 @@ def worst_failures(
         *_, pair = deeppointmap.read_scan_pairs(drive, drawn[: number + 1], seed=seed)
         a, b = drawn[number]
         title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
-        T = np.asarray(row["motions"][number]).reshape(4, 4)
-        motions = {"found": T, "true": pair.T_target_source}
+        motions = {"found": np.reshape(row["motions"][number], (4, 4)), "true": pair.T_target_source}
         shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions))
     return shown
 

@@ -141,8 +141,7 @@ def _trust_lines(assessment: Mapping[str, Any]) -> list[str]:
 
 def spans_of(rows: Sequence[int]) -> list[str]:
     """Returns increasing numbers as spans, such as 3-5 and 9."""
-    breaks = np.flatnonzero(np.diff(rows) > 1) + 1
-    parts = np.split(np.asarray(rows), breaks)
+    parts = np.split(np.asarray(rows), np.flatnonzero(np.diff(rows) > 1) + 1)
     return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts if len(part)]
 
 
