@@ -25,7 +25,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.result_files import write_poses
+from dpmjax.cli.result_files import named_initial, write_poses
 from dpmjax.cli.run_folder import RunFolder, RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def depth_numbers(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
         "consistency": 1 - (found.misfit if found.kept == "fit" else found.start_misfit),
         "consistency_initial": 1 - found.start_misfit,
         **after,
-        **{"_initial_".join(name.rsplit("_", 1)): value for name, value in before.items()},
+        **named_initial(before),
     }
 
 

@@ -45,10 +45,8 @@ SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
-    """Options of the run."""
-
-    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
+class ProcessOptions(RunOptions):
+    """Options of a run of several processes."""
 
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
     """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
@@ -56,6 +54,14 @@ class Config(RunOptions):
     """How many processes there are."""
     process_id: Annotated[int | None, arg(metavar="I")] = None
     """Which of them this one is, from 0; process 0 alone writes and prints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(ProcessOptions):
+    """Options of the run."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
+
     data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
     """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
     preset: Literal["tiny", "small", "paper"] = "tiny"
