@@ -90,13 +90,11 @@ class Timing(NamedTuple):
     median_s: float
     min_s: float
 
-    def rows(self, case: str) -> list[Row]:
-        """Returns the timing as rows of the table."""
-        return [
-            Row(case, "compile", self.compile_s, "s"),
-            Row(case, "median", 1e3 * self.median_s, "ms"),
-            Row(case, "min", 1e3 * self.min_s, "ms"),
-        ]
+    def rows(self, case: str, *, is_compiled: bool = True) -> list[Row]:
+        """Returns the timing as rows of the table, that of the compilation first, where there is one."""
+        compiling = [Row(case, "compile", self.compile_s, "s")] if is_compiled else []
+        calls = {"median": self.median_s, "min": self.min_s}
+        return compiling + [Row(case, name, 1e3 * seconds, "ms") for name, seconds in calls.items()]
 
 
 def measure(function: Callable[..., object], *args: object, repeats: int = 20) -> Timing:

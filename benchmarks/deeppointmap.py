@@ -164,8 +164,8 @@ def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.De
 def _timed(case: str, parts: dict[str, Callable[[], object]], quick: bool, repeats: int = 12) -> list[Row]:
     rows: list[Row] = []
     for name, function in parts.items():
-        timing = measure(function, repeats=3 if quick else repeats).rows(f"{case}: {name}")
-        rows += [row for row in timing if row.metric != "compile" or name not in NOT_COMPILED]
+        timing = measure(function, repeats=3 if quick else repeats)
+        rows += timing.rows(f"{case}: {name}", is_compiled=name not in NOT_COMPILED)
     return rows
 
 
@@ -246,12 +246,8 @@ def with_figures(rows: list[Row]) -> list[Row]:
     result = []
     for row in rows:
         result.append(row)
-        figure = FIGURES.get(row.case, Figure())
         if row.metric in ("median", "peak memory"):
-            held_against = {"authors' program": figure.theirs, "goal": figure.goal}
-            result += [
-                row._replace(metric=f"{row.metric}, {name}", value=value)
-                for name, value in held_against.items()
-                if value is not None
-            ]
+            figures = zip(("authors' program", "goal"), FIGURES.get(row.case, Figure()), strict=True)
+            known = [(name, value) for name, value in figures if value is not None]
+            result += [row._replace(metric=f"{row.metric}, {name}", value=value) for name, value in known]
     return result

@@ -1,6 +1,6 @@
 """Baselines of the DeepMapping paper that stand on other packages (extra `baselines`).
 
-L-BFGS by jaxopt on DeepMapping's loss without L-Net, and solvers of jaxopt on the toy. A chain of scans by particle
+L-BFGS by jaxopt on DeepMapping's loss without L-Net. A chain of scans by particle
 swarms of evosax. Multiway registration by Open3D, whose pairs are registered by iterated closest points. Neighbours in
 time are sure edges of a pose graph, and all further pairs uncertain ones. A line process removes wrong edges (Choi,
 Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax import ScanSet
-from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem, toy_loss
+from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem
 from dpmjax.geometry import rigid, se2, typical_range
 from dpmjax.losses import chamfer_distance
 
@@ -55,30 +55,6 @@ def optimize_directly(
     solver = jaxopt.LBFGS(loss, maxiter=num_iterations, history_size=10, linesearch="backtracking", maxls=20)
     solution, _ = solver.run((start.poses, start.occupancy))
     return np.asarray(solution[0], np.float64) * [unit, unit, 1.0]
-
-
-def minimize_toy(
-    x0: Float[Array, ""], method: Literal["gradient-descent", "lbfgs", "bfgs"], *, max_iterations: int = 1000
-) -> Float[Array, ""]:
-    """Solves the direct form of the toy by a solver of jaxopt with its own line search.
-
-    Args:
-        x0: where to start.
-        method: "gradient-descent" (with line search and momentum), "lbfgs" or "bfgs".
-        max_iterations: the largest number of iterations.
-
-    Returns:
-        The end of the descent.
-
-    Raises:
-        ValueError: the method is unknown.
-    """
-    import jaxopt
-
-    solvers = {"gradient-descent": jaxopt.GradientDescent, "lbfgs": jaxopt.LBFGS, "bfgs": jaxopt.BFGS}
-    if method not in solvers:
-        raise ValueError(f"method: expected one of {', '.join(solvers)}, got {method!r}")
-    return solvers[method](fun=toy_loss, maxiter=max_iterations).run(x0).params
 
 
 # Particles start within this: translation along each axis in typical ranges, and radians.

@@ -73,6 +73,10 @@ class Drive(NamedTuple):
         """Returns the lengths of the recall of loops."""
         return INDOOR_SCALE if self.is_indoors else Scale()
 
+    def save_trajectory(self, method: str, T_world_scan: np.ndarray) -> None:
+        """Writes the trajectory of a method."""
+        cli.write_trajectory(self.folder.path, T_world_scan, self.sequence.times, file_name(method))
+
     def trajectory(self, method: str) -> np.ndarray:
         """Reads what a method has written."""
         return np.load(self.folder / f"{file_name(method)}.npy")
@@ -94,7 +98,7 @@ def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     result, row = map_row(drive, drive.folder, OURS, methods)
     cli.write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
     cli.write_scans(drive.folder / "scans.csv", result.reports, result.keyframes, drive.sequence.sources)
-    save_trajectory(drive, ODOMETRY, result.T_odometry_scan)
+    drive.save_trajectory(ODOMETRY, result.T_odometry_scan)
     return {**row, **map_sizes(drive.folder.path, result)}
 
 
@@ -144,8 +148,7 @@ def tenths(scan_s: Sequence[float]) -> list[float]:
 
 def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
     """Measures our odometry in the same run, before loops: its time is that of its stages."""
-    numbers = common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), [])
-    return {**numbers, "scan_s": ours["scan_odometry_s"]}
+    return common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), []) | {"scan_s": ours["scan_odometry_s"]}
 
 
 def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
@@ -186,7 +189,7 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
 
 def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> dict[str, Any]:
     """Writes the trajectory of a method, and returns its errors and those of its loops."""
-    save_trajectory(drive, method, T_world_scan)
+    drive.save_trajectory(method, T_world_scan)
     known = T_world_scan if drive.reference is None else drive.reference
     return {
         "num_scans": len(T_world_scan),
@@ -195,11 +198,6 @@ def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: S
         "num_loops": len(loops),
         **(loop_numbers(drive, loops) if drive.reference is not None else {}),
     }
-
-
-def save_trajectory(drive: Drive, method: str, T_world_scan: np.ndarray) -> None:
-    """Writes the trajectory of a method."""
-    cli.write_trajectory(drive.folder.path, T_world_scan, drive.sequence.times, file_name(method))
 
 
 def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:

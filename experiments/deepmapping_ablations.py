@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from tyro.conf import arg
@@ -77,16 +77,16 @@ def main(config: Config) -> list[cli.Row]:
 
 def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingConfig:
     """Returns the basis with one thing changed."""
+    fast, number = dm.preset("fast", "depth"), int(variant) if variant.isdigit() else 0
     phase = replace(
         dm.JOINT_DEPTH,
         num_steps=num_steps,
-        occupancy_weight=0.5,
+        occupancy_weight=1.0 if variant == "without" else 0.5,
         final_learning_rate=0.1,
         beams_per_step=_NUM_PIXELS,
-        num_free=4,
+        num_free=number if ablation == "free" else 4,
         is_sampled_as_published=False,
     )
-    fast, number = dm.preset("fast", "depth"), int(variant) if variant.isdigit() else 0
     localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
     maps = {
         "ResMLP": nets.OccupancyConfig(kind="resmlp", features=(64, 64, 64, 128, 128)),
@@ -94,13 +94,7 @@ def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingCo
         "depth": nets.OccupancyConfig(features=(64,) * number),
         "width": nets.OccupancyConfig(features=(number,) * 4),
     }
-    changes: dict[str, dict[str, Any]] = {
-        "without": {"occupancy_weight": 1.0},
-        "free": {"num_free": number},
-    }
-    changed = ablation if number else variant
-    phase = replace(phase, **changes.get(changed, {}))
-    occupancy = maps.get(changed, nets.OccupancyConfig(features=(64,) * 6))
+    occupancy = maps.get(ablation if number else variant, nets.OccupancyConfig(features=(64,) * 6))
     networks = {"localization": localization, "occupancy": occupancy, "steps_per_call": min(50, num_steps)}
     return replace(fast, cold_phases=(phase,), warm_phases=(phase,), **networks)
 
@@ -119,14 +113,11 @@ def run_one(settings: dm.DeepMappingConfig, trajectory: int, run_seed: int) -> c
 
 def report(rows: list[cli.Row]) -> cli.Summary:
     """Returns a line for each variant, and ablations.png."""
-    groups: dict[tuple[str, str], list[cli.Row]] = defaultdict(list)
-    panels: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        groups[row["ablation"], row["variant"]].append(row)
-        panels[f"{row['ablation']}: ATE, mm"][row["variant"]].append(row["ate_mm"])
+    panels: dict[str, dict[str, list[float]]] = defaultdict(dict)
     table = []
-    for (ablation, variant), some in groups.items():
+    for (ablation, variant), some in cli.group_rows(rows, "ablation", "variant").items():
         ate = np.array([row["ate_mm"] for row in some])
+        panels[f"{ablation}: ATE, mm"][variant] = ate.tolist()
         numbers = {"median_ate_mm": float(np.median(ate)), "success": float((ate < _SUCCESS_MM).mean())}
         numbers["median_run_s"] = float(np.median([row["run_s"] for row in some]))
         case = {"ablation": ablation, "variant": variant, "num_runs": len(some)}

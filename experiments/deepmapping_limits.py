@@ -109,7 +109,7 @@ def _successes(row: dict[str, Any]) -> dict[str, bool]:
 def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Returns a line for each world, order and method: mean success of all cells run, and at every 8th scan."""
     lines = []
-    for (world, order, method), mine in _grouped(rows, "world", "order", "method").items():
+    for (world, order, method), mine in cli.group_rows(rows, "world", "order", "method").items():
         eighth = [row["success"] for row in mine if row["stride"] == 8]
         at_eighth = f", at every 8th scan {np.mean(eighth):.0%} of {len(eighth)}" if eighth else ""
         success = np.mean([row["success"] for row in mine])
@@ -121,7 +121,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     """Returns the median ATE of every method and candidate in every cell, as Markdown."""
     columns = dict.fromkeys(_column(row, name) for row in rows for name in row["candidates"])
     lines = []
-    for cell, mine in _grouped(rows, "world", "order", "stride", "noise_px").items():
+    for cell, mine in cli.group_rows(rows, "world", "order", "stride", "noise_px").items():
         ates: dict[str, list[float]] = defaultdict(list)
         for row in mine:
             for name, numbers in row["candidates"].items():
@@ -137,20 +137,12 @@ def _column(row: dict[str, Any], candidate: str) -> str:
     return row["method"] if len(row["candidates"]) == 1 else f"{row['method']}: {candidate}"
 
 
-def _grouped(rows: Sequence[dict[str, Any]], *keys: str) -> dict[tuple[Any, ...], list[dict[str, Any]]]:
-    """Returns the rows by the values of some keys, in the order in which they first appear."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = defaultdict(list)
-    for row in rows:
-        groups[tuple(row[key] for key in keys)].append(row)
-    return groups
-
-
 def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Summary:
     """Returns the successes, the table and a picture for each world and order."""
     lines = summary(rows)
 
     def draw(folder: cli.RunFolder) -> None:
-        for (world, order), mine in _grouped(rows, "world", "order").items():
+        for (world, order), mine in cli.group_rows(rows, "world", "order").items():
             figure = viz.success_grids_figure(
                 success_grids(mine, config),
                 {"scans used": [f"1/{stride}" for stride in sorted(config.strides)]},

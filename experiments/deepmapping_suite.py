@@ -100,12 +100,6 @@ def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def by_method(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Returns the rows of each method, in the order in which the methods were run."""
-    names = dict.fromkeys(row["method"] for row in rows)
-    return {name: [row for row in rows if row["method"] == name] for name in names}
-
-
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Returns the table as Markdown: a row for each method, and below it one for each of several candidates."""
     columns = ("method", "trajectories", "median ATE, px", "median point distance, px", "success (ATE < 20 px)")
@@ -115,7 +109,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         return [title, s["num_trajectories"], *medians, f"{s['success']:.1%}", *last]
 
     lines = []
-    for method, mine in by_method(rows).items():
+    for (method,), mine in cli.group_rows(rows, "method").items():
         s = summarise(mine)
         right = "-" if s["success_of_trusted"] is None else f"{s['success_of_trusted']:.1%}"
         lines.append(cells(shared.METHODS[method].title, s, f"{s['median_s']:.1f}", s["num_trusted"], right))
@@ -129,7 +123,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def report(rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Summary:
     """Returns the numbers of the methods, the table and boxes.png."""
-    groups = by_method(rows)
+    groups = {method: mine for (method,), mine in cli.group_rows(rows, "method").items()}
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
     text, bounds = table(rows), [row["bound_px"] for row in rows if "bound_px" in row]
     if bounds:

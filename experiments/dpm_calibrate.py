@@ -16,7 +16,7 @@ out of the fits. `python -m experiments.dpm_confidence` checks the confidence on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -32,11 +32,13 @@ from dpmjax.simulation import HDL32E, OS1_64, VLP16, SceneMixture, draw_scene, s
 from dpmjax.slam import most_similar, pooled_vector
 from dpmjax.weights import read_card
 
+# Smallest and largest distance of the pairs of each kind, metres.
+Bands = tuple[tuple[float, float], ...]
+
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
-LIDARS = (VLP16, HDL32E, OS1_64)
-BEAMS = {len(lidar.elevations_deg): lidar for lidar in LIDARS}
+BEAMS = {len(lidar.elevations_deg): lidar for lidar in (VLP16, HDL32E, OS1_64)}
 KINDS = ("of_clouds", "of_scans", "of_weak_scans")
 # Elements of a scan in the map of SLAM, and in `register(..., refine=True)` with a cloud.
 NUM_ELEMENTS = 1024
@@ -86,7 +88,7 @@ def main(config: Config) -> list[cli.Row]:
             drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
             return measure_town(model, drives, NUM_OVERLAP_PAIRS, config.seed)
         drive, bands_m = open_place(**case)
-        return measure_pairs(model, drive, bands_m, NUM_PAIRS, seed=config.seed, on_pair=run.check_stop)
+        return measure_pairs(model, run.until_stopped(draw_pairs(drive, bands_m, NUM_PAIRS, config.seed)))
 
     cases = list_cases(config)
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))
@@ -100,9 +102,7 @@ def list_cases(config: Config) -> list[cli.Row]:
     return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(config.overlap_towns)]
 
 
-def open_place(
-    *, kind: str, town: int | None = None, place: int = 0, beams: int = 0
-) -> tuple[LidarSequence, tuple[tuple[float, float], ...]]:
+def open_place(*, kind: str, town: int | None = None, place: int = 0, beams: int = 0) -> tuple[LidarSequence, Bands]:
     """Simulates a town or an ambiguous place; returns its drive, and the distances of its pairs, metres."""
     if town is not None:
         return simulation.simulate_drive(town, length_m=TOWN_LENGTH_M, kind=kind), TOWN_BANDS_M
@@ -185,60 +185,51 @@ def ambiguous_drive(place: int, kind: str, beams: int, length_m: float) -> Lidar
     return simulate_scene(draw_scene(place, mixture))
 
 
-def measure_pairs(
-    model: dpm.Model,
-    drive: LidarSequence,
-    bands_m: tuple[tuple[float, float], ...],
-    num_pairs: int,
-    *,
-    seed: int,
-    on_pair: Callable[[], object],
-) -> dict[str, Any]:
-    """Registers random pairs as scans, and as clouds of surface elements.
+def draw_pairs(drive: LidarSequence, bands_m: Bands, num_pairs: int, seed: int) -> Iterator[dpm.ScanPair]:
+    """Reads random pairs of each band of distances, fewer than `num_pairs` where the drive has fewer."""
+    distances = dpm.scan_distances(drive)
+    for number, (low, high) in enumerate(bands_m):
+        drawn = dpm.draw_rows_apart(distances, low, high, num_pairs, np.random.default_rng([PAIR_STREAM, number, seed]))
+        yield from dpm.read_scan_pairs(drive, drawn, seed=seed)
+
+
+def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
+    """Registers pairs as scans, and as clouds of surface elements.
 
     Args:
         model: encoder and decoder.
-        drive: scans with true poses.
-        bands_m: smallest and largest distance of the pairs.
-        num_pairs: number of pairs of each distance, fewer where the drive has fewer.
-        seed: of the draws.
-        on_pair: called after each pair.
+        pairs: the pairs.
 
     Returns:
         Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
         true distance, metres.
     """
-    names = (*KINDS, "is_right_of_clouds", "is_right", "distance_m")
-    found: dict[str, list[Any]] = {name: [] for name in names}
-    distances = dpm.scan_distances(drive)
+    found: cli.Row = {name: [] for name in (*KINDS, "is_right_of_clouds", "is_right", "distance_m")}
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
-    for number, (low, high) in enumerate(bands_m):
-        drawn = dpm.draw_rows_apart(distances, low, high, num_pairs, np.random.default_rng([PAIR_STREAM, number, seed]))
-        for pair in dpm.read_scan_pairs(drive, drawn, seed=seed):
-            result = dpm.register_in_stages(model, pair)
-            clouds = [encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
-            of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
-            motions = np.stack([of_clouds, result.verified])
-            is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
-            for name, features in result.evidence._asdict().items():
-                found[name].append(None if features is None else features.tolist())
-            found["is_right_of_clouds"].append(bool(is_right[0]))
-            found["is_right"].append(bool(is_right[1]))
-            found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))
-            on_pair()
+    for pair in pairs:
+        result = dpm.register_in_stages(model, pair)
+        clouds = [encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
+        of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
+        motions = np.stack([of_clouds, result.verified])
+        is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
+        for name, features in result.evidence._asdict().items():
+            found[name].append(None if features is None else features.tolist())
+        found["is_right_of_clouds"].append(bool(is_right[0]))
+        found["is_right"].append(bool(is_right[1]))
+        found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))
     return found
 
 
-class TownPairs(NamedTuple):
-    """Pairs of scans, their distances in metres, and whether they are hard: far apart, but similar by retrieval."""
+class LabelledPairs(NamedTuple):
+    """Pairs of scans; whether they are less than 20 m apart; and hard: farther apart, but similar by retrieval."""
 
     sources: list[DescriptorCloud]
     targets: list[DescriptorCloud]
-    distances_m: np.ndarray
+    is_overlap: np.ndarray
     is_hard: np.ndarray
 
 
-def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> TownPairs:
+def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> LabelledPairs:
     """Returns encoded pairs of a town.
 
     Half of the pairs are less than 20 m apart, a quarter 20 to 40 m, an eighth farther; an eighth has one scan of
@@ -273,7 +264,8 @@ def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int
     drawn.append(dpm.draw_rows(np.array(hard, int).reshape(-1, 2), num_pairs // 4, rng))
     pairs = np.concatenate(drawn)
     sources, targets = ([clouds[row] for row in side] for side in pairs.T)
-    return TownPairs(sources, targets, distances[tuple(pairs.T)], np.arange(len(pairs)) >= len(pairs) - len(drawn[-1]))
+    is_hard = np.arange(len(pairs)) >= len(pairs) - len(drawn[-1])
+    return LabelledPairs(sources, targets, distances[tuple(pairs.T)] < dpm.OVERLAP_M, is_hard)
 
 
 def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:
@@ -281,7 +273,7 @@ def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: i
     pairs = town_pairs(model, drives, num_pairs, seed)
     num = int(np.sum(~pairs.is_hard))
     evidence = np.asarray(dpm.evidence_pairs(model, pairs.sources[:num], pairs.targets[:num]))
-    return {"evidence": evidence.tolist(), "is_overlap": (pairs.distances_m[:num] < dpm.OVERLAP_M).tolist()}
+    return {"evidence": evidence.tolist(), "is_overlap": pairs.is_overlap[:num].tolist()}
 
 
 def fit_overlap(rows: Sequence[dict[str, Any]]) -> tuple[dpm.LogisticModel, dict[str, Any], dict[str, np.ndarray]]:

@@ -23,7 +23,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, load_model, metrics
 from dpmjax import deeppointmap as dpm
-from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, measure_pairs
+from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, draw_pairs, measure_pairs
 
 EXPERIMENT = "dpm_confidence"
 # Apart from the seeds of the calibration.
@@ -73,24 +73,19 @@ def main(config: Config) -> list[cli.Row]:
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
         drive = ambiguous_drive(place, kind, beams, LENGTH_M)
-        return measure_pairs(first, drive, BANDS_M, config.pairs, seed=config.seed, on_pair=run.check_stop)
+        return measure_pairs(first, run.until_stopped(draw_pairs(drive, BANDS_M, config.pairs, config.seed)))
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         numbers = [
             {"model": name, "rated": rated, "kind": kind, **rate(some, calibration, rated)}
             for rated in RATED
             for name, calibration in calibrations.items()
-            for kind, some in _by_kind(rows).items()
+            for (kind,), some in {**cli.group_rows(rows, "kind"), ("all",): rows}.items()
         ]
         return cli.Summary({"models": list(config.models)}, table(numbers), rows=numbers)
 
     cases = [ambiguous_case(number, FIRST_PLACE) for number in range(config.places)]
     return cli.run_table(config, EXPERIMENT, cases, work, report)
-
-
-def _by_kind(rows: Sequence[cli.Row]) -> dict[str, list[cli.Row]]:
-    kinds = dict.fromkeys(row["kind"] for row in rows)
-    return {**{kind: [row for row in rows if row["kind"] == kind] for kind in kinds}, "all": list(rows)}
 
 
 def rate(rows: Sequence[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.Row:

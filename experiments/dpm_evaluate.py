@@ -2,6 +2,7 @@
 
     python -m experiments.dpm_evaluate path/to/drive another/drive --weights model.safetensors
     python -m experiments.dpm_evaluate town                             towns that no training has seen
+    python -m experiments.dpm_evaluate path/to/drive --clouds 256 1024
     python -m experiments.dpm_evaluate --slam path/to/drive another/drive
     python -m experiments.dpm_evaluate --slam town --num-towns 5 --town-length-m 1000 4000
     python -m experiments.dpm_evaluate --slam path/to/drive kitti_00.txt kitti_07.txt      towns along real routes
@@ -11,7 +12,9 @@ A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). 
 to 20 m apart and turned by any yaw, are registered. A registration within 2 m and 5 degrees is right. Results go to
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
-(extra `kiss`). Rows of all recorded drives together have confidence intervals and say which methods differ.
+(extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
+a scan; the scans themselves are not used again. Rows of all recorded drives together have confidence intervals and say
+which methods differ.
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
@@ -26,7 +29,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,7 +38,7 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, load_model, registration_recall
+from dpmjax import cli, encode, load_model, register, registration_recall
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import mcnemar_p_value, wilson_interval
@@ -48,6 +51,8 @@ VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
 Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
 NETWORK, VERIFIED = "network alone", "network, search and verification"
 SEARCH, KISS = "search and verification, no network", "KISS-Matcher"
+# Beginning of the names of matches of clouds, before the number of surface elements.
+CLOUDS = "clouds, elements "
 # The row and its entry that say which pairs a method has registered right.
 _ANSWERS = {
     NETWORK: ("DeepPointMap", "is_right_descriptors"),
@@ -69,6 +74,8 @@ class Config(cli.DriveOptions):
     """Compare SLAM on whole drives instead of registrations of pairs."""
     pairs: Annotated[int, arg(metavar="N")] = 30
     """Pairs for each distance."""
+    clouds: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
+    """Also register descriptor clouds, refined by N surface elements a scan."""
     num_towns: Annotated[int, arg(metavar="N")] = 3
     """Number of towns, where town is among the paths."""
     town_length_m: Annotated[tuple[float, ...], arg(metavar="M")] = (400.0,)
@@ -108,11 +115,15 @@ def evaluate_slam(config: Config) -> list[cli.Row]:
 def evaluate_pairs(config: Config) -> list[cli.Row]:
     """Registers the pairs that are missing, and writes table, numbers and pictures."""
     model = load_model(config.weights)
+    low, high = model.config.num_descriptors, model.config.pyramid.stages[0].num_points
+    if not all(low <= num <= high for num in config.clouds):
+        raise ValueError(f"--clouds: expected from {low} to {high} elements a scan, got {config.clouds}")
     matchers = {"search": partial(search_alone, config=model.config.verification), "KISS-Matcher": kiss_matcher}
+    matchers |= {f"{CLOUDS}{num}": partial(match_clouds, model=model, num_elements=num) for num in config.clouds}
     drives = cli.open_evaluation_drives(config.paths, cli.evaluation_towns(config.num_towns, config.town_length_m[0]))
     by_name = {drive.name: drive for drive in drives}
     no_kiss = cli.why_not_importable("kiss_matcher") if not config.no_kiss else "left out by --no-kiss"
-    methods = ("DeepPointMap", "search", *(("KISS-Matcher",) if no_kiss is None else ()))
+    methods = ["DeepPointMap", *(name for name in matchers if no_kiss is None or name != "KISS-Matcher")]
 
     def work(run: cli.TableRun, method: str, sequence: str, band: str) -> cli.Row:
         drive = by_name[sequence]
@@ -120,8 +131,8 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
             num_pairs = OVERLAP_FACTOR * config.pairs
             return cli.overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
         if method == "DeepPointMap":
-            return cli.registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
-        return evaluate_matcher(matchers[method], drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
+            return cli.registration_row(model, cli.read_pairs(run, drive, band, config), config.pairs)
+        return evaluate_matcher(matchers[method], cli.read_pairs(run, drive, band, config))
 
     bands = [(method, band) for band in ("near", "middle") for method in methods]
     cases = [
@@ -138,7 +149,7 @@ def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row],
     pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])
     numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **cli.calibration_numbers(rows)}
     notes = [] if no_kiss is None else [f"KISS-Matcher was not run: {no_kiss}."]
-    text = "\n\n".join(filter(None, [table(rows), pooled_table(pooled), *notes]))
+    text = "\n\n".join(filter(None, [table(rows), cloud_table(rows), pooled_table(pooled), *notes]))
     draw = partial(cli.draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
     return cli.Summary({**numbers, "pooled": pooled}, text, draw)
 
@@ -163,17 +174,20 @@ def search_alone(source: np.ndarray, target: np.ndarray, config: dpm.Verificatio
     return dpm.refine_motion(*measured, chosen, config).T_target_source
 
 
-def evaluate_matcher(
-    matcher: Matcher, drive: LidarSequence, band: str, num_pairs: int, *, seed: int, on_pair: Callable[[], object]
-) -> cli.Row:
+def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, num_elements: int) -> np.ndarray:
+    """Returns `T_target_source` of descriptor clouds, refined by their surface elements."""
+    clouds = [encode(model, points, num_elements=num_elements) for points in (source, target)]
+    return np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
+
+
+def evaluate_matcher(matcher: Matcher, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
     """Returns errors and seconds of another matcher on the same pairs."""
     motions, seconds, true = [], [], []
-    for pair in dpm.read_scan_pairs(drive, dpm.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed):
+    for pair in pairs:
         started = time.perf_counter()
         motions.append(matcher(pair.source, pair.target))
         seconds.append(time.perf_counter() - started)
         true.append(pair.T_target_source)
-        on_pair()
     errors = registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
     row = cli.error_columns(errors, "_refined")
     row["is_right"] = row.pop("is_right_refined")
@@ -199,6 +213,16 @@ def table(rows: Sequence[cli.Row]) -> str:
         seconds = (row["pair_s"], kiss.get("pair_s"), cli.cell_text(auc, 3))
         lines.append([sequence, cli.BAND_NAMES[band], row["num_pairs"], *recalls, *others, *errors, *seconds])
     return cli.markdown(columns, lines)
+
+
+def cloud_table(rows: Sequence[cli.Row]) -> str:
+    """Returns the registrations of descriptor clouds as Markdown; without any, an empty string."""
+    lines = []
+    for row in (row for row in rows if row["method"].startswith(CLOUDS) and row["num_pairs"]):
+        case = (row["sequence"], cli.BAND_NAMES[row["band"]], row["method"].removeprefix(CLOUDS), row["num_pairs"])
+        lines.append([*case, row["recall_refined"], cli.length_text(row["median_error_refined_m"])])
+    columns = ("sequence", "distance", "surface elements of clouds", "pairs", "recall", "median error")
+    return cli.markdown(columns, lines) if lines else ""
 
 
 def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> list[dict[str, Any]]:

@@ -93,8 +93,7 @@ def measure_scene(config: Config, model: dpm.Model, run: cli.TableRun, **case: A
         )
     ]
     pairs = []
-    for band, rows in drawn:
-        run.check_stop()
+    for band, rows in run.until_stopped(drawn):
         clouds, poses = [], []
         for row in rows:
             rng = np.random.default_rng([config.seed, row])
@@ -132,9 +131,8 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.EvidenceWeights, list[cli.Row]]:
     for row in rows:
         others = scene != row["scene"]
         weights, _ = dpm.fit_weights(shares[others], is_right[others])
-        for band in dict.fromkeys(pair["band"] for pair in row["pairs"]):
-            pairs = [pair for pair in row["pairs"] if pair["band"] == band]
-            case = {name: row[name] for name in ("kind", "sensor", "points")}
+        case = {name: row[name] for name in ("kind", "sensor", "points")}
+        for (band,), pairs in cli.group_rows(row["pairs"], "band").items():
             table.append(
                 {
                     **case,

@@ -25,7 +25,6 @@ from tyro.conf import Positional, arg
 from dpmjax import DescriptorCloud, cli, load_model, registration_recall, scans, slam
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
-from experiments.dpm_clouds import open_drives
 
 EXPERIMENT = "dpm_keyframes"
 
@@ -49,7 +48,7 @@ class Config(cli.ModelOptions, cli.RunOptions):
 def main(config: Config) -> list[cli.Row]:
     """Makes the rows that are missing, and writes the table and the numbers."""
     model = load_model(config.weights)
-    drives = {drive.name: drive for drive in open_drives(config.paths)}
+    drives = {drive.name: drive for drive in cli.open_evaluation_drives(config.paths, [])}
 
     def work(_: cli.TableRun, sequence: str) -> cli.Row:
         return evaluate(model, drives[sequence], config.keyframes)

@@ -16,7 +16,7 @@ of each drive, and table.md a row a drive. A file of poses (TUM, KITTI) stands f
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,11 +61,11 @@ class Config(cli.DriveOptions):
 def main(config: Config) -> Any:
     """Lets the agents of each run map, joins their maps, writes; returns the numbers, or a row for each drive."""
     started = time.perf_counter()
-    methods, runs = agent_methods(config), open_runs(config)
+    methods, runs = make_methods(load_model(config.weights)), open_runs(config)
     if not config.cut:
         folder = cli.open_run_folder(config, EXPERIMENT)
         with cli.recording(folder), cli.StopFlag() as stop:
-            numbers = map_agents(folder, config, methods, runs[0], lambda: stop.is_requested)
+            numbers = map_agents(cli.TableRun(folder, lambda: stop.is_requested), config, methods, runs[0])
             numbers |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
             cli.write_metrics(folder, numbers, seed=config.seed)
             print(f"{summary(numbers)}\nresults in {folder.path}")
@@ -73,8 +73,8 @@ def main(config: Config) -> Any:
     by_name = {sequences[0].name: sequences for sequences in runs}
 
     def work(run: cli.TableRun, sequence: str) -> cli.Row:
-        part = run.folder.part("drives", sequence)
-        row = map_agents(part, config, methods, by_name[sequence], run.is_stopped)
+        part = run._replace(folder=run.folder.part("drives", sequence))
+        row = map_agents(part, config, methods, by_name[sequence])
         run.check_stop()
         return row
 
@@ -82,19 +82,13 @@ def main(config: Config) -> Any:
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(weights, table(rows)))
 
 
-def map_agents(
-    folder: cli.RunFolder,
-    config: Config,
-    methods: SlamMethods,
-    sequences: list[LidarSequence],
-    is_stopped: Callable[[], bool],
-) -> dict[str, Any]:
+def map_agents(run: cli.TableRun, config: Config, methods: SlamMethods, sequences: list[LidarSequence]) -> cli.Row:
     """Lets the agents of one run map, joins their maps, writes their files; returns the numbers."""
-    agents = []
+    agents, folder = [], run.folder
     for number, sequence in enumerate(sequences, start=1):
-        if not is_stopped():
+        if not run.is_stopped():
             part = folder.part("agents", f"agent_{number}")
-            agents.append(cli.map_drive(part, sequence, methods, is_stopped)[1])
+            agents.append(cli.map_drive(part, sequence, methods, run.is_stopped)[1])
     mapped = [sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)]
     with cli.progress_bar("loops between agents", " keyframes") as on_keyframe:
         result = join_agents(methods, agents, on_keyframe=on_keyframe)
@@ -106,18 +100,12 @@ def map_agents(
     return numbers
 
 
-def agent_methods(config: Config) -> SlamMethods:
-    """Returns the methods of the model, which all agents share."""
-    return make_methods(load_model(config.weights))
-
-
 def open_runs(config: Config) -> list[list[LidarSequence]]:
     """Opens the scans of the agents of each run; bad input that can be known before a run is a `ValueError`."""
     drives = [cli.open_drive(data, config, config.sequence) for data in config.data or (None,)]
     if len(drives) > 1 and not config.cut:
         return [drives]
-    if len({drive.name for drive in drives}) < len(drives):
-        raise ValueError(f"two drives have the same name ({', '.join(drive.name for drive in drives)})")
+    cli.check_names_differ(drives)
     return [cut_sequence(drive, config.agents, config.overlap) for drive in drives]
 
 

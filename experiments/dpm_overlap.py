@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from scipy.special import expit
 from tyro.conf import Positional, arg
 
 from dpmjax import DescriptorCloud, cli, io, load_model, metrics, simulation
@@ -79,12 +80,11 @@ def main(config: Config) -> list[cli.Row]:
     drives = cli.open_evaluation_drives(config.paths, [])
 
     def work(run: cli.TableRun) -> cli.Row:
-        fitted = measure_towns(model, FIRST_TOWN, config.towns, config.seed, run.check_stop)
-        other = measure_towns(model, FIRST_OTHER_TOWN, config.other_towns, config.seed, run.check_stop)
+        fitted = measure_towns(model, FIRST_TOWN, config.towns, config.seed, run)
+        other = measure_towns(model, FIRST_OTHER_TOWN, config.other_towns, config.seed, run)
         places = {"towns": joined([town.at(~town.is_hard) for town in other]), "towns, hard pairs too": joined(other)}
-        for drive, following in zip(drives, drives[1:] + drives[:1], strict=True):
+        for drive, following in run.until_stopped(zip(drives, drives[1:] + drives[:1], strict=True)):
             places[drive.name] = measure_drive(model, drive, following, config)
-            run.check_stop()
         return {"compared": compare(model, fitted, places, config.seed)}
 
     def report(rows: list[cli.Row]) -> cli.Summary:
@@ -94,17 +94,11 @@ def main(config: Config) -> list[cli.Row]:
     return cli.run_table(config, EXPERIMENT, [{}], work, report)
 
 
-def measure_towns(
-    model: dpm.Model, first: int, num_towns: int, seed: int, check_stop: Callable[[], object]
-) -> list[Examples]:
+def measure_towns(model: dpm.Model, first: int, num_towns: int, seed: int, run: cli.TableRun) -> list[Examples]:
     """Returns the pairs of each town; the next town gives scans of another place."""
     drives = [simulation.simulate_drive(first + number, length_m=TOWN_LENGTH_M) for number in range(num_towns + 1)]
-    found = []
-    for both in itertools.pairwise(drives):
-        pairs = calibrate.town_pairs(model, both, NUM_PAIRS, seed)
-        found.append(measure(model, pairs.sources, pairs.targets, pairs.distances_m < dpm.OVERLAP_M, pairs.is_hard))
-        check_stop()
-    return found
+    pairs = (calibrate.town_pairs(model, both, NUM_PAIRS, seed) for both in itertools.pairwise(drives))
+    return [measure(model, of_town) for of_town in run.until_stopped(pairs)]
 
 
 def measure_drive(model: dpm.Model, drive: io.LidarSequence, following: io.LidarSequence, config: Config) -> Examples:
@@ -120,22 +114,18 @@ def measure_drive(model: dpm.Model, drive: io.LidarSequence, following: io.Lidar
     if not len(far):
         others = dpm.encode_turned(model, following, rng.integers(len(following), size=min(num_far, 20)), rng=rng)
         targets[len(near) :] = [others[number % len(others)].described for number in range(num_far)]
-    return measure(model, sources, targets, np.arange(len(pairs)) < len(near), np.zeros(len(pairs), bool))
+    is_overlap = np.arange(len(pairs)) < len(near)
+    return measure(model, calibrate.LabelledPairs(sources, targets, is_overlap, np.zeros(len(pairs), bool)))
 
 
-def measure(
-    model: dpm.Model,
-    sources: Sequence[DescriptorCloud],
-    targets: Sequence[DescriptorCloud],
-    is_overlap: np.ndarray,
-    is_hard: np.ndarray,
-) -> Examples:
+def measure(model: dpm.Model, pairs: calibrate.LabelledPairs) -> Examples:
     """Matches pairs; float16 halves the correlated features in memory."""
+    sources, targets, is_overlap, is_hard = pairs
     correlated = [jax.device_get(dpm.correlate(model, *pair)) for pair in zip(sources, targets, strict=True)]
     features = np.stack([[cloud.features.astype(np.float16) for cloud in pair] for pair in correlated])
     mask = np.stack([[cloud.mask for cloud in pair] for pair in correlated])
     evidence = np.asarray(dpm.evidence_pairs(model, sources, targets), float)
-    return Examples(evidence, features, mask, np.asarray(is_overlap), np.asarray(is_hard))
+    return Examples(evidence, features, mask, is_overlap, is_hard)
 
 
 def joined(parts: Sequence[Examples]) -> Examples:
@@ -153,11 +143,11 @@ def compare(model: dpm.Model, towns: list[Examples], places: dict[str, Examples]
     scale, bias = dpm.fit_weights(head_logits(model, trained, stopping)[:, None], stopping.is_overlap)
 
     def of_head(head: Any, scale: float, bias: float) -> Callable[[Examples], np.ndarray]:
-        return lambda pairs: logistic(scale * head_logits(model, head, pairs) + bias)
+        return lambda pairs: expit(scale * head_logits(model, head, pairs) + bias)
 
     def regression(pairs: Examples, features: Callable[[Examples], np.ndarray]) -> Callable[[Examples], np.ndarray]:
         weights, bias = dpm.fit_weights(features(pairs), pairs.is_overlap)
-        return lambda other: logistic(features(other) @ weights + bias)
+        return lambda other: expit(features(other) @ weights + bias)
 
     def with_logit(pairs: Examples) -> np.ndarray:
         return np.column_stack([pairs.evidence, head_logits(model, trained, pairs)])
@@ -236,11 +226,6 @@ def _logits(model: dpm.Model, head: Any, features: jax.Array, mask: jax.Array) -
         return decoder.apply({"params": params}, a, b, method="overlap_logit")
 
     return jax.vmap(one)(features, mask)
-
-
-def logistic(logits: np.ndarray) -> np.ndarray:
-    """Returns probabilities; large logits overflow nowhere."""
-    return np.exp(-np.logaddexp(0, -logits))
 
 
 def table(rows: Sequence[cli.Row]) -> str:

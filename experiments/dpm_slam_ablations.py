@@ -81,21 +81,15 @@ def ablated(model: Model, setting: str) -> slam.SlamMethods:
 
 def table(rows: Sequence[cli.Row]) -> str:
     """Returns the table as Markdown."""
+
+    def cells(row: cli.Row) -> list[object]:
+        loops = f"{row['num_loops']} ({row.get('num_wrong_loops', '-')})"
+        errors = (cli.cell_text(row.get("ate_m"), 3), row.get("t_rel_percent"))
+        sizes = ", ".join(f"{row[f'map_bytes_{precision}'] / 1e6:.2f}" for precision in ("int8", "float32"))
+        return [row["sequence"], row["setting"], *errors, loops, row.get("loop_recall"), row["num_keyframes"], sizes]
+
     columns = ("drive", "setting", "ATE, m", "t_rel, %", "loops (wrong)", "recall of loops", "keyframes")
-    lines = [
-        [
-            row["sequence"],
-            row["setting"],
-            cli.cell_text(row.get("ate_m"), 3),
-            row.get("t_rel_percent"),
-            f"{row['num_loops']} ({row.get('num_wrong_loops', '-')})",
-            row.get("loop_recall"),
-            row["num_keyframes"],
-            ", ".join(f"{row[f'map_bytes_{precision}'] / 1e6:.2f}" for precision in ("int8", "float32")),
-        ]
-        for row in rows
-    ]
-    return cli.markdown((*columns, "map int8, float32, MB"), lines)
+    return cli.markdown((*columns, "map int8, float32, MB"), map(cells, rows))
 
 
 def with_fewer_elements(model: Model, num_elements: int) -> slam.SlamMethods:

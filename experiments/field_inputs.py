@@ -95,6 +95,9 @@ CASES = (
 )
 
 
+BY_NAME = {(case.data, case.command): case for case in CASES}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config(RunOptions):
     """Options of the table."""
@@ -112,15 +115,14 @@ class Config(RunOptions):
 
 def main(config: Config) -> list[dict[str, Any]]:
     """Runs the missing rows and writes the table."""
-    cases = [case for case in CASES if not config.only or Path(case.data).name in config.only]
-    named = [{"data": case.data, "command": case.command} for case in cases]
+    chosen = (case for case in CASES if not config.only or Path(case.data).name in config.only)
+    named = [{"data": case.data, "command": case.command} for case in chosen]
     return run_table(config, EXPERIMENT, named, functools.partial(_run, config=config), report)
 
 
 def report(rows: list[dict[str, Any]]) -> Summary:
     """Adds the results of before and the right ones."""
-    known = {(case.data, case.command): case for case in CASES}
-    cases = (known[row["data"], row["command"]] for row in rows)
+    cases = [BY_NAME[row["data"], row["command"]] for row in rows]
     compared = [row | {"before": case.before, "right": case.right} for row, case in zip(rows, cases, strict=True)]
     return Summary({}, table_of(compared), rows=compared)
 
@@ -128,7 +130,7 @@ def report(rows: list[dict[str, Any]]) -> Summary:
 def _run(table: TableRun, data: str, command: str, *, config: Config) -> dict[str, Any]:
     """Returns the exit code, the seconds, the message and the numbers of a run."""
     table.check_stop()
-    (case,) = (case for case in CASES if (case.data, case.command) == (data, command))
+    case = BY_NAME[data, command]
     words, started = command.format(*(2 * [str(config.data / data)])).split(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         ended = subprocess.run([sys.executable, "-m", "dpmjax", *words, "-o", folder], capture_output=True, text=True)

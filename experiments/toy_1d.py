@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, get_args
 
 import numpy as np
@@ -23,7 +24,8 @@ from dpmjax import deepmapping as dm
 
 EXPERIMENT = "toy_1d"
 FORMS = ("network", "direct")
-SOLVERS = ("gradient-descent", "lbfgs", "bfgs")
+# Solvers of jaxopt with a line search.
+SOLVERS = {"gradient-descent": "GradientDescent", "lbfgs": "LBFGS", "bfgs": "BFGS"}
 # Half the way to the next local minimum is 0.31; an end this close is in the right valley and at its bottom.
 _SAME_PLACE = 0.05
 # The pictures show -VIEW to VIEW.
@@ -104,13 +106,11 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.f
     import jax
     import jax.numpy as jnp
 
-    from experiments._baselines import minimize_toy
-
     runs = descend_both(toy, config)
     network, direct = map(path, runs)
     ends = {f"{name} form, gradient descent": x[:, -1] for name, x in zip(FORMS, (network, direct), strict=True)}
     for solver in SOLVERS:
-        solve = jax.jit(jax.vmap(lambda x, solver=solver: minimize_toy(x, solver, max_iterations=config.steps)))
+        solve = jax.jit(jax.vmap(partial(minimize, solver=solver, max_iterations=config.steps)))
         ends[f"direct form, jaxopt {solver}"] = np.asarray(solve(jnp.asarray(direct[:, 0])))
     # Out of the same vmap as the shares: the descent is chaotic, and one seed compiled alone rounds its way elsewhere.
     chosen = choose_seed(network, direct)
@@ -124,6 +124,13 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.f
         "direct_end": (x_direct, float(dm.toy_loss(x_direct))),
         "network_end_z": float(params.z),
     }
+
+
+def minimize(x0: Any, *, solver: str, max_iterations: int) -> Any:
+    """Returns the end of the descent of the direct form from `x0` by one of `SOLVERS`."""
+    import jaxopt
+
+    return getattr(jaxopt, SOLVERS[solver])(fun=dm.toy_loss, maxiter=max_iterations).run(x0).params
 
 
 def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating]) -> int:

@@ -17,7 +17,7 @@ from dpmjax.deepmapping.toy import (
     toy_loss,
     toy_problem,
 )
-from experiments._baselines import minimize_toy
+from experiments.toy_1d import minimize
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 SHORT = ToyConfig(num_steps=20)
@@ -90,14 +90,13 @@ def test_initialisations_have_their_spread(name: str) -> None:
 @pytest.mark.parametrize("method", ["gradient-descent", "lbfgs", "bfgs"])
 def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
     x_best, _ = global_minimum()
-    x = minimize_toy(jnp.float32(x_best + 0.05), method, max_iterations=50)
+    x = minimize(jnp.float32(x_best + 0.05), solver=method, max_iterations=50)
     assert float(x) == pytest.approx(x_best, abs=1e-3)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: minimize_toy(jnp.zeros(()), "newton"), "method: expected one of"),
         (lambda: ToyConfig(learning_rate=0.0), "learning_rate"),
         (lambda: ToyConfig(num_steps=0), "num_steps"),
         (lambda: ScalarNetConfig(initialization="zeros"), "initialization"),

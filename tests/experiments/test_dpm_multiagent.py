@@ -36,14 +36,15 @@ def run(*options) -> int:
     )
 
 
-def truth_methods(config) -> SlamMethods:
+def truth_methods(model) -> SlamMethods:
     return SlamMethods(TruthMatcher(TRUTH), TruthGeometry(TRUTH, sigma_m=0.02), SlamConfig())
 
 
 @pytest.fixture(autouse=True)
 def with_truth(monkeypatch) -> None:
     """Truth in place of the networks."""
-    monkeypatch.setattr(dpm_multiagent, "agent_methods", truth_methods)
+    monkeypatch.setattr(dpm_multiagent, "load_model", lambda weights: None)
+    monkeypatch.setattr(dpm_multiagent, "make_methods", truth_methods)
 
 
 def write_drive(folder: Path, numbers) -> Path:

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments.dpm_evaluate import KISS, MONITORED, NETWORK, SEARCH, VERIFIED, pooled_rows, pooled_table, table
+from experiments.dpm_evaluate import (
+    CLOUDS,
+    KISS,
+    MONITORED,
+    NETWORK,
+    SEARCH,
+    VERIFIED,
+    cloud_table,
+    pooled_rows,
+    pooled_table,
+    table,
+)
 
 NUM_PAIRS, NUM_NETWORK, NUM_SEARCH = 30, 20, 25
 
@@ -67,3 +78,11 @@ def test_the_pooled_table_names_the_drives_that_were_watched() -> None:
     assert f"| {NETWORK} | 20 | 0.667 (0.488 to 0.808) |" in seen
     assert f"{KISS} < 0.001" in seen
     assert "watched" not in pooled_table(pooled_rows(rows_of("a"), ["a"]))
+
+
+def test_clouds_have_a_row_for_each_number_of_elements() -> None:
+    row = {"method": f"{CLOUDS}512", "sequence": "street", "band": "near", "num_pairs": 20}
+    row |= {"recall_refined": 0.0, "median_error_refined_m": None}
+    lines = cloud_table([*rows_of("street"), row, row | {"num_pairs": 0}]).splitlines()
+    assert lines[2:] == ["| street | 2-10 m | 512 | 20 | 0.00 | - |"]
+    assert cloud_table(rows_of("street")) == ""

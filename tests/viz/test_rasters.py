@@ -10,6 +10,12 @@ from dpmjax.viz import ErrorMap, Limits, error_maps_figure, from_above_figure, o
 from dpmjax.viz.rasters import UNEXPLORED_GREY
 
 
+def draw_occupancy(probability, explored, extent, unit, path=((0.0, 0.0),), **view):
+    """The picture in the frame of the world, and all of it."""
+    view = {"T_view_world": np.eye(3), "limits": Limits(*extent), **view}
+    return occupancy_figure((probability, explored, extent), np.array(path), unit, **view)
+
+
 def example():
     probability = np.zeros((30, 50))
     probability[12:15, 10:40] = 1.0
@@ -30,7 +36,7 @@ def rendered_map(figure, dpi=100):
 
 def test_shares_of_black_white_and_grey_are_those_of_the_map():
     probability, explored = example()
-    image = rendered_map(occupancy_figure((probability, explored, (0, 100, 0, 60)), None, "px"))
+    image = rendered_map(draw_occupancy(probability, explored, (0, 100, 0, 60), "px"))
     grey = np.abs(image - round(255 * UNEXPLORED_GREY)).max(axis=-1) <= 2
     white = image.min(axis=-1) > 250
     black = image.max(axis=-1) < 5
@@ -42,7 +48,7 @@ def test_shares_of_black_white_and_grey_are_those_of_the_map():
 def test_row_zero_is_the_smallest_y():
     probability, explored = np.zeros((20, 20)), np.ones((20, 20), bool)
     probability[:5] = 1.0
-    image = rendered_map(occupancy_figure((probability, explored, (0, 10, 0, 10)), None, "m"))
+    image = rendered_map(draw_occupancy(probability, explored, (0, 10, 0, 10), "m"))
     assert image[-20:].mean() < 60
     assert image[20:100].mean() > 240
 
@@ -50,7 +56,7 @@ def test_row_zero_is_the_smallest_y():
 def test_trajectory_is_drawn_in_world_coordinates():
     probability, explored = example()
     path = np.array([[10.0, 10.0], [90.0, 50.0]])
-    figure = occupancy_figure((probability, explored, (0, 100, 0, 60)), path, "px")
+    figure = draw_occupancy(probability, explored, (0, 100, 0, 60), "px", path)
     assert any(np.array_equal(line.get_xydata(), path) for line in figure.axes[0].lines)
     assert figure.axes[0].get_xlim() == (0, 100)
     assert figure.axes[0].get_ylim() == (0, 60)
@@ -62,9 +68,7 @@ def test_a_quarter_turn_of_the_world_turns_the_picture():
     T_view_world = np.array([[0.0, -1.0, 10.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     path = np.array([[1.0, 2.0]])
     limits = Limits(0.0, 20.0, 0.0, 10.0)
-    figure = occupancy_figure(
-        (probability, explored, (0, 10, 0, 10)), path, "m", T_view_world=T_view_world, limits=limits
-    )
+    figure = draw_occupancy(probability, explored, (0, 10, 0, 10), "m", path, T_view_world=T_view_world, limits=limits)
     assert figure.axes[0].get_xlim() == (0, 20)
     np.testing.assert_allclose(figure.axes[0].lines[0].get_xydata(), [[8.0, 1.0]])
     image = rendered_map(figure).mean(axis=-1)
@@ -81,7 +85,7 @@ def test_a_quarter_turn_of_the_world_turns_the_picture():
 )
 def test_wrong_shapes_are_refused(explored_shape, extent, message):
     with pytest.raises(ValueError, match=message):
-        occupancy_figure((np.zeros((4, 5)), np.ones(explored_shape, bool), extent), None, "px")
+        draw_occupancy(np.zeros((4, 5)), np.ones(explored_shape, bool), extent, "px")
 
 
 def test_errors_are_drawn_on_one_scale_with_titles_trajectory_and_bar():

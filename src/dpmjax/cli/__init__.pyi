@@ -6,6 +6,7 @@ from .command import progress_bar as progress_bar
 from .command import run_command as run_command
 from .depth import depth_errors as depth_errors
 from .drives import DriveOptions as DriveOptions
+from .drives import check_names_differ as check_names_differ
 from .drives import keep_scans as keep_scans
 from .drives import open_drive as open_drive
 from .evaluate import BAND_NAMES as BAND_NAMES
@@ -17,6 +18,7 @@ from .evaluate import evaluation_towns as evaluation_towns
 from .evaluate import length_text as length_text
 from .evaluate import open_evaluation_drives as open_evaluation_drives
 from .evaluate import overlap_row as overlap_row
+from .evaluate import read_pairs as read_pairs
 from .evaluate import registration_row as registration_row
 from .info import environment as environment
 from .info import peak_rss_gb as peak_rss_gb
@@ -36,6 +38,7 @@ from .rows import Summary as Summary
 from .rows import TableRun as TableRun
 from .rows import cell_text as cell_text
 from .rows import do_row as do_row
+from .rows import group_rows as group_rows
 from .rows import markdown as markdown
 from .rows import run_table as run_table
 from .run_folder import METRICS as METRICS

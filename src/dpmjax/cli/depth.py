@@ -25,7 +25,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.result_files import write_poses
+from dpmjax.cli.result_files import named_initial, write_poses
 from dpmjax.cli.run_folder import RunFolder, RunOptions, ScanOptions, open_run_folder, recording, write_metrics
 
 if TYPE_CHECKING:
@@ -69,8 +69,7 @@ def main(config: Config) -> dict[str, Any]:
         print(f"{sequence.name}: {len(sequence)} images", "search of first poses ...", sep="\n", flush=True)
         recorder = FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
         settings = deepmapping.preset(config.preset, "depth", motion="planar" if sequence.is_planar else "full")
-        key = jax.random.key(config.seed)
-        found = deepmapping.register_depth(images, settings, key=key, engine=recorder)
+        found = deepmapping.register_depth(images, settings, key=jax.random.key(config.seed), engine=recorder)
         metrics = {
             **depth_numbers(sequence, found),
             **recorder.numbers,
@@ -110,7 +109,7 @@ def depth_numbers(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
         "consistency": 1 - (found.misfit if found.kept == "fit" else found.start_misfit),
         "consistency_initial": 1 - found.start_misfit,
         **after,
-        **{"_initial_".join(name.rsplit("_", 1)): value for name, value in before.items()},
+        **named_initial(before),
     }
 
 
@@ -166,8 +165,7 @@ def draw(folder: RunFolder, sequence: DepthSequence, found: Registered) -> None:
     panels = [("search of first poses", found.start), ("DeepMapping", found.fitted.T_world_scan)]
     if sequence.T_world_camera is not None:
         panels.append(("reference", sequence.T_world_camera))
-    figure = viz.from_above_figure(panels, sequence.points, sequence.mask)
-    viz.save_figure(figure, folder / "map.png", dpi=110)
+    viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), folder / "map.png", dpi=110)
     draw_loss(folder, "m")
 
 

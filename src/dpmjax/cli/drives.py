@@ -245,6 +245,13 @@ def find_sources(
     return sources
 
 
+def check_names_differ(drives: Iterable[LidarSequence]) -> None:
+    """Raises a ValueError where two drives have the same name."""
+    names = sorted(drive.name for drive in drives)
+    if len(set(names)) < len(names):
+        raise ValueError(f"two drives have the same name ({', '.join(names)}); evaluate them one by one")
+
+
 class ScanReader:
     """Reads scans, with point times for deskewing.
 
@@ -262,9 +269,14 @@ class ScanReader:
         points = self.sequence.read_points(index)
         if not self._is_deskewed or not len(points):
             return points
-        offsets = self._offsets_by_times(index)
-        if offsets is None:
-            offsets = scans.offsets_by_azimuth(points, self._turn_share(index))
+        interval_s = self._interval_s(index)
+        times = None if self.sequence.read_times is None else self.sequence.read_times(index)
+        offsets = None if times is None else scans.offsets_by_times(times, interval_s)
+        if offsets is None:  # by the time of a turn, as a share of the time between scans
+            turn_share = 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
+            offsets = scans.offsets_by_azimuth(points, turn_share)
+        elif interval_s is None:
+            offsets = offsets / self._jump
         return slam.TimedScan(points, offsets)
 
     def iterate(self, start: int) -> Generator[slam.TimedScan | np.ndarray, None, None]:
@@ -276,20 +288,6 @@ class ScanReader:
                 done, waiting = waiting, pool.submit(self, index + 1) if index + 1 in numbers else None
                 assert done is not None
                 yield done.result()
-
-    def _offsets_by_times(self, index: int) -> np.ndarray | None:
-        """Returns the offsets by the times in the file; None where it has no usable times."""
-        times = None if self.sequence.read_times is None else self.sequence.read_times(index)
-        if times is None:
-            return None
-        interval_s = self._interval_s(index)
-        offsets = scans.offsets_by_times(times, interval_s)
-        return offsets if offsets is None or interval_s is not None else offsets / self._jump
-
-    def _turn_share(self, index: int) -> float:
-        """Returns the time of a turn, as a share of the time between the two scans before."""
-        interval_s = self._interval_s(index)
-        return 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
 
     def _interval_s(self, index: int) -> float | None:
         """Returns the time between the two scans before, whose motion predicts this one; None where it is unknown."""

@@ -15,19 +15,19 @@ where the drive has some) with pairs more than 40 m apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
-from dpmjax.cli.drives import Source, find_sources
-from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, markdown, run_table
+from dpmjax.cli.drives import Source, check_names_differ, find_sources
+from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, group_rows, markdown, run_table
 from dpmjax.cli.run_folder import ModelOptions, RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 
@@ -74,9 +74,8 @@ def main(config: Config) -> list[Row]:
     def work(run: TableRun, sequence: str, band: str) -> Row:
         drive = by_name[sequence]
         if band == "overlap":
-            num_pairs = OVERLAP_FACTOR * config.pairs
-            return overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
-        return registration_row(model, drive, band, config.pairs, seed=config.seed, on_pair=run.check_stop)
+            return overlap_row(model, drive, OVERLAP_FACTOR * config.pairs, seed=config.seed, on_scan=run.check_stop)
+        return registration_row(model, read_pairs(run, drive, band, config), config.pairs)
 
     def report(rows: list[Row]) -> Summary:
         numbers, text = calibration_numbers(rows), table(rows)
@@ -115,29 +114,22 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list
     for drive in drives:
         if not len(deeppointmap.draw_scan_pairs(drive, "near", 1)):
             raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")
-    names = [drive.name for drive in drives]
-    if len(set(names)) < len(names):
-        raise ValueError(f"two drives have the same name ({', '.join(sorted(names))}); evaluate them one by one")
+    check_names_differ(drives)
     return drives
 
 
-def registration_row(
-    model: deeppointmap.Model,
-    drive: LidarSequence,
-    band: str,
-    num_pairs: int,
-    *,
-    seed: int,
-    on_pair: Callable[[], object],
-) -> Row:
+def read_pairs(run: TableRun, drive: LidarSequence, band: str, config: Any) -> Iterator[deeppointmap.ScanPair]:
+    """Yields random pairs of scans of a band of distances; `config` has their number, `pairs`, and the seed."""
+    drawn = deeppointmap.draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
+    return run.until_stopped(deeppointmap.read_scan_pairs(drive, drawn, seed=config.seed))
+
+
+def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.ScanPair], num_asked: int) -> Row:
     """Returns errors by stage, confidence and seconds of the registrations of a band of distances."""
-    pairs = deeppointmap.read_scan_pairs(
-        drive, deeppointmap.draw_scan_pairs(drive, band, num_pairs, seed=seed), seed=seed
-    )
-    found = deeppointmap.evaluate_scan_pairs(model, pairs, on_pair=on_pair)
+    found = deeppointmap.evaluate_scan_pairs(model, pairs)
     row: Row = {
         "is_calibrated": model.config.calibration is not None,
-        "num_asked": num_pairs,
+        "num_asked": num_asked,
         "confidence": found.confidence.tolist(),
     }
     for stage in STAGES:
@@ -186,8 +178,7 @@ def calibration_numbers(rows: Sequence[Row]) -> Row:
         confidence, is_right = (np.concatenate([row[name] for row in some]) for name in ("confidence", "is_right"))
         return metrics.brier_score(confidence, is_right.astype(bool))
 
-    bands = dict.fromkeys(row["band"] for row in known)
-    numbers = {f"brier_{band}": brier([row for row in known if row["band"] == band]) for band in bands}
+    numbers = {f"brier_{band}": brier(some) for (band,), some in group_rows(known, "band").items()}
     is_calibrated = all(row["is_calibrated"] for row in known)
     return {"brier": brier(known), **numbers, "is_calibrated": is_calibrated} if known else {}
 
@@ -222,8 +213,7 @@ def worst_failures(
         *_, pair = deeppointmap.read_scan_pairs(drive, drawn[: number + 1], seed=seed)
         a, b = drawn[number]
         title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
-        T = np.asarray(row["motions"][number]).reshape(4, 4)
-        motions = {"found": T, "true": pair.T_target_source}
+        motions = {"found": np.reshape(row["motions"][number], (4, 4)), "true": pair.T_target_source}
         shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions))
     return shown
 

@@ -59,8 +59,7 @@ def main(config: Config) -> dict[str, Any]:
     folder = open_run_folder(config, NAME)
     with recording(folder):
         found = pose_graph.optimize_pose_graph(graph, settings)
-        wall_s = time.perf_counter() - started
-        metrics = {"graph": config.graph.name, **graph_numbers(found), "wall_s": wall_s}
+        metrics = {"graph": config.graph.name, **graph_numbers(found), "wall_s": time.perf_counter() - started}
         poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
         write_g2o(folder / "graph.g2o", found.graph)
         io.write_tum(folder / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")

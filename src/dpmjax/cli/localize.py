@@ -186,8 +186,7 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[st
         return {}, None
     errors = localization_errors(results, case.slam_map, reference, drive.T_world_lidar)
     is_wrong = (~errors.is_right & drive.has_reference)[errors.is_found]
-    apart = np.linalg.norm(drive.T_world_lidar[:, None, :3, 3] - reference[None, :, :3, 3], axis=2)
-    num_inside, num_right = int((apart.min(axis=1) <= REACH_M).sum()), int(errors.is_right.sum())
+    num_inside, num_right = int((errors.keyframe_distance_m <= REACH_M).sum()), int(errors.is_right.sum())
     numbers: dict[str, Any] = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
     if num_right:
         numbers["median_error_m"] = float(np.median(errors.translation_m[errors.is_right]))

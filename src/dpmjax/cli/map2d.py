@@ -36,7 +36,7 @@ from dpmjax.cli import run_folder
 from dpmjax.cli.command import StopFlag, check_least
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.result_files import write_poses
+from dpmjax.cli.result_files import named_initial, write_poses
 
 if TYPE_CHECKING:
     from dpmjax.deepmapping import DeepMappingConfig, Fit, Fitted
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from dpmjax.sequences import ScanSequence
 
 Floats = NDArray[np.float64]
+# Computes numbers, by name, of the poses of all scans.
+Measure = Callable[[Floats], dict[str, float]]
 
 NAME = "map2d"
 LOGGER = logging.getLogger("dpmjax.map2d")
@@ -164,12 +166,7 @@ def register_sequence(
         )
 
 
-def map_numbers(
-    sequence: ScanSequence,
-    result: RegisteredScans,
-    config: Config,
-    measure: Callable[[Floats, str], dict[str, float]],
-) -> dict[str, Any]:
+def map_numbers(sequence: ScanSequence, result: RegisteredScans, config: Config, measure: Measure) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
     registered = results.registered_scans(sequence, result)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
@@ -181,8 +178,8 @@ def map_numbers(
         "num_scans": len(sequence),
         "num_registered": len(registered),
         **results.before_and_after(registered, start, kept),
-        **measure(result.recording.between(start), "_initial"),
-        **measure(result.poses, ""),
+        **named_initial(measure(result.recording.between(start))),
+        **measure(result.poses),
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
@@ -193,7 +190,7 @@ def map_numbers(
     }
 
 
-def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str], dict[str, float]]:
+def measures_of(config: Config, sequence: ScanSequence) -> Measure:
     """Reads further references of the scans.
 
     Args:
@@ -201,7 +198,7 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
         sequence: all scans.
 
     Returns:
-        A function of the poses of all scans and a suffix of the names; it returns the numbers.
+        A function of the poses of all scans; it returns the numbers by name.
 
     Raises:
         ValueError: a file does not belong to the scans.
@@ -209,17 +206,17 @@ def measures_of(config: Config, sequence: ScanSequence) -> Callable[[Floats, str
     relations = None if config.relations is None else io.read_relations(config.relations)
     corrected = None if config.corrected is None else io.read_sequence(config.corrected)
     if relations is None and corrected is None:
-        return lambda _poses, _suffix: {}
+        return lambda _poses: {}
     times = sequence.times
     if times is None:
         raise ValueError(f"{sequence.name}: its scans have no times, which relations and a corrected log need")
 
-    def measure(poses: Floats, suffix: str) -> dict[str, float]:
-        by_relations = {} if relations is None else results.relation_numbers(times, poses, relations, suffix)
-        return by_relations | ({} if corrected is None else results.corrected_numbers(times, poses, corrected, suffix))
+    def measure(poses: Floats) -> dict[str, float]:
+        by_relations = {} if relations is None else results.relation_numbers(times, poses, relations)
+        return by_relations | ({} if corrected is None else results.corrected_numbers(times, poses, corrected))
 
     # Files of another drive are refused before any long work.
-    measure(np.zeros((len(sequence), 3)), "")
+    measure(np.zeros((len(sequence), 3)))
     return measure
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax import deepmapping, metrics, registration2d, viz
+from dpmjax.cli.result_files import named_initial
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.sequences import Relations, ScanSequence
 
@@ -71,23 +72,23 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
     return {
         **after,
-        **{name.replace(f"_{unit}", f"_initial_{unit}"): value for name, value in before.items()},
+        **named_initial(before),
         f"success_threshold_{unit}": threshold,
         "success": after[f"ate_{unit}"] < threshold,
     }
 
 
-def relation_numbers(times: Floats, poses: Floats, relations: Relations, suffix: str = "") -> dict[str, float]:
+def relation_numbers(times: Floats, poses: Floats, relations: Relations) -> dict[str, float]:
     """Computes the mean errors of the poses of all scans against hand-checked relations."""
     found = metrics.relation_errors(relations, times, poses)
     return {
-        f"relations{suffix}_m": float(found.translation_m.mean()),
-        f"relations{suffix}_deg": float(found.rotation_deg.mean()),
+        "relations_m": float(found.translation_m.mean()),
+        "relations_deg": float(found.rotation_deg.mean()),
         "num_relations": int(found.is_used.sum()),
     }
 
 
-def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suffix: str = "") -> dict[str, float]:
+def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence) -> dict[str, float]:
     """Computes the ATE at the common scans of a corrected log of the same drive, and errors of its relations.
 
     The relations are the relative poses of successive scans of the corrected log.
@@ -96,7 +97,6 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
         times: of all scans.
         poses: of all scans.
         corrected: the corrected log.
-        suffix: of the names.
 
     Returns:
         The numbers by name.
@@ -118,9 +118,9 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence, suf
         Relations(at[:-1], at[1:], se2.relative(reference[:-1], reference[1:])), at, poses[mine]
     )
     return {
-        f"ate_corrected{suffix}_m": float(metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2])),
-        f"relations_corrected{suffix}_m": float(steps.translation_m.mean()),
-        f"relations_corrected{suffix}_deg": float(steps.rotation_deg.mean()),
+        "ate_corrected_m": float(metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2])),
+        "relations_corrected_m": float(steps.translation_m.mean()),
+        "relations_corrected_deg": float(steps.rotation_deg.mean()),
         "num_corrected": len(mine),
     }
 
@@ -141,8 +141,7 @@ def _trust_lines(assessment: Mapping[str, Any]) -> list[str]:
 
 def spans_of(rows: Sequence[int]) -> list[str]:
     """Returns increasing numbers as spans, such as 3-5 and 9."""
-    breaks = np.flatnonzero(np.diff(rows) > 1) + 1
-    parts = np.split(np.asarray(rows), breaks)
+    parts = np.split(np.asarray(rows), np.flatnonzero(np.diff(rows) > 1) + 1)
     return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts if len(part)]
 
 
@@ -209,6 +208,6 @@ def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: Register
     picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
     kept, reference = result.candidates[result.kept].poses, registered.reference_poses
     anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
-    T_view_fit = metrics.align_rigid(trajectory, anchor[:, :2])
+    T_view_fit = np.asarray(metrics.align_rigid(trajectory, anchor[:, :2]))
     figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
     viz.save_figure(figure, folder / "occupancy.png")

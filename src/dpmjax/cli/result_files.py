@@ -61,6 +61,12 @@ def as_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
+    """Returns errors under their names for the initial poses, such as ate_initial_m for ate_m; counts are left out."""
+    errors = {name: value for name, value in numbers.items() if not name.startswith("num_")}
+    return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
+
+
 def commits_note(rows: Sequence[Mapping[str, Any]], commit: str | None) -> str | None:
     """Returns a note on rows of other commits than the one that writes the file.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from tqdm import tqdm
 
@@ -19,6 +19,7 @@ from dpmjax.cli.run_folder import RunFolder, RunOptions, open_run_folder, record
 from dpmjax.io.files import write_atomically
 
 Row = dict[str, Any]
+Item = TypeVar("Item")
 
 
 class RowStopped(Exception):
@@ -40,6 +41,12 @@ class TableRun(NamedTuple):
         """Raises `RowStopped` after a signal; a callback of the work on a row."""
         if self.is_stopped():
             raise RowStopped
+
+    def until_stopped(self, items: Iterable[Item]) -> Iterator[Item]:
+        """Yields the items of the work on a row, and raises `RowStopped` after a signal."""
+        for item in items:
+            self.check_stop()
+            yield item
 
 
 class Summary(NamedTuple):
@@ -81,8 +88,7 @@ def run_table(
     with recording(folder), StopFlag() as stop:
         table, rows = TableRun(folder, lambda: stop.is_requested), list[Row]()
         with suppress(RowStopped):
-            for case in tqdm(list(cases), unit=" rows"):
-                table.check_stop()
+            for case in table.until_stopped(tqdm(list(cases), unit=" rows")):
                 rows.append(do_row(folder.path, case, partial(work, table, **case), seed=config.seed))
         summary = report(rows) if rows else Summary({}, "no row is finished")
         # Numbers come before pictures, so that they are written even if a picture fails.
@@ -94,6 +100,14 @@ def run_table(
             summary.write_more(folder)
     print(f"results in {folder.path}")
     return rows
+
+
+def group_rows(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Returns the rows by the values of some keys, in the order in which they first appear."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -51,12 +51,14 @@ class LocalizationErrors(NamedTuple):
         is_right: (n,) True where the scan was found within 2 m and 5 degrees.
         translation_m: (n,) NaN where it was not found.
         rotation_deg: (n,) NaN where it was not found.
+        keyframe_distance_m: (n,) distance of the true position to the nearest keyframe.
     """
 
     is_found: np.ndarray
     is_right: np.ndarray
     translation_m: np.ndarray
     rotation_deg: np.ndarray
+    keyframe_distance_m: np.ndarray
 
 
 def localization_errors(
@@ -86,7 +88,9 @@ def localization_errors(
         recall = metrics.registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
         is_right[is_found] = recall.is_right
         errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg
-    return LocalizationErrors(is_found, is_right, *errors)
+    apart = np.linalg.norm(T_reference_scan[:, None, :3, 3] - T_reference_keyframe[None, :, :3, 3], axis=2)
+    translation_m, rotation_deg = errors
+    return LocalizationErrors(is_found, is_right, translation_m, rotation_deg, apart.min(axis=1))
 
 
 UNSURE = {

@@ -232,8 +232,7 @@ def draw_curves(folder: RunFolder) -> None:
         names = {name: name.replace("_", " ") for name in SHOWN_CURVES}
         curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
         curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
-        steps = [int(row["step"]) for row in rows]
-        viz.save_figure(viz.curves_figure(steps, curves), folder / "loss.png")
+        viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), folder / "loss.png")
 
 
 def draw_matches(folder: RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:

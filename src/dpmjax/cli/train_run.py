@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.cli.drives import TOWN, Source
+from dpmjax.cli.drives import Source
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
 from dpmjax.io import open_lidar_sequence
@@ -78,26 +78,15 @@ def prepare_sources(
     sources: Sequence[Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
 ) -> list[dpm.PreparedDrive]:
     """Returns all drives, each prepared in a process of its own and kept in `folder` for later runs."""
-    with tqdm(total=len(sources), desc="prepare scans", unit=" drives", dynamic_ncols=True) as bar:
-        if len(sources) == 1:
-            with tqdm(desc=str(sources[0].path or TOWN), unit=" scans", leave=False) as scans:
-                prepared = dpm.prepare_drive(
-                    sources[0].open(), settings, folder=folder, seed=seed, on_scan=lambda: scans.update(1)
-                )
-            bar.update(1)
-            return [prepared]
-        # A fresh interpreter: a fork of a process that runs JAX may hang.
-        num_workers = min(len(sources), os.cpu_count() or 1)
-        pool = ProcessPoolExecutor(num_workers, get_context("spawn"), initializer=_use_processor)
-        try:
-            tasks = {pool.submit(_prepare, source, settings, folder, seed): source for source in sources}
-            done: dict[Source, dpm.PreparedDrive] = {}
-            for task in as_completed(tasks):
-                done[tasks[task]] = task.result()
-                bar.update(1)
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return [done[source] for source in sources]
+    prepare = partial(_prepare, settings=settings, folder=folder, seed=seed)
+    if len(sources) == 1:
+        with tqdm(desc="prepare scans", unit=" scans", dynamic_ncols=True) as bar:
+            return [prepare(sources[0], on_scan=lambda: bar.update(1))]
+    # A fresh interpreter: a fork of a process that runs JAX may hang.
+    num_workers = min(len(sources), os.cpu_count() or 1)
+    with ProcessPoolExecutor(num_workers, get_context("spawn"), initializer=_use_processor) as pool:
+        found = pool.map(prepare, sources)
+        return list(tqdm(found, "prepare scans", len(sources), unit=" drives", dynamic_ncols=True))
 
 
 def _use_processor() -> None:
@@ -105,8 +94,8 @@ def _use_processor() -> None:
     jax.config.update("jax_platforms", "cpu")
 
 
-def _prepare(source: Source, settings: dpm.TrainingConfig, folder: Path, seed: int) -> dpm.PreparedDrive:
-    return dpm.prepare_drive(source.open(), settings, folder=folder, seed=seed)
+def _prepare(source: Source, *, settings: dpm.TrainingConfig, **options: Any) -> dpm.PreparedDrive:
+    return dpm.prepare_drive(source.open(), settings, **options)
 
 
 class Records:

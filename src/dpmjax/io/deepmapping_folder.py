@@ -57,8 +57,7 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
         points *= np.float32(_PIXELS_PER_UNIT)
     pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
     reference = None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names))
-    is_organised = has_angular_order(points, mask)
-    return ScanSequence(Path(path).stem, points, mask, unit or "px", is_organised, reference)
+    return ScanSequence(Path(path).stem, points, mask, unit or "px", has_angular_order(points, mask), reference)
 
 
 def _list_files(path: Path) -> dict[str, bytes]:

@@ -6,9 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dpmjax.io.bags import is_bag
 from dpmjax.io.bin_columns import check_size, columns_of_drive
 from dpmjax.io.files import log_notes, natural_key
@@ -25,7 +22,7 @@ from dpmjax.io.lidar_datasets import (
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
 from dpmjax.io.scan_bags import open_lidar_bag
-from dpmjax.io.scan_file import read_point_times, read_timed_cloud, unit_note
+from dpmjax.io.scan_file import read_point_times, read_timed_cloud, with_unit_doubt
 from dpmjax.io.scan_files import scan_files, stray_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
@@ -98,16 +95,10 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
         bin_columns, note = columns_of_drive(files)
         notes.append(note)
 
-    def read_scan(index: int) -> NDArray[np.float32]:
-        points = read_timed_cloud(files[index], bin_columns).points
-        if index == 0 and (note := unit_note(points, files[index])) is not None:
-            log_notes([note])
-        return points
-
     return LidarSequence(
         drive.name,
         tuple(map(str, files)),
-        read_scan,
+        with_unit_doubt(lambda index: read_timed_cloud(files[index], bin_columns).points, files),
         drive.T_world_lidar,
         drive.times,
         lambda index: read_point_times(files[index]),

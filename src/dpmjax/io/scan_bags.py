@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from dpmjax.io.array_files import to_float32
 from dpmjax.io.bags import LASER_SCAN, LIVOX_CLOUDS, MULTI_ECHO_SCAN, POINT_CLOUD, Bag
 from dpmjax.io.clouds import TimedCloud, cloud_of
-from dpmjax.io.files import log_notes, refusing
+from dpmjax.io.files import refusing
 from dpmjax.io.poses import homogeneous, interpolate_poses
-from dpmjax.io.scan_file import check_scan, unit_note
+from dpmjax.io.scan_file import check_scan, with_unit_doubt
 from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, has_angular_order, pad_scans
 
 _ODOMETRY, _TRANSFORMS = "nav_msgs/msg/Odometry", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -204,14 +204,8 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
             cloud = _cloud_of(message, chosen.kind)
         return check_scan(cloud, sources[index])
 
-    def read_scan(index: int) -> np.ndarray:
-        points = read(index).points
-        if index == 0 and (note := unit_note(points, sources[0])) is not None:
-            log_notes([note])
-        return points
-
-    name = path.resolve().stem
-    return LidarSequence(name, sources, read_scan, None, times, lambda index: read(index).times)
+    read_scan = with_unit_doubt(lambda index: read(index).points, sources)
+    return LidarSequence(path.resolve().stem, sources, read_scan, None, times, lambda index: read(index).times)
 
 
 def _cloud_of(message: Any, kind: str) -> TimedCloud:

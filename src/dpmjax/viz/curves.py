@@ -33,13 +33,13 @@ class History:
         seconds: (k,) run time, never decreasing, compile time left out.
         loss: (k,) value of the phase's own objective; NaN where there is none.
         phase: (k,) name of the phase of each record ("L-Net", "free poses", "polish").
-        ate: (k,) absolute trajectory error in the unit of the figure, NaN where not measured; None without a reference.
+        ate: (k,) absolute trajectory error in the unit of the figure, NaN where not measured.
     """
 
     seconds: NDArray[np.floating]
     loss: NDArray[np.floating]
     phase: Sequence[str]
-    ate: NDArray[np.floating] | None = None
+    ate: NDArray[np.floating]
 
 
 class _Phase(NamedTuple):
@@ -66,13 +66,13 @@ def history_figure(history: History, unit: str) -> Figure:
     Raises:
         ValueError: no record, or columns of different lengths.
     """
-    seconds, loss = np.asarray(history.seconds, np.float64), np.asarray(history.loss, np.float64)
-    ate = None if history.ate is None else np.asarray(history.ate, np.float64)
-    lengths = [len(seconds), len(loss), len(history.phase)] + ([] if ate is None else [len(ate)])
+    seconds, loss, ate = (np.asarray(column, np.float64) for column in (history.seconds, history.loss, history.ate))
+    lengths = [len(column) for column in (seconds, loss, history.phase, ate)]
     if len(set(lengths)) != 1 or lengths[0] == 0:
         raise ValueError(f"expected one or more records and columns of one length; got lengths {lengths}")
 
-    has_ate = ate is not None and bool(np.isfinite(ate).any())
+    is_known = np.isfinite(ate)
+    has_ate = bool(is_known.any())
     figure = figures.new_figure(8.0, 5.2 if has_ate else 3.0)
     rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
     phases = _phases(history.phase, seconds)
@@ -82,8 +82,7 @@ def history_figure(history: History, unit: str) -> Figure:
     for phase in phases:
         _draw_line(rows[0], seconds[phase.rows], loss[phase.rows], LOSS_COLOR)
     _finish_value_axis(rows[0], loss, "loss")
-    if has_ate and ate is not None:
-        is_known = np.isfinite(ate)
+    if has_ate:
         _draw_line(rows[1], seconds[is_known], ate[is_known], ACCENT)
         _finish_value_axis(rows[1], ate, f"ATE ({unit})")
         last = seconds[is_known][-1], ate[is_known][-1]

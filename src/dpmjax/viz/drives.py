@@ -69,8 +69,7 @@ def trajectory_figure(
     shown = [track.positions for track in tracks] + ([] if reference is None else [reference])
     limits = figures.plane_limits(np.concatenate(shown)[:, :2], 0.06)
     (width_in, height_in), has_errors = figures.size_in(limits), any(track.errors_m is not None for track in tracks)
-    total_in = (width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
-    figure = figures.new_figure(*total_in)
+    figure = figures.new_figure(width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
     axes = figures.add_axes(figure, (0.15, 0.65, width_in, height_in))
     if reference is not None:
         axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)

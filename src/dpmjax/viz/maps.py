@@ -151,8 +151,7 @@ def _shared_limits(panels: Sequence[Panel], anchor: Panel) -> Limits:
 def _extent(panel: Panel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Returns the corners of the box around trajectory and nearly all points; a unit box where there is nothing."""
     points, _ = panel.visible_points()
-    trajectory = panel.trajectory_world[np.isfinite(panel.trajectory_world).all(axis=-1)]
-    corners = [trajectory]
+    corners = [panel.trajectory_world[np.isfinite(panel.trajectory_world).all(axis=-1)]]
     if len(points):
         corners.append(np.quantile(points, [OUTER_QUANTILE, 1.0 - OUTER_QUANTILE], axis=0))
     stacked = np.concatenate(corners)

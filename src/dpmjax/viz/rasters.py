@@ -22,25 +22,27 @@ OBSTACLE = "#e4e6e9"
 TRAJECTORY = "#16c7d9"
 RIGHT = "#2a9d5c"
 HEAD_SHARE = 0.02
+# Points with a smaller y than this, in the frame of the first camera, are the ceiling.
+CEILING_M = -0.9
 
 
 def occupancy_figure(
     picture: tuple[ArrayLike, ArrayLike, tuple[float, float, float, float]],
-    trajectory_world: ArrayLike | None,
+    trajectory_world: NDArray[np.floating],
     unit: str,
     *,
-    T_view_world: ArrayLike | None = None,
-    limits: Limits | None = None,
+    T_view_world: NDArray[np.floating],
+    limits: Limits,
 ) -> Figure:
     """Draws an occupancy map in the manner of DeepMapping, Figure 5.
 
     Args:
         picture: (h, w) probability that a cell is occupied, row 0 at the smallest y; (h, w) True where a beam passed or
             ended; and x_min, x_max, y_min, y_max of the grid's outer edges in the world, in `unit`.
-        trajectory_world: (n, 2) sensor positions, or None.
+        trajectory_world: (n, 2) sensor positions.
         unit: unit of lengths, "px" or "m".
-        T_view_world: (3, 3) rigid motion into the frame of the picture; None draws the world unchanged.
-        limits: shown part of that frame; None shows the grid.
+        T_view_world: (3, 3) rigid motion into the frame of the picture.
+        limits: shown part of that frame.
 
     Returns:
         The figure.
@@ -56,9 +58,6 @@ def occupancy_figure(
     extent = Limits(*(float(edge) for edge in picture[2]))
     if not (extent.width > 0.0 and extent.height > 0.0):
         raise ValueError(f"expected an extent (x_min, x_max, y_min, y_max) with min < max; got {tuple(extent)}")
-    T = np.eye(3) if T_view_world is None else np.asarray(T_view_world, np.float64)
-    limits = limits or extent
-
     scale_in = LONGER_SIDE_IN / max(limits.width, limits.height)
     width_in, height_in = limits.width * scale_in, limits.height * scale_in
     figure = figures.new_figure(width_in + 2.0 * GAP_IN, height_in + 2.0 * GAP_IN)
@@ -66,9 +65,8 @@ def occupancy_figure(
     brightness = np.where(explored, 1.0 - np.clip(probability, 0.0, 1.0), UNEXPLORED_GREY)
     axes.set_facecolor(str(UNEXPLORED_GREY))
     image = figures.show_raster(axes, brightness, extent, cmap="gray", vmin=0.0, vmax=1.0)
-    image.set_transform(Affine2D(T) + axes.transData)
-    if trajectory_world is not None:
-        figures.draw_trajectory(axes, np.asarray(trajectory_world, np.float64) @ T[:2, :2].T + T[:2, 2], ACCENT)
+    image.set_transform(Affine2D(T_view_world) + axes.transData)
+    figures.draw_trajectory(axes, trajectory_world @ T_view_world[:2, :2].T + T_view_world[:2, 2], ACCENT)
     figures.frame_map(axes, limits, unit)
     return figure
 
@@ -132,16 +130,13 @@ def error_maps_figure(
     return figure
 
 
-def from_above_figure(
-    panels: Sequence[tuple[str, ArrayLike]], points: ArrayLike, mask: ArrayLike, *, below_m: float = -0.9
-) -> Figure:
+def from_above_figure(panels: Sequence[tuple[str, NDArray[np.float64]]], points: ArrayLike, mask: ArrayLike) -> Figure:
     """Draws depth images from above, without the ceiling, one colour for each image, for several sets of poses.
 
     Args:
         panels: title and (n, 4, 4) T_world_camera in metres; all are aligned with the last.
         points: (n, h, w, 3) in the camera frames (y down).
         mask: (n, h, w).
-        below_m: points with a smaller y than this are the ceiling.
 
     Returns:
         The figure.
@@ -152,7 +147,7 @@ def from_above_figure(
     if not panels:
         raise ValueError("panels: expected at least one")
     cloud, valid = np.asarray(points, np.float64), np.asarray(mask, bool)
-    poses = [np.asarray(panel[1], np.float64) for panel in panels]
+    poses = [T for _, T in panels]
     # The first camera is level in every panel, so the panels are aligned by the first poses.
     aligned = [poses[-1][0] @ np.linalg.inv(T[0]) @ T for T in poses]
     clouds = [np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3] for T in aligned]
@@ -166,7 +161,7 @@ def from_above_figure(
     size = float(np.clip(200 / np.sqrt(max(valid.sum(), 1)), 1.2, 4))
     for axes, (title, _), world, centres in zip(axes_row, panels, clouds, sensors, strict=True):
         for image, color in enumerate(colors):
-            shown = world[image][valid[image] & (world[image][..., 1] > below_m)]
+            shown = world[image][valid[image] & (world[image][..., 1] > CEILING_M)]
             axes.plot(shown[:, 0], shown[:, 2], ".", ms=size, mew=0, color=color)
         axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
         figures.frame_map(axes, limits, "m" if axes is axes_row[0] else None)
