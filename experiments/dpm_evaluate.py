@@ -13,8 +13,9 @@ to 20 m apart and turned by any yaw, are registered. A registration within 2 m a
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
-a scan; the scans themselves are not used again. Rows of all recorded drives together have confidence intervals and say
-which methods differ.
+a scan; the scans themselves are not used again. Another table has the accuracy of the offset head along each axis, as
+coefficient of determination and root mean square residual. Rows of all recorded drives together have confidence
+intervals and say which methods differ.
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
@@ -53,6 +54,7 @@ NETWORK, VERIFIED = "network alone", "network, search and verification"
 SEARCH, KISS = "search and verification, no network", "KISS-Matcher"
 # Beginning of the names of matches of clouds, before the number of surface elements.
 CLOUDS = "clouds, elements "
+OFFSETS = "offsets"
 # The row and its entry that say which pairs a method has registered right.
 _ANSWERS = {
     NETWORK: ("DeepPointMap", "is_right_descriptors"),
@@ -132,8 +134,10 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
             return cli.overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
         if method == "DeepPointMap":
             return cli.registration_row(model, cli.read_pairs(run, drive, band, config), config.pairs)
-        return evaluate_matcher(matchers[method], cli.read_pairs(run, drive, band, config))
+        pairs = cli.read_pairs(run, drive, band, config)
+        return offset_row(model, pairs) if method == OFFSETS else evaluate_matcher(matchers[method], pairs)
 
+    methods += [OFFSETS] if config.clouds else []
     bands = [(method, band) for band in ("near", "middle") for method in methods]
     cases = [
         {"method": method, "sequence": name, "band": band}
@@ -149,7 +153,7 @@ def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row],
     pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])
     numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **cli.calibration_numbers(rows)}
     notes = [] if no_kiss is None else [f"KISS-Matcher was not run: {no_kiss}."]
-    text = "\n\n".join(filter(None, [table(rows), cloud_table(rows), pooled_table(pooled), *notes]))
+    text = "\n\n".join(filter(None, [table(rows), cloud_tables(rows), pooled_table(pooled), *notes]))
     draw = partial(cli.draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
     return cli.Summary({**numbers, "pooled": pooled}, text, draw)
 
@@ -178,6 +182,15 @@ def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, nu
     """Returns `T_target_source` of descriptor clouds, refined by their surface elements."""
     clouds = [encode(model, points, num_elements=num_elements) for points in (source, target)]
     return np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
+
+
+def offset_row(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
+    """Returns the accuracy of the offset head on close descriptors, along x, y and z of the lidar."""
+    quality = dpm.offset_quality(
+        model,
+        [(*(encode(model, points) for points in (pair.source, pair.target)), pair.T_target_source) for pair in pairs],
+    )
+    return {"num_pairs": quality.num_pairs, "r2": quality.r2.tolist(), "rmse_m": quality.rmse_m.tolist()}
 
 
 def evaluate_matcher(matcher: Matcher, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
@@ -215,14 +228,21 @@ def table(rows: Sequence[cli.Row]) -> str:
     return cli.markdown(columns, lines)
 
 
-def cloud_table(rows: Sequence[cli.Row]) -> str:
-    """Returns the registrations of descriptor clouds as Markdown; without any, an empty string."""
-    lines = []
-    for row in (row for row in rows if row["method"].startswith(CLOUDS) and row["num_pairs"]):
-        case = (row["sequence"], cli.BAND_NAMES[row["band"]], row["method"].removeprefix(CLOUDS), row["num_pairs"])
-        lines.append([*case, row["recall_refined"], cli.length_text(row["median_error_refined_m"])])
-    columns = ("sequence", "distance", "surface elements of clouds", "pairs", "recall", "median error")
-    return cli.markdown(columns, lines) if lines else ""
+def cloud_tables(rows: Sequence[cli.Row]) -> str:
+    """Returns the registrations of descriptor clouds and the offsets as Markdown; without any, an empty string."""
+    lines, offsets = [], []
+    for row in (row for row in rows if row["method"].startswith((CLOUDS, OFFSETS)) and row["num_pairs"]):
+        case = (row["sequence"], cli.BAND_NAMES[row["band"]])
+        if row["method"] == OFFSETS:
+            axes = zip(row["r2"], row["rmse_m"], strict=True)
+            offsets.append([*case, *(f"{cli.cell_text(r2)} ({cli.cell_text(rmse_m)} m)" for r2, rmse_m in axes)])
+        else:
+            errors = (row["recall_refined"], cli.length_text(row["median_error_refined_m"]))
+            lines.append([*case, row["method"].removeprefix(CLOUDS), row["num_pairs"], *errors])
+    clouds = ("sequence", "distance", "surface elements of clouds", "pairs", "recall", "median error")
+    axes = ("sequence", "distance", "offsets along x: R2 (rmse)", "y", "z")
+    tables = [cli.markdown(clouds, lines) if lines else "", cli.markdown(axes, offsets) if offsets else ""]
+    return "\n\n".join(filter(None, tables))
 
 
 def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> list[dict[str, Any]]:

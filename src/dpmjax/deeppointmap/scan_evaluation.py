@@ -131,16 +131,13 @@ def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
     return StagedRegistration(*found, evidence, StageSeconds(*np.diff(times).tolist()))
 
 
-def evaluate_scan_pairs(
-    model: Model, pairs: Iterable[ScanPair], *, on_pair: Callable[[], object] | None = None
-) -> ScanEvaluation:
+def evaluate_scan_pairs(model: Model, pairs: Iterable[ScanPair]) -> ScanEvaluation:
     """Registers pairs of scans and compares the motions with the true ones.
 
     Args:
         model: encoder and decoder.
         pairs: such as `read_scan_pairs` yields; the first one is registered twice, so that no time is that of a
             compilation.
-        on_pair: called after each pair, to show progress.
 
     Returns:
         Errors, confidence and seconds; right is within 2 m and 5 degrees.
@@ -152,8 +149,6 @@ def evaluate_scan_pairs(
             register_in_stages(model, pair)
         found.append(register_in_stages(model, pair))
         true.append(pair.T_target_source)
-        if on_pair is not None:
-            on_pair()
 
     def errors(motions: list[Float[np.ndarray, "4 4"]]) -> RegistrationRecall:
         return registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
