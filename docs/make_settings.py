@@ -92,7 +92,7 @@ SLAM = Group("SLAM", (
     Section("FrontEndConfig", "dpmjax.slam", "`SlamConfig(front_end=...)`", {
         "keyframe_share": ("share of the median range", "higher: fewer keyframes, smaller maps, fewer loops"),
         "max_keyframe_m": ("m", "longest way between two keyframes"),
-        "num_lost": ("scans", "after this number of rejected scans, at the latest, a new part of the map begins"),
+        "num_lost": ("scans", "after this number of rejected scans a new part of the map begins"),
     }),
     Section("LoopClosureConfig", "dpmjax.slam", "`SlamConfig(loops=...)`", {
         "is_on": ("", "False: odometry alone (`--no-loop`)"),

@@ -53,8 +53,7 @@ class FrontEndConfig:
     Attributes:
         min_probability: smallest P(correct) of a decoder's motion that confirms a pose of too low a score.
         num_submap: largest number of keyframes that are merged for a registration.
-        num_lost: number of scans without an accepted pose after which a new segment begins at the latest; loops may
-            join it.
+        num_lost: number of scans without an accepted pose after which a new segment begins, which loops may join.
         keyframe_share: distance of keyframes, as a share of the extent.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of the distance of keyframes.

@@ -79,7 +79,7 @@ UNKNOWN_M = 1000.0
 # Source of a pose. "first": first scan of the map, or of a new part of a loaded one. "tracked": aligned from the
 # predicted pose. "network": aligned from the decoder's pose, or confirmed by it at a low score. "predicted": no
 # alignment was accepted; the pose is a guess. "empty": too few points. "restarted": first scan of a new part at a
-# guessed pose, after several rejected scans, or where the scan meets only such scans; loops may join the part.
+# guessed pose, after several rejected scans; loops may join the part.
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 
 
@@ -253,7 +253,8 @@ def _locate(
     config, usual = methods.config.front_end, state.usual_score
     tried = _attempt(methods, state, local_map, scan)
     best, probability = tried.best, tried.probability
-    wanted = _least_score(state)
+    # A new part has no usual score yet, and sparse scans never score high.
+    wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
     is_far = not are_near(state.predicted, best.T_map_scan, NEAR_M, np.inf)
     if is_far and state.scores and (probability or 0.0) < config.min_probability:
         # A motion that neither the last motion nor the decoder supports needs the usual score.
@@ -261,8 +262,8 @@ def _locate(
     T, information = best.T_map_scan, best.information
     status: ScanStatus = "tracked" if best is tried.tracked else "network"
     if best.score < wanted and not _is_confirmed(tried, config.min_probability):
-        T, is_met = _guess(methods, state, local_map, scan, T)
-        status = "restarted" if is_met or len(state.lost) + 1 >= config.num_lost else "predicted"
+        T = _guess(methods, state, local_map, scan, T)
+        status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
         information = diagonal_information(GUESS_M, GUESS_RAD)
     reason = f"score {best.score:.2f} of usually {usual:.2f}"
     if probability is not None:
@@ -272,23 +273,13 @@ def _locate(
     return Located(report._replace(score=best.score, probability=probability), information, tried.compact)
 
 
-def _least_score(state: FrontEndState) -> float:
-    # A new part has no usual score yet, and sparse scans never score high.
-    return max(MIN_SCORE, MIN_SCORE_SHARE * state.usual_score if state.scores else 0.0)
-
-
-def _guess(
-    methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, T: Pose
-) -> tuple[Pose, bool]:
-    """Returns the pose of a rejected scan, and whether the scan meets the lost ones: in a doorway the map ends."""
-    # The best alignment is the better guess, unless it is too far from the last motion.
-    T = T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
-    if not state.lost:
-        return T, False
-    surface = joined_surface((*local_map.keyframes, *state.recent, *state.lost))
-    aligned = methods.geometry.align(local_map._replace(surface=surface), scan, T)
-    is_near = are_near(state.predicted, aligned.T_map_scan, 3 * GUESS_M, 3 * GUESS_RAD)
-    return (aligned.T_map_scan, aligned.score >= _least_score(state)) if is_near else (T, False)
+def _guess(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, T: Pose) -> Pose:
+    """Returns the pose of a rejected scan near the predicted pose, aligned with the lost scans: a map ends at a door."""
+    if state.lost:
+        surface = joined_surface((*local_map.keyframes, *state.recent, *state.lost))
+        T = _attempt(methods, state, local_map._replace(surface=surface), scan).best.T_map_scan
+    # An alignment is the better guess, unless it is too far from the last motion.
+    return T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
 
 
 def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> _Attempt:
