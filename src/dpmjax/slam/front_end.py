@@ -274,7 +274,7 @@ def _locate(
 
 
 def _guess(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, T: Pose) -> Pose:
-    """Returns the pose of a rejected scan near the predicted pose, aligned with the lost scans: a map ends at a door."""
+    """Returns the guessed pose of a rejected scan, aligned with the lost scans, too: behind a door the map ends."""
     if state.lost:
         surface = joined_surface((*local_map.keyframes, *state.recent, *state.lost))
         T = _attempt(methods, state, local_map._replace(surface=surface), scan).best.T_map_scan
