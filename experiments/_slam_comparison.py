@@ -1,4 +1,4 @@
-"""`dpm_evaluate --slam`: which drives, the rows of drives and methods, the tables and the pictures."""
+"""`dpm_evaluate --slam`: the drives, the rows of drives and methods, the tables and the pictures."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def open_drives(
 
     Args:
         paths: folders of scans, files of poses along which towns are simulated, or `TOWN` for towns of the seeds.
-        options: which scans of each folder and of each town.
+        options: selection of the scans of each folder and of each town.
         towns: length of the route of each town, metres, by its seed.
 
     Returns:

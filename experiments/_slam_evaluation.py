@@ -54,8 +54,8 @@ class Drive(NamedTuple):
     Attributes:
         sequence: the scans.
         folder: of this drive.
-        is_indoors: whether its first scan is one of a room.
-        is_stopped: whether to end.
+        is_indoors: True if its first scan is one of a room.
+        is_stopped: True to end.
     """
 
     sequence: LidarSequence

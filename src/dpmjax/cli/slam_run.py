@@ -96,7 +96,7 @@ def map_drive(
         folder: folder for the state and interim results.
         sequence: the drive.
         methods: matcher, geometry and settings.
-        is_stopped: whether to end before the next scan.
+        is_stopped: True to end before the next scan.
 
     Returns:
         The run with its seconds, and the trajectory and the map.
@@ -126,7 +126,7 @@ def run_scans(
         reader: reads the scans.
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
-        is_stopped: whether to end before the next scan.
+        is_stopped: True to end before the next scan.
         on_scan: called with each scan, the state after it and its report.
 
     Returns:

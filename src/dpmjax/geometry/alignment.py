@@ -21,25 +21,25 @@ from dpmjax.checks import as_float, as_points, require_shape
 from dpmjax.geometry.rigid import matmul, namespace_of
 from dpmjax.types import AnyArray
 
-# Relative to the largest, how small a singular value (in units of the dtype's epsilon) counts as zero.
+# Largest singular value that counts as zero, relative to the largest one, in epsilons of the dtype.
 DEGENERATE_IN_EPS = 32
 
 
 def weighted_svd(
     source: Float[AnyArray, "n d"], target: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]
 ) -> Float[Array, "d1 d1"]:
-    """The rigid motion `T_target_source` that minimises sum_i weights[i] * |T source[i] - target[i]|^2.
+    """Computes the rigid motion `T_target_source` that minimises sum_i weights[i] * |T source[i] - target[i]|^2.
 
     The rotation is proper (determinant +1) even where a reflection would fit better. Where several motions fit equally
-    well (all points on one line in 3-D; one pair; a perfect mirror image), it is one of them near the identity: one
+    well (all points on one line in 3-D; one pair; a perfect mirror image), it is one of them near the identity. One
     valid pair gives a translation, none the identity. Value and gradient are finite in all these cases: along
     directions that the data leave open the derivative is zero.
 
     Args:
         source: (n, 2) or (n, 3), in the source frame.
         target: the same number of points, in the target frame and the same unit.
-        weights: of each pair; zero, negative and NaN weights leave it out, and its points may then hold anything.
-            Only ratios count.
+        weights: weight of each pair; zero, negative and NaN weights leave it out, and its points may then hold
+            anything. Only ratios count.
 
     Returns:
         Homogeneous matrix (d+1, d+1), dtype of the inputs.
@@ -55,7 +55,7 @@ def weighted_svd(
 
 
 def best_motion(source: Any, target: Any, weights: Any) -> Any:
-    """Computes what `weighted_svd` describes, of unchecked arrays of either kind.
+    """Computes `weighted_svd` for unchecked arrays of NumPy or JAX.
 
     Args:
         source: (n, 2) or (n, 3), in the source frame.

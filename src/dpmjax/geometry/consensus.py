@@ -1,10 +1,10 @@
-"""The motions that most point pairs agree on, even if most pairs are wrong.
+"""Motions that most point pairs agree on, even if most pairs are wrong.
 
 A rigid motion keeps distances: two right pairs have the same distance between their points on both sides. So right
 pairs agree with each other, and wrong ones only by chance (spectral matching, Leordeanu and Hebert 2005). Two pairs
 that agree and have many third pairs in common that agree with both are right with far better odds (second-order
-compatibility, Chen et al. 2022). Each of the best pairs proposes a motion from the pairs it goes best with. Proposals
-are ranked by their support, and of near-equal ones only the best is kept (non-maximum suppression).
+compatibility, Chen et al. 2022). Each of the best pairs proposes a motion from the pairs that are most compatible with
+it. Proposals are ranked by their support, and of near-equal ones only the best is kept (non-maximum suppression).
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ DISTINCT_M = 2.0
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """Tolerances, and how many motions are tried and returned.
+    """Tolerances, and numbers of motions.
 
     Attributes:
         agreement_m: two pairs agree if the distances between their points differ by less than this on the two sides.
             Points nearer to each other than this, on either side, are not compared.
-        num_seeds: how many pairs propose a motion.
-        num_rounds: how often a motion is fitted again to what supports it.
-        num_motions: how many motions are returned.
+        num_seeds: number of pairs that propose a motion.
+        num_rounds: number of times that a motion is fitted again to the pairs that support it.
+        num_motions: largest number of motions that are returned.
     """
 
     agreement_m: float = 1.0
@@ -61,7 +61,7 @@ class Consensus:
 
     Attributes:
         T_target_source: the motions; where there are fewer, the first is repeated with support 0.
-        is_inlier: which pairs are nearer than `INLIER_M` under each.
+        is_inlier: True for pairs nearer than `INLIER_M` under each.
         support: sum of 1 - error / INLIER_M over the inliers; pairs of nearly the same points count as one. Only the
             caller can estimate the support that arises by chance.
     """

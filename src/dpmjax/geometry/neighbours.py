@@ -32,7 +32,7 @@ def k_nearest(
     Args:
         queries: where to search, in the frame and unit of `points`.
         points: the searched points.
-        k: how many neighbours; may exceed the number of points.
+        k: number of neighbours; may exceed the number of points.
         mask: False for points that are not there; they may hold anything.
 
     Returns:
@@ -62,7 +62,7 @@ def radius_search(
         queries: where to search, in the frame and unit of `points`.
         points: the searched points.
         radius: largest distance of a neighbour.
-        max_neighbours: how many neighbours are kept.
+        max_neighbours: largest number of neighbours that are kept.
         mask: False for points that are not there; they may hold anything.
 
     Returns:

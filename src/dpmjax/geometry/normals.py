@@ -67,7 +67,7 @@ def estimate_normals(
 
     Args:
         points: (n, 2) or (n, 3), in the sensor's frame.
-        k: how many neighbours; more average more noise away and round more corners.
+        k: number of neighbours; more average more noise away and round more corners.
         mask: False for points that are not there; they may hold anything.
         radius: neighbours farther away than this do not count; unlimited by default.
 

@@ -37,7 +37,7 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
 
     Args:
         xyz: coordinates of k neighbours of n points, relative to each point, metres; any where `is_near` is False.
-        is_near: which neighbours count; at least one of each point.
+        is_near: True for neighbours that count; at least one of each point.
 
     Returns:
         Normals and flatness.

@@ -1,4 +1,4 @@
-"""The point pyramid: which points are kept from level to level, and which are whose neighbours.
+"""The point pyramid: the points that are kept from level to level, and their neighbours.
 
 Farthest-point order and neighbourhoods depend on coordinates only, so they are built once and apart from the network,
 which is a function of its parameters and of this. `build_pyramid` is for one cloud, under jit, vmap and on any device;
@@ -19,7 +19,7 @@ from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
-# Relative. Scans are quantised: points at exactly the radius are common, and rounding must not decide about them.
+# Relative slack of the radius: quantised points often lie exactly on it, and rounding must not decide.
 RADIUS_SLACK = 1 + 1e-6
 
 # Added to squared normalised distances before they are inverted; 1e-4 of the unit, 6 mm.
@@ -31,10 +31,10 @@ class PyramidStage:
     """One step down the pyramid.
 
     Attributes:
-        num_points: how many points are kept, by farthest-point sampling.
-        radii: of the neighbourhoods, normalised: the first block has neighbours in the level before, every later block
-            in this level.
-        num_neighbours: how many neighbours each of them holds.
+        num_points: number of points that are kept, by farthest-point sampling.
+        radii: radii of the neighbourhoods, normalised: the first block has neighbours in the level before, every later
+            block in this level.
+        num_neighbours: number of neighbours in each neighbourhood.
     """
 
     num_points: int
@@ -55,7 +55,7 @@ class PyramidConfig:
 
     Attributes:
         stages: the steps down.
-        num_interpolations: how many steps up again, from the coarsest level.
+        num_interpolations: number of steps up again, from the coarsest level.
     """
 
     stages: tuple[PyramidStage, ...] = (

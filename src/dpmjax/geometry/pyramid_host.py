@@ -78,7 +78,7 @@ def farthest_points_on_host(
     Args:
         points: candidates.
         mask: False for points that are not there.
-        num_samples: how many to choose.
+        num_samples: number of points to choose.
 
     Returns:
         Rows of the points.

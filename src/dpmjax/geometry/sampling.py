@@ -25,7 +25,7 @@ def farthest_point_sample(
 
     Args:
         points: candidates, n >= 1.
-        num_samples: how many to choose.
+        num_samples: number of points to choose.
         mask: False for points that are not there; they may hold anything.
 
     Returns:

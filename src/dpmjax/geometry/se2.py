@@ -100,7 +100,7 @@ def is_within(motions: Any, length: Any, angle: Any) -> Any:
 
 
 def chain(steps: Poses) -> Poses:
-    """Poses from steps: `T_world_next = T_world_scan @ T_scan_next`, the first pose zero.
+    """Chains steps to poses: `T_world_next = T_world_scan @ T_scan_next`, the first pose zero.
 
     Args:
         steps: (n - 1, 3) T_scan_next.

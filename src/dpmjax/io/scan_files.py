@@ -1,4 +1,4 @@
-"""Scan files of a folder: which files are scans, their order, and the numbers and times in their names."""
+"""Scan files of a folder: their choice, their order, and the numbers and times in their names."""
 
 from __future__ import annotations
 

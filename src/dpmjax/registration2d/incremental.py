@@ -83,8 +83,8 @@ def scan_odometry(scans: PlanarScans) -> Floats:
     """Chains coarse alignments of each scan with the one before, from zero motion.
 
     These poses select scans of a dense recording that lie apart, for a robot without odometry. Steps that are long or
-    unconstrained in some direction are wrong. A step without a match gets the length of one typical range: with the
-    zero motion of its start the robot would stand still, and the scan would be left out.
+    unconstrained in some direction are wrong. A step without a match gets the length of one typical range. Zero
+    motion would look like a standing robot, and the scan would be left out.
 
     Args:
         scans: n scans in time order.

@@ -102,8 +102,8 @@ class RegistrationHooks(NamedTuple):
     """Functions that `register_scans` calls.
 
     Attributes:
-        on_progress: called with the name of a stage and the share of it that is done, where the stage begins, after
-            each call of the step of the fit, and after the parts of a refinement.
+        on_progress: called with the name of a stage and the share of it that is done. The calls come where the stage
+            begins, after each call of the step of the fit, and after the parts of a refinement.
         stop: called before each stage that may be left out and before each call of the step of the fit. Where it
             returns True, the fit ends, and the best of the candidates so far is kept.
         engine: called with the rows of the scans that are fitted, in the order of the fit; returns the `engine` of

@@ -1,9 +1,9 @@
 """Poses of a sequence of scans by beam search: each scan against the last placed scans, with several hypotheses.
 
 A step between two scans that share few beams has several poses that fit. An exhaustive search of the pair finds these
-hypotheses (`pair_search.py`); it prefers poses with much overlap, so alignments from the arcs of the usual motion give
-more. Their score is matched less contradicting beams against all of the last placed scans; the
-fitness of an ICP ignores contradicting beams. The best sequences of poses are kept from scan to scan. A scan that fits
+hypotheses (`pair_search.py`). It prefers poses with much overlap, so further hypotheses are alignments from arcs of the
+usual motion. Their score is matched less contradicting beams against all of the last placed scans; the fitness of an
+ICP ignores contradicting beams. The best sequences of poses are kept from scan to scan. A scan that fits
 none of the last placed scans (a swapped line of the log, a covered lens) stays unregistered, and the sequence continues
 with the next scan.
 """
