@@ -66,8 +66,8 @@ def test_kind_and_dtype_are_kept() -> None:
 
 def test_a_path_is_as_long_as_its_steps() -> None:
     poses = np.array([[1.0, 1.0, 0.5], [4.0, 5.0, -2.0], [4.0, 5.0, 3.0], [4.0, 3.0, 0.0]])
-    np.testing.assert_allclose(se2.path_lengths(poses), [0.0, 5.0, 5.0, 7.0], **DOUBLE)
-    np.testing.assert_array_equal(se2.path_lengths(poses[:1]), [0.0])
+    np.testing.assert_allclose(se2.driven_lengths(poses), [0.0, 5.0, 5.0, 7.0], **DOUBLE)
+    np.testing.assert_array_equal(se2.driven_lengths(poses[:1]), [0.0])
 
 
 def test_motions_are_within_both_limits(kind: str) -> None:

@@ -114,7 +114,7 @@ def chain(steps: Poses) -> Poses:
     return np.array(poses)
 
 
-def path_lengths(poses: Poses) -> Poses:
+def driven_lengths(poses: Poses) -> Poses:
     """Computes the length of a trajectory up to each of its poses.
 
     Args:

@@ -125,7 +125,7 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
 
 def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
     """Finds pairs of scans that may overlap: a later one (source) and an earlier one (target)."""
-    way, nearby = se2.path_lengths(poses), 2.0 * _NEARBY * typical_range
+    way, nearby = se2.driven_lengths(poses), 2.0 * _NEARBY * typical_range
     radius = min(_MAX_RADIUS * typical_range, nearby + config.drift * way[-1])
     first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
     apart = way[second] - way[first]
@@ -142,7 +142,7 @@ def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> 
 
 def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, config: LoopConfig) -> PairMatches:
     """Matches scans to submaps around their targets, one batch of candidates."""
-    unit, way = scans.typical_range, se2.path_lengths(poses)
+    unit, way = scans.typical_range, se2.driven_lengths(poses)
     submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
     predicted = se2.relative(poses[target], poses[source])
     # The prior has the standard deviation of the drift: it constrains the position along a corridor.

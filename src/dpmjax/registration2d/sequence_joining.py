@@ -97,7 +97,7 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
     sides = []
     for number, step in enumerate(steps):
         before, after = rows[ends[number] + 1 : step + 1], rows[step + 1 : ends[number + 2] + 1]
-        sides += [side[se2.path_lengths(poses[side]) <= _SIDE_LENGTH * unit] for side in (before[::-1], after)]
+        sides += [side[se2.driven_lengths(poses[side]) <= _SIDE_LENGTH * unit] for side in (before[::-1], after)]
     centres = np.array([side[0] for side in sides])
     profiles, target = _submap_profiles(sequence, centres, sides), 2 * np.arange(len(steps))
     config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
@@ -124,7 +124,7 @@ def _move_behind(sequence: _Sequence, step: int, way: Floats) -> None:
 def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
     """Makes submaps about a typical range apart, none across a weak step."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
-    way = se2.path_lengths(poses[rows])
+    way = se2.driven_lengths(poses[rows])
     spacing = max(unit, way[-1] / _MAX_SUBMAPS)
     middles, members = [], []
     for number in range(part[-1] + 1):
