@@ -262,7 +262,7 @@ def _locate(
     T, information = best.T_map_scan, best.information
     status: ScanStatus = "tracked" if best is tried.tracked else "network"
     if best.score < wanted and not _is_confirmed(tried, config.min_probability):
-        T = _guess(methods, state, local_map, scan, T)
+        T = _guess(methods, state, local_map, scan, tried)
         status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
         information = diagonal_information(GUESS_M, GUESS_RAD)
     reason = f"score {best.score:.2f} of usually {usual:.2f}"
@@ -273,16 +273,23 @@ def _locate(
     return Located(report._replace(score=best.score, probability=probability), information, tried.compact)
 
 
-def _guess(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, T: Pose) -> Pose:
+def _guess(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, tried: _Attempt) -> Pose:
     """Returns the guessed pose of a rejected scan, aligned with the lost scans, too: behind a door the map ends."""
     if state.lost:
         surface = joined_surface((*local_map.keyframes, *state.recent, *state.lost))
-        T = _attempt(methods, state, local_map._replace(surface=surface), scan).best.T_map_scan
+        tried = _attempt(methods, state, local_map._replace(surface=surface), scan, tried.compact)
+    T = tried.best.T_map_scan
     # An alignment is the better guess, unless it is too far from the last motion.
     return T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
 
 
-def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan) -> _Attempt:
+def _attempt(
+    methods: SlamMethods,
+    state: FrontEndState,
+    local_map: LocalMap,
+    scan: ThinnedScan,
+    compact: CompactScan | None = None,
+) -> _Attempt:
     """Aligns from the prediction and from the decoder's motions, in the order that the configuration names."""
     geometry, predicted = methods.geometry, state.predicted
     is_predicted = methods.config.odometry.proposer == "prediction"
@@ -293,7 +300,7 @@ def _attempt(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, sc
         tracked = geometry.align(local_map, scan, predicted)
         if tracked.score >= good_score:
             return _Attempt(tracked, tracked)
-    compact = methods.matcher.encode(scan)
+    compact = methods.matcher.encode(scan) if compact is None else compact
     row = nearest_keyframe(local_map, predicted[:3, 3])
     proposal = methods.matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
     starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
