@@ -116,9 +116,7 @@ def _with_wider_radii(config: slam.SlamConfig, factor: float) -> slam.SlamConfig
 
 def without_elements(methods: slam.SlamMethods) -> slam.SlamMethods:
     """Returns methods without surface elements: each pose and each loop stays as the decoder proposes it."""
-    loops = methods.config.loops
-    information = np.diag(np.repeat([loops.sigma_m**-2.0, loops.sigma_rad**-2.0], 3))
-    geometry = _Unmoved(methods.geometry, information)
+    geometry = _Unmoved(methods.geometry)
     return with_network(methods._replace(matcher=_DecoderAlone(methods.matcher), geometry=geometry))
 
 
@@ -166,12 +164,8 @@ class _FewerOfScans(_Wrapped):
 class _Unmoved(_Wrapped):
     """A geometry that returns the first of the given poses and accepts it."""
 
-    def __init__(self, geometry: slam.Geometry, information: np.ndarray) -> None:
-        super().__init__(geometry)
-        self._information = information
-
     def align(self, local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
-        return slam.Alignment(T_map_scan, 1.0, 0.0, 1.0, self._information)
+        return slam.Alignment(T_map_scan, 1.0, 0.0, 1.0, slam.DESCRIPTOR_INFORMATION)
 
     def search(self, local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
         return self.align(local_map, scan, T_map_scan[0])

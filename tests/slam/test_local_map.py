@@ -24,7 +24,7 @@ from dpmjax.slam.local_map import (
 from dpmjax.types import SurfaceElements
 from tests.slam.truth import compact_of, laps, number_of, pose
 
-CONFIG = OdometryConfig(num_keyframes=5, num_recent=3)
+CONFIG = OdometryConfig(num_keyframes=5)
 TRUTH = laps(1, side_m=20.0, step_m=2.0)
 SPACING_M = 0.8
 
@@ -83,30 +83,29 @@ def test_a_local_map_moves_with_the_frame_of_the_map() -> None:
 def test_a_scan_that_adds_nothing_does_not_join() -> None:
     recent = (placed_at(np.eye(4), 5.0),)
     for T in (pose(0, 0, 0), pose(0.99 * SPACING_M, 0, 0), pose(0, 0, 0.16)):
-        assert with_scan(recent, placed_at(T, 5.0), SPACING_M, CONFIG) is recent
+        assert with_scan(recent, placed_at(T, 5.0), SPACING_M) is recent
     for T in (pose(1.01 * SPACING_M, 0, 0), pose(0, 0, 0.18)):
         placed = placed_at(T, 5.0)
-        joined = with_scan(recent, placed, SPACING_M, CONFIG)
+        joined = with_scan(recent, placed, SPACING_M)
         assert joined == (*recent, placed)
         # The distance is that from the last scan that has joined.
-        assert with_scan(joined, placed, SPACING_M, CONFIG) is joined
-        assert len(with_scan(joined, recent[0], SPACING_M, CONFIG)) == 3
-    assert with_scan((), recent[0], SPACING_M, CONFIG) == recent
+        assert with_scan(joined, placed, SPACING_M) is joined
+        assert len(with_scan(joined, recent[0], SPACING_M)) == 3
+    assert with_scan((), recent[0], SPACING_M) == recent
     # People move around a lidar that stands still.
     here = placed_at(np.eye(4), 6.0)
-    assert with_scan(recent, here, 0.0, CONFIG) == (*recent, here)
+    assert with_scan(recent, here, 0.0) == (*recent, here)
 
 
 def test_the_oldest_of_too_many_scans_leaves() -> None:
     recent: tuple[PlacedElements, ...] = ()
-    for step in range(1, 6):
-        recent = with_scan(recent, placed_at(pose(step, 0, 0), 5.0 + step), SPACING_M, CONFIG)
-    assert [placed.T_map_scan[0, 3] for placed in recent] == [3, 4, 5]
+    for step in range(1, 11):
+        recent = with_scan(recent, placed_at(pose(step, 0, 0), 5.0 + step), SPACING_M)
+    assert [placed.T_map_scan[0, 3] for placed in recent] == list(range(3, 11))
     surface = local_map_of(chain(TRUTH[:3]), recent, CONFIG).surface
-    np.testing.assert_allclose(sorted(surface.points[-3:, 0]), [8 + 3, 9 + 4, 10 + 5], atol=1e-5)
-    assert len(surface.points) == 3 + 3
-    assert sorted(surface.samples) == list(range(6))
-    assert with_scan((), recent[0], SPACING_M, replace(CONFIG, num_recent=0)) == ()
+    np.testing.assert_allclose(sorted(surface.points[-8:, 0]), [5 + 2 * step for step in range(3, 11)], atol=1e-5)
+    assert len(surface.points) == 3 + 8
+    assert sorted(surface.samples) == list(range(11))
 
 
 def test_a_placed_scan_has_the_flat_elements() -> None:

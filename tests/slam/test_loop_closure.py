@@ -135,12 +135,12 @@ def test_right_loops_agree_and_wrong_ones_do_not() -> None:
     right = [loop_between(truth, half + row, row, noise(np.random.default_rng(row), 0.1, 0.01)) for row in (5, 8)]
     wrong = loop_between(truth, half + 9, 9, pose(3.0, 0.0, 0.0))
     turned = loop_between(truth, half + 9, 9, pose(0.0, 0.0, 0.5))
-    assert are_consistent(slam_map, *right, CONFIG)
-    assert not are_consistent(slam_map, right[0], wrong, CONFIG)
-    assert not are_consistent(slam_map, right[0], turned, CONFIG)
+    assert are_consistent(slam_map, *right)
+    assert not are_consistent(slam_map, right[0], wrong)
+    assert not are_consistent(slam_map, right[0], turned)
     # A keyframe is no witness for itself, and far loops tell nothing of each other.
-    assert not are_consistent(slam_map, right[0], right[0], CONFIG)
-    assert not are_consistent(slam_map, right[0], loop_between(truth, half + 60, 60), CONFIG)
+    assert not are_consistent(slam_map, right[0], right[0])
+    assert not are_consistent(slam_map, right[0], loop_between(truth, half + 60, 60))
 
 
 def test_a_wrong_loop_is_taken_back() -> None:

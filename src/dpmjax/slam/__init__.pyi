@@ -30,6 +30,7 @@ from .localization import LocalizationConfig as LocalizationConfig
 from .localization import localize as localize
 from .localization import localize_each as localize_each
 from .loop_candidates import most_similar as most_similar
+from .loops import DESCRIPTOR_INFORMATION as DESCRIPTOR_INFORMATION
 from .loops import Loop as Loop
 from .map_optimization import RefinedKeyframes as RefinedKeyframes
 from .map_optimization import refine_keyframes as refine_keyframes

@@ -26,7 +26,6 @@ class OdometryConfig:
             those of the decoder are tried. With "network" the decoder registers each scan to the nearest keyframe
             (DeepPointMap section 4).
         num_keyframes: number of the nearest keyframes in the local map.
-        num_recent: number of scans since the last keyframe in the local map.
         narrow: alignment from a first guess that is nearly right.
         wide: alignment from other starts.
         plane_radius_m: largest distance between an element and the element of the map whose plane it meets.
@@ -34,7 +33,6 @@ class OdometryConfig:
 
     proposer: Proposer = "prediction"
     num_keyframes: int = 12
-    num_recent: int = 8
     narrow: AlignmentConfig = NARROW
     wide: AlignmentConfig = WIDE
     plane_radius_m: float = 1.5
@@ -43,7 +41,6 @@ class OdometryConfig:
         require_one_of("proposer", self.proposer, get_args(Proposer))
         require_positive_fields(self, "plane_radius_m")
         require_fields(self, "num_keyframes", low=1)
-        require_fields(self, "num_recent", low=0)
 
 
 @dataclass(frozen=True)
@@ -86,8 +83,6 @@ class LoopClosureConfig:
         num_registered: largest number of candidates that are registered.
         min_probability: smallest P(correct) of an accepted registration.
         min_support: smallest number of consistent registrations, its own included, with which a loop becomes an edge.
-        sigma_m: standard deviation of the translation of a registration by descriptors.
-        sigma_rad: standard deviation of the rotation of a registration by descriptors.
     """
 
     is_on: bool = True
@@ -98,14 +93,11 @@ class LoopClosureConfig:
     num_registered: int = 2
     min_probability: float = 0.5
     min_support: int = 2
-    sigma_m: float = 0.2
-    sigma_rad: float = 0.02
 
     def __post_init__(self) -> None:
         require_fields(self, "min_overlap", "min_probability", low=0, high=1)
         require_fields(self, "min_support", "num_registered", "num_asked", low=1)
         require_fields(self, "num_near", "num_similar", low=0)
-        require_positive_fields(self, "sigma_m", "sigma_rad")
 
 
 @dataclass(frozen=True)

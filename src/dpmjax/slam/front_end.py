@@ -214,7 +214,7 @@ def place_scan(
         # People move around a lidar that stands still, so the local map is renewed where it fits less.
         is_changed = bool(state.scores) and report.score < GOOD_SHARE * state.usual_score
         spacing_m = 0.0 if is_changed else RECENT_SHARE * thinned.extent_m
-        recent = with_scan(state.recent, placed, spacing_m, methods.config.odometry)
+        recent = with_scan(state.recent, placed, spacing_m)
         if recent is not state.recent:
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
@@ -358,7 +358,7 @@ def _make_keyframe(
     spacing_m = RECENT_SHARE * scan.extent_m
     after = _advanced(state, report)._replace(
         is_begun=True,
-        recent=with_scan(moved, placed, spacing_m, methods.config.odometry),
+        recent=with_scan(moved, placed, spacing_m),
         local_map=None,
         T_keyframe_last=np.eye(4),
     )

@@ -23,6 +23,9 @@ from dpmjax.types import AnyArray
 # Smallest distance between the last scans, as a share of the extent.
 RECENT_SHARE = 0.08
 
+# Largest number of the last scans. More make a denser surface, which odometry searches more slowly.
+NUM_RECENT = 8
+
 # Turn above which a scan joins the local map at a smaller distance.
 RECENT_RAD = 0.17
 
@@ -93,15 +96,14 @@ def _placed(T_map_scan: Pose, *arrays: AnyArray) -> PlacedElements:
 
 
 def with_scan(
-    recent: tuple[PlacedElements, ...], placed: PlacedElements, spacing_m: float, config: OdometryConfig
+    recent: tuple[PlacedElements, ...], placed: PlacedElements, spacing_m: float
 ) -> tuple[PlacedElements, ...]:
-    """Adds a scan that is far enough from the last one, and drops the oldest scan beyond the number that is kept.
+    """Adds a scan that is far enough from the last one, and drops the oldest of more than `NUM_RECENT` scans.
 
     Args:
         recent: the last scans, oldest first.
         placed: the scan.
         spacing_m: smallest distance from the last scan, unless the scan is turned.
-        config: number of scans.
 
     Returns:
         The new last scans; the same tuple where the scan is not added.
@@ -110,7 +112,7 @@ def with_scan(
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
         if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < RECENT_RAD:
             return recent
-    return (*recent, placed)[-config.num_recent :] if config.num_recent else recent
+    return (*recent, placed)[-NUM_RECENT:]
 
 
 def nearest_keyframe(local_map: LocalMap, position_map: Float[np.ndarray, " 3"]) -> int:

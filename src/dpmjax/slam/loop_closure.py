@@ -12,11 +12,18 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.scans.weak_directions import with_least_covariance
-from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframes import KeyframeMap, diagonal_information, submap_around
+from dpmjax.slam.keyframes import KeyframeMap, submap_around
 from dpmjax.slam.loop_candidates import find_loop_candidates, nearest_pairs
-from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, loop_status, num_accepted
+from dpmjax.slam.loops import (
+    DESCRIPTOR_INFORMATION,
+    Loop,
+    LoopState,
+    LoopStatus,
+    accept_consistent,
+    loop_status,
+    num_accepted,
+)
 from dpmjax.slam.map_optimization import optimize_map
 
 # Overlap probability above which no further candidate is examined.
@@ -146,7 +153,7 @@ def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates
             probability=match.probability,
             rmse=match.rmse,
             T_target_source=match.T_target_source,
-            information=_edge_information(match, config),
+            information=_edge_information(match),
         )
         if loops[number].status == "waits for support":
             break
@@ -170,8 +177,8 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
     return loops
 
 
-def _edge_information(match: Match, config: LoopClosureConfig) -> Float[np.ndarray, "6 6"]:
-    """Returns the information by the planes, with an upper bound; without planes, that of the configuration."""
+def _edge_information(match: Match) -> Float[np.ndarray, "6 6"]:
+    """Returns the information by the planes, with an upper bound; without planes, that of descriptors."""
     if match.information is None:
-        return diagonal_information(config.sigma_m, config.sigma_rad)
+        return DESCRIPTOR_INFORMATION
     return with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)

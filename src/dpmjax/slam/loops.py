@@ -15,7 +15,13 @@ from jaxtyping import Float
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near
+from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near, diagonal_information
+
+# Standard deviations of a registration by descriptors alone: translation and rotation.
+DESCRIPTOR_SIGMA_M, DESCRIPTOR_SIGMA_RAD = 0.2, 0.02
+
+# Information of a registration by descriptors alone.
+DESCRIPTOR_INFORMATION = diagonal_information(DESCRIPTOR_SIGMA_M, DESCRIPTOR_SIGMA_RAD)
 
 # Standard deviation of odometry over one metre; it grows with the root of the path.
 DRIFT_M = 0.05
@@ -129,7 +135,7 @@ def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClo
         slam_map: the map.
         loop: the candidate.
         match: its registration.
-        config: thresholds.
+        config: smallest probability.
 
     Returns:
         "waits for support", or the reason of the rejection.
@@ -141,7 +147,7 @@ def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClo
         path_m = abs(source.path_m - target.path_m)
         T_world = slam_map.T_world_keyframe
         predicted = rigid.inverse(T_world[loop.target]) @ T_world[loop.source]
-        sigma_m, sigma_rad = _drift(path_m, config)
+        sigma_m, sigma_rad = _drift(path_m)
         most_m = CONSISTENT_SIGMAS * sigma_m + MIN_DRIFT_SHARE * path_m
         most_rad = CONSISTENT_SIGMAS * sigma_rad + MIN_DRIFT_SHARE
         if not are_near(predicted, match.T_target_source, most_m, most_rad):
@@ -158,7 +164,7 @@ def accept_consistent(
         slam_map: the map.
         loops: all candidates, in the order of their sources.
         number: index of the loop; nothing is changed unless it waits for support.
-        config: standard deviations and the required number of registrations.
+        config: the required number of registrations.
 
     Returns:
         All candidates after.
@@ -167,7 +173,7 @@ def accept_consistent(
         return loops
 
     def agree(one: int, other: int) -> bool:
-        return are_consistent(slam_map, loops[one], loops[other], config)
+        return are_consistent(slam_map, loops[one], loops[other])
 
     near = list(_near_along(slam_map, loops, number))
     compared = [other for other in near if loops[other].status == "accepted"][:MAX_COMPARED]
@@ -182,14 +188,13 @@ def accept_consistent(
     return tuple(loop._replace(status="accepted") if row in members else loop for row, loop in enumerate(loops))
 
 
-def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopClosureConfig) -> bool:
+def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop) -> bool:
     """Returns True if two loops of different keyframes and the odometry between their ends make a cycle that closes.
 
     Args:
         slam_map: the map.
         loop: a registered candidate.
         other: another one.
-        config: uncertainties.
 
     Returns:
         False also where the loops are too far apart for a test.
@@ -203,9 +208,9 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop, config: LoopC
     paths_m = [abs(a.path_m - b.path_m) for a, b in ends]
     T_source_other, T_target_other = (rigid.inverse(a.T_odometry_keyframe) @ b.T_odometry_keyframe for a, b in ends)
     one_way, other_way = loop.T_target_source @ T_source_other, T_target_other @ other.T_target_source
-    sigma_m, sigma_rad = _drift(sum(paths_m), config)
+    sigma_m, sigma_rad = _drift(sum(paths_m))
     # A rotation error of a registration moves the far end in proportion to the length of the odometry between them.
-    sigma_m = float(np.hypot(sigma_m, config.sigma_rad * max(paths_m)))
+    sigma_m = float(np.hypot(sigma_m, DESCRIPTOR_SIGMA_RAD * max(paths_m)))
     return are_near(one_way, other_way, CONSISTENT_SIGMAS * sigma_m, CONSISTENT_SIGMAS * sigma_rad)
 
 
@@ -224,9 +229,9 @@ def _is_near_along(slam_map: KeyframeMap, row: int, other: int) -> bool:
     return a.segment == b.segment and abs(a.path_m - b.path_m) <= PENDING_PATH_M
 
 
-def _drift(path_m: float, config: LoopClosureConfig) -> tuple[float, float]:
+def _drift(path_m: float) -> tuple[float, float]:
     """Returns standard deviations of a cycle of two registrations and a path of odometry: metres, radians."""
     return (
-        float(np.sqrt(2 * config.sigma_m**2 + DRIFT_M**2 * path_m)),
-        float(np.sqrt(2 * config.sigma_rad**2 + DRIFT_RAD**2 * path_m)),
+        float(np.sqrt(2 * DESCRIPTOR_SIGMA_M**2 + DRIFT_M**2 * path_m)),
+        float(np.sqrt(2 * DESCRIPTOR_SIGMA_RAD**2 + DRIFT_RAD**2 * path_m)),
     )
