@@ -191,13 +191,13 @@ def task_of(profiles: RangeProfiles, keyframes: list[int], config: GlobalConfig 
 
 def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
     profiles, poses = make_profiles(walk_scans), np.array(walk.reference_poses)
-    assert len(find_unregistered(profiles, poses, GlobalConfig())) == 0
+    assert len(find_unregistered(profiles, poses)) == 0
     poses[[9, 10], :2] += 5000.0
-    assert set(find_unregistered(profiles, poses, GlobalConfig())) == {9, 10}
+    assert set(find_unregistered(profiles, poses)) == {9, 10}
 
 
 def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = simulate_sequence(0, 97, seed=2).take(slice(0, None, 16))
+    there = simulate_sequence(0, 113, seed=2).take(slice(0, None, 16))
     truth, lost, profiles = np.asarray(there.reference_poses), 5, make_profiles(scans_of(there))
 
     def know(profiles: RangeProfiles, source: np.ndarray, target: np.ndarray, *_: object, **__: object) -> Candidates:
@@ -211,9 +211,9 @@ def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest
     monkeypatch.setattr(importlib.import_module("dpmjax.registration2d.global_registration"), "search_pairs", know)
     poses = truth.copy()
     poses[lost] += [5000.0, 0.0, 0.0]
-    task = task_of(profiles, [0, 1], replace(CONFIG, max_unregistered=4))
+    task = task_of(profiles, [0, 1])
     found = know(profiles, np.array([1]), np.array([0]))
-    more = know(profiles, np.array([1, 2, 3, 3]), np.array([2, 3, 4, 6]))
+    more = know(profiles, np.array([1, 2, 3, 3, 6]), np.array([2, 3, 4, 6, 7]))
     placed, more = place_others(task, poses, found, more)
     partners = more.source[more.target == lost]
     assert {0, 1} < set(partners)

@@ -84,13 +84,20 @@ def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
     out = np.stack([10.0 * np.arange(30), np.zeros(30), np.zeros(30)], -1)
     poses = np.concatenate([out, out[::-1] + np.array([0.0, 1.0, 0.0])])
     unit = walk_scans.typical_range
-    source, target = choose_pairs(walk_scans, poses, RefinementConfig(num_spatial=2, radius=40.0 / unit))
+    config = RefinementConfig(radius=40.0 / unit)
+    source, target = choose_pairs(walk_scans, poses, config)
     temporal = {(s, t) for s, t in zip(source, target, strict=True) if 1 <= s - t <= 3}
     assert len(temporal) == 59 + 58 + 57
     assert (5, 54) in set(zip(source.tolist(), target.tolist(), strict=True))
     away = np.abs(source - target) > 3
     assert np.hypot(*(poses[source[away]] - poses[target[away]])[:, :2].T).max() <= 40.0
-    assert (np.bincount(source[away], minlength=60) <= 2).all()
+    # Of many visits eight are enough, and of each of them one scan.
+    laps = np.concatenate([(out, out[::-1])[lap % 2] + np.array([0.0, lap, 0.0]) for lap in range(12)])
+    source, target = choose_pairs(walk_scans, laps, config)
+    away = np.abs(source - target) > 3
+    assert (np.bincount(source[away], minlength=len(laps)) == 8).all()
+    for row in range(len(laps)):
+        assert np.diff(np.sort(target[away & (source == row)])).min() > 2
 
 
 def test_pairs_are_filled_up_to_few_sizes() -> None:
@@ -102,7 +109,7 @@ def test_pairs_are_filled_up_to_few_sizes() -> None:
 # A walk of five rounds would take minutes; a short way there and back sees every place twice.
 @pytest.fixture(scope="module")
 def revisit() -> ScanSequence:
-    there = simulate_sequence(0, 30, num_beams=64, seed=1)
+    there = simulate_sequence(0, 59, num_beams=64, seed=1).take(slice(0, None, 2))
     order = np.concatenate([np.arange(30), np.arange(28, -1, -1)])
     return ScanSequence(
         "there-and-back", there.points[order], there.mask[order], "px", reference_poses=there.reference_poses[order]
@@ -118,7 +125,7 @@ def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
     true = revisit.reference_poses
     steps = se2.relative(true[:-1], true[1:])
     drifted = se2.chain(steps * [1.05, 1.05, 1.0] + [0.0, 0.0, np.radians(0.5)])
-    config = LoopConfig(min_way=0.3, drift=0.2, num_rounds=1, max_candidates=128)
+    config = LoopConfig(drift=0.2, num_rounds=1)
     closed, loops, weight = correct_by_loops(scans, drifted, config)
     assert len(loops.source) == len(weight) > 10
     assert (loops.source > loops.target).all()
@@ -166,8 +173,17 @@ def test_candidates_are_near_in_space_and_far_along_the_way() -> None:
     assert len(source)
     assert (np.hypot(*(poses[source] - poses[target])[:, :2].T) < 10.0).all()
     assert (source - target > 5).all()
-    few, _ = find_candidates(poses, LoopConfig(drift=0.0, max_candidates=7), typical_range=33.0)
-    assert len(few) == 7
+
+
+def test_of_too_many_candidates_those_are_kept_that_are_near() -> None:
+    angle = np.linspace(0.0, 4 * np.pi, 400)
+    poses = np.stack([30 * np.cos(angle), 30 * np.sin(angle), angle], -1)
+    source, target = find_candidates(poses, LoopConfig(drift=0.0), typical_range=33.0)
+    later, earlier = np.tril_indices(400, k=-6)
+    apart = np.hypot(*(poses[later] - poses[earlier])[:, :2].T)
+    may = (apart < 9.9) & (se2.driven_lengths(poses)[later] - se2.driven_lengths(poses)[earlier] > 2.25 * 33.0)
+    assert len(source) == 2000 < 0.5 * may.sum()
+    assert np.median(np.hypot(*(poses[source] - poses[target])[:, :2].T)) < 0.6 * np.median(apart[may])
 
 
 def test_a_wrong_loop_has_no_support() -> None:

@@ -48,6 +48,10 @@ _MAX_ELIGIBLE = 1024
 # A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
 # if they match more than this share.
 _MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
+# Largest number of unregistered scans that are searched against all keyframes. Those still unregistered are then
+# searched against an equal number of further scans. A cluster of up to half of this number of scans, which matches no
+# scan outside it, is unregistered too.
+_MAX_UNREGISTERED = 12
 
 
 @dataclass(frozen=True)
@@ -56,14 +60,10 @@ class GlobalConfig:
 
     Attributes:
         max_keyframes: largest number of keyframes, which are searched all against all.
-        max_unregistered: largest number of unregistered scans that are searched against all keyframes. Those still
-            unregistered are then searched against an equal number of further scans. A cluster of up to half of
-            `max_unregistered` scans, which matches no scan outside it, is unregistered too.
         search: settings of the search of pairs.
     """
 
     max_keyframes: int = 32
-    max_unregistered: int = 12
     search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
 
 
@@ -229,7 +229,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     # A scan that overlaps with no keyframe has its neighbours among the remaining scans; so has a keyframe that
     # overlaps with no other keyframe.
     for partners in (task.keyframes, task.others):
-        lost = find_unregistered(task.profiles, poses, task.config)
+        lost = find_unregistered(task.profiles, poses)
         if not len(lost):
             break
         # The likely turns of these scans were wrong, so all turns are tried, with the most similar partners.
@@ -240,7 +240,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     return poses, more
 
 
-def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConfig) -> Indices:
+def find_unregistered(profiles: RangeProfiles, poses: Floats) -> Indices:
     """Finds unregistered scans: they match far fewer beams than usual with any scan outside their cluster.
 
     A small cluster of scans that match each other and no other scan is unregistered too: its scans must not support
@@ -249,7 +249,6 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
     Args:
         profiles: n scans.
         poses: (n, 3) T_world_scan.
-        config: settings.
 
     Returns:
         Rows of the unregistered scans, the worst first.
@@ -263,10 +262,10 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats, config: GlobalConf
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
     is_linked = matched > _MIN_LINK * usual
     cluster = label_parts(num_scans, scan[is_linked], other[is_linked])
-    is_small = np.bincount(cluster)[cluster] <= config.max_unregistered // 2
+    is_small = np.bincount(cluster)[cluster] <= _MAX_UNREGISTERED // 2
     matched = np.where(is_small[scan] & (cluster[scan] == cluster[other]), 0.0, matched)
     support = matched.reshape(near.shape).max(axis=1)
-    worst = np.argsort(support)[: config.max_unregistered]
+    worst = np.argsort(support)[:_MAX_UNREGISTERED]
     return worst[support[worst] < _MIN_SUPPORT * usual].astype(np.int64)
 
 

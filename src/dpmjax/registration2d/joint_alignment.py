@@ -43,6 +43,8 @@ _NUM_OPEN_ROUNDS, _NUM_TORN_ROUNDS = 3, 5
 _LOST_SCORE, _LEAST_WEIGHT = 0.25, 0.01
 # Offsets of the neighbours in time, of ordered scans; largest difference of heading of neighbours in space, radians.
 _TEMPORAL, _MAX_TURN = (1, 2, 3), 2.0
+# Largest number of neighbours in space, each from another visit.
+_NUM_SPATIAL = 8
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
@@ -51,11 +53,9 @@ class JointAlignmentConfig:
     """Settings of the joint alignment. Lengths are in typical ranges of the scans.
 
     Attributes:
-        num_spatial: largest number of neighbours in space, each from another visit.
-        radius: largest distance of neighbours in space.
+        radius: largest distance of neighbours in space, up to eight of them, each from another visit.
     """
 
-    num_spatial: int = 8
     radius: float = 0.6
 
 
@@ -229,7 +229,7 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig
     tree = scipy.spatial.cKDTree(poses[:, :2])
     # Of each visit of a place one scan is enough; without an order every scan is a visit.
     apart, visit = (max(temporal, default=0) + 2, 2) if scans.is_ordered else (0, 0)
-    count = min(num_scans, 6 * config.num_spatial + 2 * apart)
+    count = min(num_scans, 6 * _NUM_SPATIAL + 2 * apart)
     nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scans.typical_range)
     distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
     for scan in range(num_scans):
@@ -237,7 +237,7 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig
         near = near[(np.abs(near - scan) > apart)]
         near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < _MAX_TURN]
         chosen: list[int] = []
-        while len(near) and len(chosen) < config.num_spatial:
+        while len(near) and len(chosen) < _NUM_SPATIAL:
             chosen.append(int(near[0]))
             near = near[np.abs(near - near[0]) > visit]
         source.append(np.full(len(chosen), scan))

@@ -30,8 +30,10 @@ _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations
 _BATCH = 512
 # Two views that overlap well are nearer than twice this, in typical ranges, in addition to the drift.
 _NEARBY = 0.15
-# Largest distance of a candidate, in typical ranges.
-_MAX_RADIUS = 2.25
+# Largest distance of a candidate, and least distance travelled between the two scans of a loop, in typical ranges.
+_MAX_RADIUS, _MIN_WAY = 2.25, 2.25
+# Largest number of candidates in a round.
+_MAX_CANDIDATES = 2000
 # Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
 # Least robust share of matched beams, and largest share of beams that contradict their partner scan.
@@ -52,14 +54,10 @@ class LoopConfig:
     Attributes:
         num_rounds: number of searches, each from the corrected poses of the search before.
         drift: error of a relative pose as a share of the distance travelled; it bounds the search for loops.
-        min_way: least distance travelled between the two scans of a loop.
-        max_candidates: largest number of pairs in a round.
     """
 
     num_rounds: int = 3
     drift: float = 0.05
-    min_way: float = 2.25
-    max_candidates: int = 2000
 
 
 class LoopResult(NamedTuple):
@@ -130,12 +128,12 @@ def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> 
     first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
     apart = way[second] - way[first]
     distance = np.hypot(*(poses[second, :2] - poses[first, :2]).T)
-    keep = (apart > config.min_way * typical_range) & (distance < nearby + config.drift * apart) & (second - first > 5)
+    keep = (apart > _MIN_WAY * typical_range) & (distance < nearby + config.drift * apart) & (second - first > 5)
     source, target = second[keep], first[keep]
-    if len(source) > config.max_candidates:
+    if len(source) > _MAX_CANDIDATES:
         # Nearer pairs overlap more often; random factors on their distances keep some far pairs among the candidates.
         rng = np.random.default_rng(0)
-        order = np.argsort(distance[keep] * rng.uniform(0.1, 1.0, len(source)))[: config.max_candidates]
+        order = np.argsort(distance[keep] * rng.uniform(0.1, 1.0, len(source)))[:_MAX_CANDIDATES]
         source, target = source[np.sort(order)], target[np.sort(order)]
     return source.astype(np.int64), target.astype(np.int64)
 
