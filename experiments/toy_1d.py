@@ -59,8 +59,7 @@ def main(config: Config) -> dict[str, Any]:
         ends, figure = run_paper(paper, config)
         variants = []
         for initialization, rate in itertools.product(get_args(dm.Initialization), LEARNING_RATES):
-            net = replace(paper.net, initialization=initialization)
-            runs = descend_both(replace(paper, net=net, learning_rate=rate), config)
+            runs = descend_both(replace(paper, initialization=initialization, learning_rate=rate), config)
             shares = {form: share_at_minimum(run.poses) for form, run in zip(FORMS, runs, strict=True)}
             variants.append({"initialization": initialization, "learning_rate": rate, **shares})
         x_best, loss_best = dm.global_minimum()

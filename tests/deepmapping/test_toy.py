@@ -10,7 +10,6 @@ import pytest
 from dpmjax.deepmapping.engine import fit
 from dpmjax.deepmapping.toy import (
     ScalarNet,
-    ScalarNetConfig,
     ToyConfig,
     global_minimum,
     network_value,
@@ -80,7 +79,7 @@ def test_network_is_a_chain_of_linear_maps_and_elus() -> None:
 
 @pytest.mark.parametrize("name", ["xavier-relu", "xavier", "he", "lecun", "pytorch"])
 def test_initialisations_have_their_spread(name: str) -> None:
-    net = ScalarNet(ScalarNetConfig(features=(400, 300), initialization=name))
+    net = ScalarNet(name, features=(400, 300))
     layer = net.init(jax.random.key(2), jnp.zeros(()))["params"]["Dense_1"]
     variance = {"xavier-relu": 4 / 700, "xavier": 2 / 700, "he": 2 / 400, "lecun": 1 / 400, "pytorch": 1 / 1200}[name]
     assert float(jnp.var(layer["kernel"])) == pytest.approx(variance, rel=0.03)
@@ -99,7 +98,7 @@ def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
     [
         (lambda: ToyConfig(learning_rate=0.0), "learning_rate"),
         (lambda: ToyConfig(num_steps=0), "num_steps"),
-        (lambda: ScalarNetConfig(initialization="zeros"), "initialization"),
+        (lambda: ToyConfig(initialization="zeros"), "initialization"),
     ],
 )
 def test_bad_settings_are_named(call, message, as_user) -> None:

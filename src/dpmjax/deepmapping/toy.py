@@ -6,7 +6,7 @@ second is the weights and the input of a network with the output x. Both are pro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import flax.linen as nn
@@ -33,40 +33,28 @@ _KERNELS: dict[str, tuple[float, Any, Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class ScalarNetConfig:
-    """Shape of the network. The features are the paper's; its initialisation is unpublished.
+class ScalarNet(nn.Module):
+    """A multi-layer perceptron from one number to one number.
 
     Attributes:
-        features: channels of the hidden layers, each followed by an ELU.
-        initialization: "xavier-relu": Xavier-uniform with the gain of ReLU, as in the published L-Net; "xavier":
-            without the gain; "he"; "lecun" (Flax's default); "pytorch": PyTorch's default. Biases are zero, or for
-            "pytorch" uniform like the weights.
+        initialization: distribution of the first weights.
+        features: channels of the hidden layers, each followed by an ELU; the default is the paper's.
     """
 
+    initialization: Initialization
     features: tuple[int, ...] = (10, 20, 30, 40)
-    initialization: Initialization = "xavier-relu"
-
-    def __post_init__(self) -> None:
-        require_one_of("initialization", self.initialization, get_args(Initialization))
-
-
-class ScalarNet(nn.Module):
-    """A multi-layer perceptron from one number to one number."""
-
-    config: ScalarNetConfig
 
     @nn.compact
     def __call__(self, z: Float[Array, ""]) -> Float[Array, ""]:
         """Computes the value x from the auxiliary variable z."""
         x = z[None]
-        for features in self.config.features:
+        for features in self.features:
             x = nn.elu(self._linear(features, x))
         return self._linear(1, x)[0]
 
     def _linear(self, features: int, x: Float[Array, " c"]) -> Float[Array, " f"]:
-        kernel_init = nn.initializers.variance_scaling(*_KERNELS[self.config.initialization])
-        bound = x.shape[0] ** -0.5 if self.config.initialization == "pytorch" else 0.0
+        kernel_init = nn.initializers.variance_scaling(*_KERNELS[self.initialization])
+        bound = x.shape[0] ** -0.5 if self.initialization == "pytorch" else 0.0
 
         def bias_init(key: jax.Array, shape: Any, dtype: Any = float) -> Array:
             return jax.random.uniform(key, shape, dtype, -bound, bound)
@@ -76,22 +64,25 @@ class ScalarNet(nn.Module):
 
 @dataclass(frozen=True)
 class ToyConfig:
-    """Settings of the example and of its only phase; the defaults are the paper's.
+    """Settings of the example and of its only phase; the defaults are the paper's, whose initialisation is unpublished.
 
     Attributes:
         form: "network": weights and input of the network are optimised; "direct": x is optimised, from the output of
             the untrained network, so that both forms have the same initial value.
-        net: shape of the network.
+        initialization: "xavier-relu": Xavier-uniform with the gain of ReLU, as in the published L-Net; "xavier":
+            without the gain; "he"; "lecun" (Flax's default); "pytorch": PyTorch's default. Biases are zero, or for
+            "pytorch" uniform like the weights.
         learning_rate: learning rate of gradient descent.
         num_steps: number of steps of gradient descent.
     """
 
     form: Literal["network", "direct"] = "network"
-    net: ScalarNetConfig = field(default_factory=ScalarNetConfig)
+    initialization: Initialization = "xavier-relu"
     learning_rate: float = 2e-4
     num_steps: int = 1000
 
     def __post_init__(self) -> None:
+        require_one_of("initialization", self.initialization, get_args(Initialization))
         require_positive_fields(self, "learning_rate")
         require_fields(self, "num_steps", low=1)
 
@@ -158,13 +149,13 @@ def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
     Returns:
         x = f(z).
     """
-    return ScalarNet(config.net).apply(params.net, params.z)  # type: ignore[return-value]
+    return ScalarNet(config.initialization).apply(params.net, params.z)  # type: ignore[return-value]
 
 
 def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
     net_key, z_key = jax.random.split(key)
     z = jax.random.normal(z_key)
-    params = ToyParams(jnp.zeros(()), ScalarNet(config.net).init(net_key, z), z)
+    params = ToyParams(jnp.zeros(()), ScalarNet(config.initialization).init(net_key, z), z)
     return params.replace(x=network_value(config, params))  # type: ignore[attr-defined]
 
 

@@ -107,11 +107,12 @@ def initialize_depth(
             poses = np.broadcast_to(before, (len(T_last_next), *before.shape))
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
-        T = _adjusted(T, images, config.tolerance[1], config.motion)
+        T = _adjusted(T, images, config.scales.tolerance[1], config.motion)
     T, images = T[:_NUM_LAST], SampledImages(scans, scans.pixels, unit)
-    for tolerance in np.geomspace(config.tolerance[1], config.final_tolerance, _NUM_TOLERANCES):
+    final = config.scales.final_tolerance
+    for tolerance in np.geomspace(config.scales.tolerance[1], final, _NUM_TOLERANCES):
         T = _adjusted(T, images, float(tolerance), config.motion, num_window=scans.mask.shape[0])
-    scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(config.final_tolerance))
+    scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(final))
     return T[np.argmax(np.asarray(scores) - _mean_cost(T, config))]
 
 
@@ -156,7 +157,7 @@ def _explained(T: Float[Array, "m n 4 4"], images: SampledImages, tolerance: Flo
 def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: DepthSearchConfig) -> NDArray[np.float64]:
     """Selects the best of (t, k, m, 4, 4) trajectories that differ from all better ones, best first."""
     rows, window = _window(T.shape[2], images, _NUM_WINDOW)
-    tolerance = jnp.asarray(config.tolerance[1])
+    tolerance = jnp.asarray(config.scales.tolerance[1])
     scores = np.concatenate([_explained(jnp.asarray(t[:, rows], jnp.float32), window, tolerance) for t in T])
     T = T.reshape(-1, *T.shape[2:])
     scores = scores - _mean_cost(T, config)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from dpmjax.checks import require_fields
+from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 from dpmjax.geometry.se3 import Motion, motion_matrices
@@ -55,15 +55,10 @@ _FIRST_SPREAD = 0.25
 _NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
 
 
-@dataclass(frozen=True)
-class DepthSearchConfig:
-    """Settings of the search.
+class SearchScales(NamedTuple):
+    """Tolerances and costs of the search, which depend on the degrees of freedom of the camera.
 
     Attributes:
-        motion: degrees of freedom of the camera.
-        num_trajectories: largest number of trajectories that are kept from image to image.
-        num_candidates: number of motions of the first round, spread evenly.
-        num_varied: number of new motions around each kept one in a round.
         tolerance: tolerance of matching points as a share of the depth, in the first and in the last round; the last
             one is also that of incomplete trajectories.
         final_tolerance: tolerance of the last adjustment and of the choice of the best trajectory.
@@ -72,17 +67,44 @@ class DepthSearchConfig:
         turn_weight: cost of the largest turn, in units of consistency.
     """
 
+    tolerance: tuple[float, float]
+    final_tolerance: float
+    translation_weight: float
+    turn_weight: float
+
+
+# Images of a hand-held camera have the noise of a real sensor, and small motions between them: wider tolerances, and
+# higher costs of motions.
+_SCALES: dict[Motion, SearchScales] = {
+    "planar": SearchScales((0.12, 0.02), 0.006, translation_weight=0.05, turn_weight=0.0),
+    "full": SearchScales((0.12, 0.03), 0.015, translation_weight=0.2, turn_weight=0.3),
+}
+
+
+@dataclass(frozen=True)
+class DepthSearchConfig:
+    """Settings of the search.
+
+    Attributes:
+        motion: degrees of freedom of the camera; they decide the tolerances and the costs of motions.
+        num_trajectories: largest number of trajectories that are kept from image to image.
+        num_candidates: number of motions of the first round, spread evenly.
+        num_varied: number of new motions around each kept one in a round.
+    """
+
     motion: Motion = "planar"
     num_trajectories: int = 16
     num_candidates: int = 1024
     num_varied: int = 20
-    tolerance: tuple[float, float] = (0.12, 0.02)
-    final_tolerance: float = 0.006
-    translation_weight: float = 0.05
-    turn_weight: float = 0.0
 
     def __post_init__(self) -> None:
         require_fields(self, "num_trajectories", "num_candidates", "num_varied", low=1)
+        require_one_of("motion", self.motion, get_args(Motion))
+
+    @property
+    def scales(self) -> SearchScales:
+        """Tolerances and costs of motions."""
+        return _SCALES[self.motion]
 
 
 def depth_search(motion: Motion) -> DepthSearchConfig:
@@ -97,16 +119,7 @@ def depth_search(motion: Motion) -> DepthSearchConfig:
     """
     if motion == "planar":
         return DepthSearchConfig()
-    return DepthSearchConfig(
-        motion="full",
-        num_trajectories=8,
-        num_candidates=16384,
-        num_varied=48,
-        tolerance=(0.12, 0.03),
-        final_tolerance=0.015,
-        translation_weight=0.2,
-        turn_weight=0.3,
-    )
+    return DepthSearchConfig(motion="full", num_trajectories=8, num_candidates=16384, num_varied=48)
 
 
 class SearchCamera(NamedTuple):
@@ -208,7 +221,7 @@ def motion_cost(length: Any, turn: Any, config: DepthSearchConfig) -> Any:
         The cost of each motion.
     """
     turn_share = turn / np.deg2rad(MAX_TURN_DEG)
-    return config.translation_weight * length / MAX_TRANSLATION + config.turn_weight * turn_share
+    return config.scales.translation_weight * length / MAX_TRANSLATION + config.scales.turn_weight * turn_share
 
 
 def _take(tree: Any, rows: Any) -> Any:
@@ -321,7 +334,7 @@ def _search(
     first_key, round_key = jax.random.split(key)
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
     T = motion_matrices(values.at[0].set(0.0))
-    tolerances = jnp.geomspace(*config.tolerance, _NUM_ROUNDS + _NUM_TOLERANCES)
+    tolerances = jnp.geomspace(*config.scales.tolerance, _NUM_ROUNDS + _NUM_TOLERANCES)
     nearest = _take(references, slice(_NUM_REFERENCES))
 
     def scores_of(T: Float[Array, "m 4 4"], compared: References, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
