@@ -63,7 +63,6 @@ SCANS_2D = Group("2-D scans", (
         "scans_per_window": ("scans", "shorter windows if scans are far apart; None: one L-Net for the whole set"),
     }),
     Section("RefinementConfig", "dpmjax.registration2d", "`refine(scans, poses, config)`", {
-        "num_spatial": ("scans", "more neighbours in space: stiffer maps, slower"),
         "radius": ("typical ranges", "how far apart neighbours in space may be"),
         "loops": ("", "None: no search of loops"),
     }),
@@ -87,7 +86,6 @@ SLAM = Group("SLAM", (
     Section("OdometryConfig", "dpmjax.slam", "`SlamConfig(odometry=...)`", {
         "proposer": ("", "\"network\": the decoder proposes the motion of every scan, slower"),
         "num_keyframes": ("keyframes", "more: a larger local map, less drift, slower"),
-        "num_recent": ("scans", "more: a denser local map, slower"),
     }),
     Section("FrontEndConfig", "dpmjax.slam", "`SlamConfig(front_end=...)`", {
         "keyframe_share": ("share of the median range", "higher: fewer keyframes, smaller maps, fewer loops"),
@@ -105,6 +103,7 @@ SLAM = Group("SLAM", (
         "num_similar": ("keyframes", "more for large maps"),
         "num_registered": ("keyframes", "more: more scans are found, slower"),
         "min_support": ("registrations", "1 for maps with few keyframes; riskier"),
+        "min_best": ("probability", "lower: more scans are found, at a higher risk"),
     }),
     Section("PoseGraphConfig", "dpmjax.pose_graph", "`optimize_pose_graph(graph, config)`", {
         "outlier_chi2": ("chi2", "10 if edges may be wrong; None: plain least squares"),
@@ -120,13 +119,11 @@ TRAINING = Group("Training", (
         "num_variants": ("variants", "more augmented variants of each scan: more disk, less overfitting"),
         "learning_rate": ("", "lower (1e-4) to tune trained weights on few scans"),
         "final_learning_rate": ("", "at the end of the decay"),
-        "decay_ratio": ("share of the steps", "part of the training in which the learning rate falls"),
         "max_gradient_norm": ("", "lower if the loss jumps"),
         "scans_at_once": ("scans", "more on a GPU, fewer if memory is short"),
     }),
     Section("SamplingConfig", "dpmjax.deeppointmap", "`TrainingConfig(sampling=...)`", {
         "num_scans": ("scans", "scans of one step; memory and time grow with it"),
-        "min_distance_m": ("m", "nearer scans are too similar to learn from"),
         "max_distance_m": ("m", "larger: harder pairs"),
     }),
 ))  # fmt: skip

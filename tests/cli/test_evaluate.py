@@ -93,9 +93,9 @@ def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) ->
 def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> None:
     write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(num_scans=6))
     assert len(drives.find_sources([str(tmp_path / "kitti")], [])) == 1
-    far = SamplingConfig(min_distance_m=500.0, max_distance_m=900.0)
-    with pytest.raises(ValueError, match=r"no two of them 500\.0 to 900\.0 m apart"):
-        drives.find_sources([str(tmp_path / "kitti")], [], far)
+    near = SamplingConfig(max_distance_m=3.0)
+    with pytest.raises(ValueError, match=r"no two of them 0\.25 to 3\.0 m apart"):
+        drives.find_sources([str(tmp_path / "kitti")], [], near)
 
 
 def test_a_table_of_no_right_registration_has_no_median() -> None:

@@ -12,10 +12,10 @@ import pytest
 import dpmjax
 from dpmjax.deeppointmap import correlate
 from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, logistic_probability
+from dpmjax.deeppointmap.matching import TEMPERATURE
 from dpmjax.deeppointmap.model import overlap_logit, similarity_features
 from dpmjax.deeppointmap.overlap_prediction import (
     HIGH,
-    MATCHING,
     OverlapEvidence,
     overlap_evidence,
     overlap_probability,
@@ -58,7 +58,7 @@ def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     features = [np.asarray(similarity_features(model, one), float) for one in correlate(model, a, b)]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in features]
     similarity = unit[0] @ unit[1].T
-    exponential = np.exp(similarity / MATCHING.temperature)
+    exponential = np.exp(similarity / TEMPERATURE)
     scores = exponential**2 / (exponential.sum(axis=1, keepdims=True) * exponential.sum(axis=0))
 
     def quantile(values: np.ndarray, share: float) -> float:

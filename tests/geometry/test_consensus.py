@@ -138,7 +138,7 @@ def test_many_sets_at_once_and_no_gradient() -> None:
     assert not gradient.any()
 
 
-@pytest.mark.parametrize("wrong", [{"agreement_m": 0.0}, {"num_seeds": 0}])
+@pytest.mark.parametrize("wrong", [{"num_rounds": 0}, {"num_seeds": 0}])
 def test_config_says_what_is_wrong(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         ConsensusConfig(**wrong)  # type: ignore[arg-type]

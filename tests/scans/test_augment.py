@@ -188,18 +188,18 @@ def test_wrong_numbers_are_named() -> None:
         ("box_probability", -1.0),
         ("max_tilt_rad", -0.1),
         ("tilt_power", 0.5),
-        ("sparse_points", (3.0, 1.0)),
+        ("sparse_probability", 1.5),
     ):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             AugmentConfig(**{name: value})
 
 
 def test_sparse_scans_keep_as_many_points_as_is_drawn() -> None:
-    config = replace(NOTHING, sparse_probability=1.0, sparse_points=(50.0, 2000.0))
-    kept = augment_all(config, cloud(600, 500)).cloud.mask.sum(axis=1)
-    # Uniform in the logarithm: 62 % of the draws are below the 500 points that there are.
-    assert 40 <= kept.min() < 80
-    assert 0.4 < (kept < 500).mean() < 0.85
+    config = replace(NOTHING, sparse_probability=1.0)
+    kept = augment_all(config, cloud(5000, 4000)).cloud.mask.sum(axis=1)
+    # From 300 to 20,000, uniform in the logarithm: 62 % of the draws are below the 4,000 points that there are.
+    assert 240 <= kept.min() < 480
+    assert 0.4 < (kept < 4000).mean() < 0.85
     assert (augment_all(NOTHING, cloud()).cloud.mask.sum(axis=1) == 250).all()
 
 

@@ -119,7 +119,7 @@ def test_alignment_moves_with_the_frames() -> None:
         (lambda: SurfaceConfig(voxel_size_m=0.0), "voxel_size_m"),
         (lambda: SurfaceConfig(min_range_m=90.0), "min_range_m"),
         (lambda: AlignmentLevel(0.0, 10, 1), "radius_m"),
-        (lambda: AlignmentConfig(min_cosine=2.0), "min_cosine"),
+        (lambda: AlignmentConfig(levels=()), "levels"),
     ],
 )
 def test_settings_out_of_range_are_named(make, name: str) -> None:

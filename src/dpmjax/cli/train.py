@@ -135,7 +135,7 @@ def main(config: Config) -> None:
                 sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=config.town_length_m)
                 records = Records(folder, settings, sets, seed=config.seed, weights=first)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
-        plateau_s = plateau_seconds(config, settings)
+        plateau_s = plateau_seconds(config)
         trained = run_training(records, store, settings, hooks, seed=config.seed, plateau_s=plateau_s)
         if trained.stopped_by:
             stop.request(trained.stopped_by)
@@ -158,11 +158,11 @@ def main(config: Config) -> None:
         print_summary(folder, metrics)
 
 
-def plateau_seconds(config: Config, settings: deeppointmap.TrainingConfig) -> float | None:
+def plateau_seconds(config: Config) -> float | None:
     """Returns the seconds of steps after which the learning rate falls; None where the steps decide."""
     if config.finish:
         return 0.0
-    return None if config.hours is None else 3600 * config.hours * (1 - settings.decay_ratio)
+    return None if config.hours is None else 3600 * config.hours * (1 - deeppointmap.DECAY_RATIO)
 
 
 def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:

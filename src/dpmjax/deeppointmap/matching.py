@@ -54,6 +54,9 @@ PredictOffsets = Callable[[Int[Array, " k"], Int[Array, " k"]], tuple[Float[Arra
 # Relative tolerance: rounding must not drop pairs whose errors are all equal.
 ERROR_SLACK = 1 + 1e-5
 
+# Temperature of the softmaxes over descriptors, in matching and in training (DeepPointMap's published configuration).
+TEMPERATURE = 0.1
+
 # A rigid motion needs three distinct points on both sides.
 MIN_NUM_POINTS = 3
 
@@ -63,20 +66,18 @@ class MatchConfig:
     """Choice of pairs and of inliers (defaults: DeepPointMap's published configuration).
 
     Attributes:
-        temperature: temperature of both softmaxes.
         pair_ratio: number of pairs per direction, as a share of the mean size of the two clouds.
         num_rounds: number of times that the inliers are chosen again.
         consensus: if given, the first inliers are the pairs that support one common motion. This tolerates many wrong
             pairs, as from networks with little training or in repetitive places.
     """
 
-    temperature: float = 0.1
     pair_ratio: float = 0.5
     num_rounds: int = 3
     consensus: ConsensusConfig | None = None
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "temperature", "pair_ratio")
+        require_positive_fields(self, "pair_ratio")
         require_fields(self, "num_rounds", low=1)
         require_fields(self, "pair_ratio", low=0, high=4)
 
@@ -130,20 +131,17 @@ class BestPairs(NamedTuple):
     mask: Bool[Array, " k"]
 
 
-def dual_softmax(
-    similarity: Float[Array, "m n"], is_pair: Bool[Array, "m n"], temperature: float
-) -> Float[Array, "m n"]:
+def dual_softmax(similarity: Float[Array, "m n"], is_pair: Bool[Array, "m n"]) -> Float[Array, "m n"]:
     """Computes the product of the softmaxes over rows and over columns (DeepPointMap section 3.2).
 
     Args:
         similarity: cosine of each pair of descriptors.
         is_pair: False for pairs that are not there.
-        temperature: temperature of both softmaxes.
 
     Returns:
         In [0, 1]; 0 for pairs that are not there.
     """
-    logits = jnp.where(is_pair, similarity / temperature, jnp.finfo(similarity.dtype).min)
+    logits = jnp.where(is_pair, similarity / TEMPERATURE, jnp.finfo(similarity.dtype).min)
     return jnp.where(is_pair, jax.nn.softmax(logits, axis=1) * jax.nn.softmax(logits, axis=0), 0)
 
 
@@ -161,7 +159,7 @@ def best_pairs(
         similarity: cosine of each pair of descriptors.
         source_mask: False for descriptors that are not there.
         target_mask: the same.
-        config: temperature and number of pairs.
+        config: number of pairs.
 
     Returns:
         The pairs, best first.
@@ -171,7 +169,7 @@ def best_pairs(
     wanted = int(config.pair_ratio * (num_source + num_target)) // 2
     capacity = min(wanted, MAX_NUM_PAIRS, num_source * num_target)
     is_pair = source_mask[:, None] & target_mask[None, :]
-    scores = dual_softmax(similarity, is_pair, config.temperature)
+    scores = dual_softmax(similarity, is_pair)
     scores, flat = lax.top_k(jnp.where(is_pair, scores, -1).ravel(), capacity)
     num_valid = jnp.sum(source_mask) + jnp.sum(target_mask)
     num_pairs = jnp.floor(config.pair_ratio * num_valid).astype(int) // 2
@@ -212,9 +210,7 @@ def _align(
         is_scored = is_inlier & (jnp.cumsum(is_inlier) <= NUM_CONFIDENT)
         mean_score = jnp.sum(jnp.where(is_scored, scores, 0)) / jnp.maximum(jnp.sum(is_scored), 1)
         half = slice(num_pairs)
-        support = motion_support(
-            T_target_source, source[half], target[half], is_inlier[half], config=config.consensus or ConsensusConfig()
-        )
+        support = motion_support(T_target_source, source[half], target[half], is_inlier[half])
         return Registration(
             T_target_source=T_target_source,
             confidence=mean_score,

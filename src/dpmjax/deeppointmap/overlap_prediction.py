@@ -120,7 +120,7 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
     correlated = correlate(model, a, b)
     is_pair = a.mask[:, None] & b.mask[None, :]
     similarity = jnp.where(is_pair, descriptor_similarity(model, *correlated), -1)
-    scores = dual_softmax(similarity, is_pair, MATCHING.temperature)
+    scores = dual_softmax(similarity, is_pair)
     best = jnp.argmax(scores, axis=1)
     is_mutual = a.mask & (jnp.argmax(scores, axis=0)[best] == jnp.arange(len(best)))
     motion = _best_motion(model, correlated, similarity)

@@ -18,11 +18,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.checks import as_float, as_mask, as_points, require_count, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.types import AnyArray
 
+# Two pairs agree if the distances between their points differ by less than this on the two sides, metres. Points nearer
+# to each other than this, on either side, are not compared.
+AGREEMENT_M = 1.0
 # A pair farther apart than this under a motion does not support it, metres.
 INLIER_M = 2.0
 # Number of pairs that support each pair.
@@ -34,23 +37,19 @@ DISTINCT_M = 2.0
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """Tolerances, and numbers of motions.
+    """Numbers of motions.
 
     Attributes:
-        agreement_m: two pairs agree if the distances between their points differ by less than this on the two sides.
-            Points nearer to each other than this, on either side, are not compared.
         num_seeds: number of pairs that propose a motion.
         num_rounds: number of times that a motion is fitted again to the pairs that support it.
         num_motions: largest number of motions that are returned.
     """
 
-    agreement_m: float = 1.0
     num_seeds: int = 128
     num_rounds: int = 5
     num_motions: int = 24
 
     def __post_init__(self) -> None:
-        require_positive("agreement_m", self.agreement_m)
         for name in ("num_seeds", "num_rounds", "num_motions"):
             require_count(name, getattr(self, name))
 
@@ -86,7 +85,7 @@ def find_consensus(
         source: metres, source frame.
         target: metres, target frame, row for row.
         mask: False for pairs that are not there; they may hold anything.
-        config: tolerances.
+        config: numbers of motions.
 
     Returns:
         `config.num_motions` motions, best first; with fewer than three pairs that agree the first is a guess with
@@ -108,7 +107,7 @@ def find_consensus(
 @functools.partial(jax.jit, static_argnames="config")
 def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, config: ConsensusConfig) -> Consensus:
     source, target = (as_float("points", jnp.where(mask[:, None], points, 0)) for points in (source, target))
-    agreement, worth = _second_order(source, target, mask, config)
+    agreement, worth = _second_order(source, target, mask)
     _, seeds = lax.top_k(jnp.sum(agreement, axis=1), min(config.num_seeds, len(source)))
 
     def propose(seed: Int[Array, ""]) -> tuple[Array, Array]:
@@ -158,8 +157,6 @@ def motion_support(
     source: Float[Array, "k 3"],
     target: Float[Array, "k 3"],
     mask: Bool[Array, " k"],
-    *,
-    config: ConsensusConfig,
 ) -> Float[Array, ""]:
     """The support of any motion, as `Consensus.support`.
 
@@ -168,35 +165,34 @@ def motion_support(
         source: metres, source frame.
         target: metres, target frame, row for row.
         mask: False for pairs that are not there; they may hold anything finite.
-        config: tolerances.
 
     Returns:
         The support.
     """
-    worth = _worth(_distances(source), _distances(target), mask, config)
+    worth = _worth(_distances(source), _distances(target), mask)
     return jnp.sum(worth * _closeness(T_target_source, source, target))
 
 
 def _second_order(
-    source: Float[Array, "k 3"], target: Float[Array, "k 3"], mask: Bool[Array, " k"], config: ConsensusConfig
+    source: Float[Array, "k 3"], target: Float[Array, "k 3"], mask: Bool[Array, " k"]
 ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
     """Returns second-order compatibility and votes.
 
     The compatibility of two pairs that agree is the number of other pairs that agree with both, else 0. Pairs whose
-    points are nearer to each other than `agreement_m` on both sides share one vote.
+    points are nearer to each other than `AGREEMENT_M` on both sides share one vote.
     """
     lengths, other_lengths = _distances(source), _distances(target)
     is_pair = mask[:, None] & mask[None, :]
-    is_apart = jnp.minimum(lengths, other_lengths) > config.agreement_m
-    agrees = (jnp.abs(lengths - other_lengths) < config.agreement_m) & is_apart & is_pair
+    is_apart = jnp.minimum(lengths, other_lengths) > AGREEMENT_M
+    agrees = (jnp.abs(lengths - other_lengths) < AGREEMENT_M) & is_apart & is_pair
     agrees = agrees.astype(jnp.float32)
-    return agrees * (agrees @ agrees), _worth(lengths, other_lengths, mask, config)
+    return agrees * (agrees @ agrees), _worth(lengths, other_lengths, mask)
 
 
 def _worth(
-    lengths: Float[Array, "k k"], other_lengths: Float[Array, "k k"], mask: Bool[Array, " k"], config: ConsensusConfig
+    lengths: Float[Array, "k k"], other_lengths: Float[Array, "k k"], mask: Bool[Array, " k"]
 ) -> Float[Array, " k"]:
-    is_same = (jnp.maximum(lengths, other_lengths) <= config.agreement_m) & mask[:, None] & mask[None, :]
+    is_same = (jnp.maximum(lengths, other_lengths) <= AGREEMENT_M) & mask[:, None] & mask[None, :]
     return mask / jnp.maximum(jnp.sum(is_same, axis=1), 1).astype(lengths.dtype)
 
 

@@ -52,6 +52,9 @@ BOX_WIDTH_M = (0.5, 2.5)
 # Longer side on the ground.
 BOX_LENGTH_M = (2.0, 10.0)
 
+# Bounds of the number of points that a sparse scan keeps at most, uniform in its logarithm.
+SPARSE_POINTS = (300.0, 20000.0)
+
 # The noise is clipped at this many standard deviations.
 JITTER_CLIP_SIGMAS = 3.0
 
@@ -65,7 +68,6 @@ class AugmentConfig:
     Attributes:
         max_drop_ratio: largest share of points that a scan loses; the share is uniform from 0 to this.
         sparse_probability: probability that a scan is thinned further, as by a lidar of few beams.
-        sparse_points: bounds of the number of points that such a scan keeps at most, uniform in its logarithm.
         sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
             scan in ten is occluded (DeepPointMap section 3.3), by either at equal odds.
         box_probability: probability that boxes occlude a scan.
@@ -78,7 +80,6 @@ class AugmentConfig:
 
     max_drop_ratio: float = 0.5
     sparse_probability: float = 0.0
-    sparse_points: Interval = (300.0, 20000.0)
     sector_probability: float = 0.05
     box_probability: float = 0.05
     max_yaw_rad: float = math.pi
@@ -91,8 +92,6 @@ class AugmentConfig:
         require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
         require_fields(self, "sparse_probability", low=0, high=1)
         require_fields(self, "tilt_power", low=1)
-        if not 1 <= self.sparse_points[0] <= self.sparse_points[1]:
-            raise ValueError(f"sparse_points: expected 1 <= lower <= upper bound, got {self.sparse_points}")
         if self.sector_probability + self.box_probability > 1:
             both = f"{self.sector_probability} and {self.box_probability}"
             raise ValueError(f"sector_probability, box_probability: expected a sum of at most 1, got {both}")
@@ -190,7 +189,7 @@ def _is_dropped(mask: Bool[AnyArray, " n"], config: AugmentConfig, key: PRNGKeyA
     draws = jax.random.uniform(key, (len(mask) + 1,))
     kept = 1 - draws[0] * config.max_drop_ratio
     coin, place = jax.random.uniform(jax.random.fold_in(key, 1), (2,))
-    low, high = jnp.log(jnp.array(config.sparse_points))
+    low, high = jnp.log(jnp.array(SPARSE_POINTS))
     share = jnp.exp(low + place * (high - low)) / jnp.maximum(jnp.sum(mask) * kept, 1)
     kept *= jnp.where(coin < config.sparse_probability, jnp.minimum(share, 1), 1)
     return draws[1:] < 1 - kept

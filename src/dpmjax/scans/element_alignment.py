@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
-from dpmjax.scans.surface_alignment import MIN_PAIRS, AlignmentConfig, AlignmentLevel
+from dpmjax.scans.surface_alignment import MIN_PAIRS, PAIR_COSINE, AlignmentConfig, AlignmentLevel
 from dpmjax.scans.surfaces import MIN_FLATNESS
 from dpmjax.types import AnyArray, SurfaceElements
 
@@ -161,10 +161,10 @@ def _stepper(
     def step_from(T_target_source: Any) -> _Step:
         moved = _moved(T_target_source, source)
         rows, is_pair = near_target(moved.positions)
-        pairs = _pairs(moved, _rows(target, rows), is_pair, sign=1, min_cosine=config.min_cosine)
+        pairs = _pairs(moved, _rows(target, rows), is_pair, sign=1)
         if is_symmetric:
             rows, is_pair = near_source(_moved(rigid.inverse(T_target_source), target).positions)
-            others = _pairs(target, _rows(moved, rows), is_pair, sign=-1, min_cosine=config.min_cosine)
+            others = _pairs(target, _rows(moved, rows), is_pair, sign=-1)
             pairs = jax.tree.map(lambda *parts: rigid.namespace_of(parts[0]).concatenate(parts), pairs, others)
         return _solve(pairs, T_target_source, level, config)
 
@@ -219,12 +219,12 @@ class _Pairs(NamedTuple):
     weights: Any
 
 
-def _pairs(queries: SurfaceElements, planes: SurfaceElements, is_pair: Any, *, sign: int, min_cosine: float) -> _Pairs:
+def _pairs(queries: SurfaceElements, planes: SurfaceElements, is_pair: Any, *, sign: int) -> _Pairs:
     """Pairs queries with planes, row for row; `sign` is 1 where the queries move, and -1 where the planes do."""
     xp = rigid.namespace_of(queries.positions)
     residuals = sign * ((queries.positions - planes.positions) * planes.normals).sum(axis=1)
     cosines = xp.abs((queries.normals * planes.normals).sum(axis=1))
-    weights = (is_pair & queries.mask) * planes.planarity * xp.maximum(cosines - min_cosine, 0)
+    weights = (is_pair & queries.mask) * planes.planarity * xp.maximum(cosines - PAIR_COSINE, 0)
     return _Pairs(queries.positions, planes.normals, residuals, weights)
 
 

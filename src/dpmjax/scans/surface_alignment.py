@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.checks import require_count, require_fields, require_positive
+from dpmjax.checks import require_count, require_positive
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
 
@@ -25,6 +25,9 @@ MIN_KERNEL_M = 0.05
 
 # Width of the Geman-McClure kernel, as a share of the radius.
 KERNEL_SHARE = 1 / 6
+
+# Smallest cosine between the normals of a pair; the part of the cosine above it is a factor of the weight of the pair.
+PAIR_COSINE = 0.3
 
 # Fewer pairs do not constrain a motion.
 MIN_PAIRS = 20
@@ -59,7 +62,6 @@ class AlignmentConfig:
 
     Attributes:
         levels: coarse to fine.
-        min_cosine: smallest cosine between the normals of a pair; the cosine is also the weight of the pair.
     """
 
     levels: tuple[AlignmentLevel, ...] = (
@@ -67,12 +69,10 @@ class AlignmentConfig:
         AlignmentLevel(1.0, 4000, 8),
         AlignmentLevel(0.4, 8000, 10),
     )
-    min_cosine: float = 0.3
 
     def __post_init__(self) -> None:
         if not self.levels:
             raise ValueError("levels: expected one or more, got none")
-        require_fields(self, "min_cosine", low=0, high=1)
 
     def kernel_width_m(self, level: AlignmentLevel) -> float:
         """Returns the width of the kernel at a level.
@@ -271,7 +271,7 @@ def _step(
     pairs: NearestPlanes, level: AlignmentLevel, config: AlignmentConfig
 ) -> tuple[PlaneStep, Float[np.ndarray, " s"]]:
     """Returns the step that brings points onto their planes, and the rmse before it."""
-    weights = pairs.flatness * np.maximum(pairs.cosines - config.min_cosine, 0) * pairs.is_paired
+    weights = pairs.flatness * np.maximum(pairs.cosines - PAIR_COSINE, 0) * pairs.is_paired
     weights *= geman_mcclure(pairs.residuals, config.kernel_width_m(level))
     total = weights.sum(axis=1)
     squares = np.sum(weights * pairs.residuals**2, axis=1)

@@ -121,7 +121,7 @@ def test_presets_double_the_groups(name) -> None:
     ("make", "message"),
     [
         (lambda: CurriculumStage(1, 3), "max_group"),
-        (lambda: SamplingConfig(min_distance_m=30.0), "min_distance_m"),
+        (lambda: SamplingConfig(max_distance_m=0.2), "max_distance_m"),
         (lambda: TrainingConfig(sampling=SamplingConfig(num_scans=16)), "num_scans"),
         (lambda: TrainingConfig(learning_rate=0.0), "learning_rate"),
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),

@@ -23,6 +23,12 @@ from dpmjax.scans.augment import AugmentConfig
 # Probability that a group is one pair of scans, in every stage.
 PAIR_PROBABILITY = 0.34
 
+# Smallest distance of a scan from its anchor, metres; nearer ones are too similar (published configuration).
+MIN_DISTANCE_M = 0.25
+
+# Share of the steps in which the learning rate falls, at the end (DeepPointMap's published configuration).
+DECAY_RATIO = 0.2
+
 # Number of scans in the first and in the second map of a group.
 GroupShape = tuple[int, int]
 
@@ -58,25 +64,20 @@ class SamplingConfig:
 
     Attributes:
         num_scans: capacity of one sample, all groups together.
-        min_distance_m: smallest distance of a scan from its anchor; nearer ones are too similar.
-        max_distance_m: largest distance of a scan of a group from its anchor.
+        max_distance_m: largest distance of a scan of a group from its anchor, above `MIN_DISTANCE_M`.
         max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
             against all others.
-        max_descriptors: largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans,
-            and attention over all of them would cost twenty times as much.
     """
 
     num_scans: int = 32
-    min_distance_m: float = 0.25
     max_distance_m: float = 20.0
     max_side: int = 16
-    max_descriptors: int = 1024
 
     def __post_init__(self) -> None:
-        require_fields(self, "max_side", "max_descriptors", low=1)
+        require_fields(self, "max_side", low=1)
         require_fields(self, "num_scans", low=2)
-        if not 0 <= self.min_distance_m < self.max_distance_m:
-            raise ValueError(f"min_distance_m: expected 0 to below {self.max_distance_m}, got {self.min_distance_m}")
+        if not self.max_distance_m > MIN_DISTANCE_M:
+            raise ValueError(f"max_distance_m: expected above {MIN_DISTANCE_M}, got {self.max_distance_m}")
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,6 @@ class TrainingConfig:
         objective: losses.
         learning_rate: learning rate after the warm-up and before the decay.
         final_learning_rate: learning rate at the end of the decay.
-        decay_ratio: share of the steps in which the learning rate falls, at the end.
         warmup_steps: number of steps in which the learning rate rises from 0.
         max_gradient_norm: longer gradients are scaled down to this norm.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
@@ -109,7 +109,6 @@ class TrainingConfig:
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-5
-    decay_ratio: float = 0.2
     warmup_steps: int = 0
     max_gradient_norm: float = 35.0
     scans_at_once: int = 8
@@ -118,7 +117,6 @@ class TrainingConfig:
         require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm")
         require_fields(self, "warmup_steps", low=0)
         require_fields(self, "scans_at_once", "num_variants", low=1)
-        require_fields(self, "decay_ratio", low=0, high=1)
         require_count("len(curriculum)", len(self.curriculum))
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:

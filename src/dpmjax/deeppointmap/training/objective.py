@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import require_fields, require_positive_fields
+from dpmjax.deeppointmap.matching import TEMPERATURE
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import radius_search
 from dpmjax.losses.descriptors import info_nce, offset_loss
@@ -30,7 +31,6 @@ class ObjectiveConfig:
     Attributes:
         coarse_weight: weight of the coarse pairing loss.
         offset_weight: weight of the offset loss.
-        temperature: temperature of both pairing losses.
         positive_radius_m: largest distance of the positive, which is the nearest descriptor; further descriptors within
             it are neutral.
         offset_radius_m: largest distance of the pairs whose offsets are learned.
@@ -40,13 +40,12 @@ class ObjectiveConfig:
 
     coarse_weight: float = 0.1
     offset_weight: float = 1.0
-    temperature: float = 0.1
     positive_radius_m: float = 1.0
     offset_radius_m: float = 2.0
     max_close: int = 16
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "temperature", "positive_radius_m", "offset_radius_m")
+        require_positive_fields(self, "positive_radius_m", "offset_radius_m")
         require_fields(self, "coarse_weight", "offset_weight", low=0)
         require_fields(self, "max_close", low=1)
 
@@ -160,7 +159,7 @@ def _direction(
     has_positive = jnp.any(is_close, axis=1)
     positives = jnp.where(has_positive, jnp.argmin(squared, axis=1), -1)
     is_absent = jnp.broadcast_to(~target.mask, squared.shape)
-    loss = functools.partial(info_nce, positives=positives, temperature=config.temperature)
+    loss = functools.partial(info_nce, positives=positives, temperature=TEMPERATURE)
     close = source.close
     return ObjectiveTerms(
         pairing=loss(source.matched_features, target.matched_features, ignore=is_absent),

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.matching import thinned_mask
-from dpmjax.deeppointmap.training.curriculum import GroupShape, Layout, SamplingConfig
+from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, GroupShape, Layout, SamplingConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 from dpmjax.types import AnyArray
@@ -110,7 +110,7 @@ def draw_groups(
             num_left -= groups[place] is None
             anchor = int(rng.integers(len(table)))
     if not any(groups):
-        limits = f"{config.min_distance_m} to {config.max_distance_m} m"
+        limits = f"{MIN_DISTANCE_M} to {config.max_distance_m} m"
         raise ValueError(f"table: expected scans with others {limits} from them, found none in {NUM_ATTEMPTS} draws")
     return tuple(groups)
 
@@ -120,7 +120,7 @@ def _group_at(
 ) -> Group | None:
     distances = table.distances_from(anchor)
     distances[anchor] = np.inf
-    others = np.flatnonzero((distances >= config.min_distance_m) & (distances <= config.max_distance_m))
+    others = np.flatnonzero((distances >= MIN_DISTANCE_M) & (distances <= config.max_distance_m))
     if len(others) == 0:
         return None
     chosen = rng.choice(others, min(sum(shape) - 1, len(others)), replace=False)

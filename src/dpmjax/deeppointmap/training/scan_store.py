@@ -20,10 +20,10 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
-from dpmjax.deeppointmap.training.curriculum import SamplingConfig, TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig
 from dpmjax.deeppointmap.training.sampling import PlacedScans, SampleScans, ScanTable
 from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, sampled_positions, stored_pyramids
-from dpmjax.scans.augment import AugmentConfig, augment_scan, random_motions_on_host
+from dpmjax.scans.augment import SPARSE_POINTS, AugmentConfig, augment_scan, random_motions_on_host
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import PointCloud
@@ -207,6 +207,7 @@ def _augmented(cloud: PointCloud, keys: Array, *, config: AugmentConfig) -> Poin
 def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
     model = config.model
     settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
+    settings[-1]["sparse_points"] = SPARSE_POINTS  # once a setting: files of that time are still found
     # Motions are drawn in the step, so they do not change the file.
     for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
         del settings[-1][name]
@@ -264,7 +265,7 @@ def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> s
         return "no poses; a pose for each scan is needed"
     positions = drive.T_world_lidar[:, :3, 3]
     tree = cKDTree(positions)
-    limits = sampling.min_distance_m, sampling.max_distance_m
+    limits = MIN_DISTANCE_M, sampling.max_distance_m
     num_too_near, num_near = (tree.count_neighbors(tree, limit) for limit in limits)
     if num_near == num_too_near:
         found = f"{len(positions)} scans, no two of them {limits[0]} to {limits[1]} m apart"

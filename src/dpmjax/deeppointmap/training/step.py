@@ -33,7 +33,7 @@ from dpmjax.deeppointmap.model import (
     predict_offsets,
     similarity_features,
 )
-from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import DECAY_RATIO, TrainingConfig
 from dpmjax.deeppointmap.training.objective import (
     ObjectiveConfig,
     ObjectiveTerms,
@@ -50,6 +50,10 @@ from dpmjax.types import AnyArray, DescriptorCloud
 
 # Groups of about this many scans are decoded at the same time.
 GROUP_SCANS_AT_ONCE = 16
+
+# Largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans, and attention over all
+# of them would cost twenty times as much.
+MAX_DESCRIPTORS = 1024
 
 # Weight decay of AdamW.
 WEIGHT_DECAY = 1e-4
@@ -109,7 +113,7 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
         params=params,
         optimizer=_optimizer(config).init(params),
         step=jnp.zeros((), jnp.int32),
-        decay_start=jnp.asarray(num_steps - round(config.decay_ratio * num_steps), jnp.int32),
+        decay_start=jnp.asarray(num_steps - round(DECAY_RATIO * num_steps), jnp.int32),
         end=jnp.asarray(num_steps, jnp.int32),
     )
 
@@ -117,7 +121,7 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
 def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
     """Begins the decay of the learning rate at once, so that training ends early.
 
-    The decay still takes the share `config.decay_ratio` of all steps.
+    The decay still takes the share `DECAY_RATIO` of all steps.
 
     Args:
         state: state before any step.
@@ -127,7 +131,7 @@ def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
         The state with its new end; the same state if its decay has begun, or would end no earlier.
     """
     step = int(state.step)
-    num_decay = max(1, math.ceil(step * config.decay_ratio / max(1 - config.decay_ratio, 1e-6)))
+    num_decay = max(1, math.ceil(step * DECAY_RATIO / (1 - DECAY_RATIO)))
     if step >= int(state.decay_start) or step + num_decay >= int(state.end):
         return state
     end = jnp.asarray(step + num_decay, jnp.int32)
@@ -187,8 +191,7 @@ def batch_loss(
         clouds = _in_parts(functools.partial(encode_sample, model), sample.scans, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
-            num = config.sampling.max_descriptors
-            maps = _merged(clouds, group.source, num), _merged(clouds, group.target, num)
+            maps = _merged(clouds, group.source), _merged(clouds, group.target)
             return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
 
         return [
@@ -265,13 +268,13 @@ def _side(
     )
 
 
-def _merged(clouds: DescriptorCloud, scans: MapOfScans, max_descriptors: int) -> DescriptorCloud:
+def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
     chosen: DescriptorCloud = jax.tree.map(lambda x: x[scans.rows], clouds)
     union = merge_clouds(replace(chosen, mask=chosen.mask & scans.mask), scans.T_map_scan)
-    if len(union.mask) <= max_descriptors:
+    if len(union.mask) <= MAX_DESCRIPTORS:
         return union
     # Valid rows stand in front, those of the nearest scan first.
-    order = jnp.argsort(~union.mask, stable=True)[:max_descriptors]
+    order = jnp.argsort(~union.mask, stable=True)[:MAX_DESCRIPTORS]
     compact: DescriptorCloud = jax.tree.map(lambda x: x[order], union)
     return compact
 
