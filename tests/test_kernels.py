@@ -14,7 +14,7 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping, deeppointmap, geometry, losses
-from dpmjax.geometry import se2, se3
+from dpmjax.geometry import rigid
 from tests.deeppointmap import toy
 
 Arrays = dict[str, Any]
@@ -64,7 +64,7 @@ def moved_clouds(dim: int) -> Callable[[np.random.Generator], Arrays]:
         source[np.arange(120), side] = np.sign(source[np.arange(120), side])
         source *= np.array([5.0, 3.0, 2.0])[:dim]
         step = np.full(3 if dim == 2 else 6, 0.03)
-        T = np.asarray((se2 if dim == 2 else se3).exp(step), np.float64)
+        T = np.asarray(rigid.exp(step), np.float64)
         target = source @ T[:dim, :dim].T + T[:dim, dim] + 0.01 * rng.normal(size=source.shape)
         arrays = {"source": source.astype(np.float32), "target": target.astype(np.float32)}
         return arrays | {"source_mask": np.ones(120, bool), "target_mask": np.ones(120, bool)}
@@ -73,7 +73,7 @@ def moved_clouds(dim: int) -> Callable[[np.random.Generator], Arrays]:
 
 
 def trajectories(rng: np.random.Generator) -> Arrays:
-    poses = {name: np.asarray(se3.exp(0.5 * rng.normal(size=(NUM, 6)))) for name in ("estimated", "reference")}
+    poses = {name: np.asarray(rigid.exp(0.5 * rng.normal(size=(NUM, 6)))) for name in ("estimated", "reference")}
     return {name: T.astype(np.float32) for name, T in poses.items()}
 
 

@@ -14,7 +14,7 @@ from dpmjax.deepmapping.cloud_scans import PlaneCloud, find_partners, misfit_of_
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.objective import scans_of_step
-from dpmjax.geometry import se3
+from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from tests.tolerances import ACCUMULATED, ROUNDING
@@ -34,7 +34,7 @@ def look_around(position: np.ndarray, rng: np.random.Generator, count: int = 150
 @pytest.fixture(scope="module")
 def truth() -> np.ndarray:
     steps = np.arange(float(NUM_SCANS))[:, None] * np.array([[0.25, 0.1, 0.02, 0.01, -0.01, 0.08]])
-    return np.asarray(se3.exp(jnp.asarray(steps, jnp.float32)), np.float64)
+    return np.asarray(rigid.exp(jnp.asarray(steps, jnp.float32)), np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def scans(clouds) -> dm.CloudScans:
 @pytest.fixture(scope="module")
 def start(truth) -> np.ndarray:
     rng = np.random.default_rng(1)
-    return truth @ np.asarray(se3.exp(jnp.asarray(rng.normal(size=(NUM_SCANS, 6)) * 0.03)), np.float64)
+    return truth @ np.asarray(rigid.exp(jnp.asarray(rng.normal(size=(NUM_SCANS, 6)) * 0.03)), np.float64)
 
 
 def small(num_steps: int = 4) -> dm.DeepMappingConfig:
@@ -101,7 +101,7 @@ def test_the_gradient_vanishes_at_the_true_poses_of_exact_planes(truth, scans) -
     exact = replace(scans, flatness=jnp.where(is_exact(scans, truth), scans.flatness, 0.0)).planes
 
     def misfit(twists: jnp.ndarray, cloud: PlaneCloud) -> jnp.ndarray:
-        T = jnp.asarray(truth, jnp.float32) @ se3.exp(twists)
+        T = jnp.asarray(truth, jnp.float32) @ rigid.exp(twists)
         return misfit_of_pairs(T, cloud, cloud, all_pairs(NUM_SCANS), jnp.ones(10, bool), (0.1, scans.spacing))
 
     gradient = jax.jit(jax.grad(misfit))

@@ -8,12 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import MatchConfig, merge_clouds
 from dpmjax.deeppointmap.matching import best_pairs, thin_merged
-from dpmjax.geometry import ConsensusConfig, rigid, se3
+from dpmjax.geometry import ConsensusConfig, rigid
 from dpmjax.types import DescriptorCloud, Registration
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED, ALIGNMENT, ROUNDING
 
-T = np.asarray(se3.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
+T = np.asarray(rigid.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
 CONFIG = MatchConfig()
 
 

@@ -3,10 +3,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
-from tests.tolerances import DOUBLE, ROUNDING
+from tests.tolerances import ACCUMULATED, DOUBLE, ROUNDING
 
 
 def random_motions(seed: int, n: int, dim: int) -> np.ndarray:
@@ -16,6 +17,36 @@ def random_motions(seed: int, n: int, dim: int) -> np.ndarray:
     R = Rotation.from_rotvec(rng.uniform(-2, 2, (n, 1)) * axis).as_matrix()
     T[:, :dim, :dim], T[:, :dim, dim] = R[:, :dim, :dim], rng.normal(size=(n, dim))
     return T
+
+
+@pytest.mark.parametrize("num", [3, 6])
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-3, 0.5, 2.0])
+def test_exp_is_the_matrix_exponential(scale: float, num: int) -> None:
+    tangent = (np.random.default_rng(9).normal(size=num) * scale).astype(np.float32)
+    if num == 3:
+        vx, vy, w = tangent.astype(np.float64)
+        twist = np.array([[0, -w, vx], [w, 0, vy], [0, 0, 0]])
+    else:
+        vx, vy, vz, wx, wy, wz = tangent.astype(np.float64)
+        twist = np.array([[0, -wz, wy, vx], [wz, 0, -wx, vy], [-wy, wx, 0, vz], [0, 0, 0, 0]])
+    np.testing.assert_allclose(rigid.exp(tangent), expm(twist), **ACCUMULATED)
+
+
+def test_a_twist_of_the_plane_is_one_of_space() -> None:
+    tangent = np.random.default_rng(13).normal(size=(7, 3)).astype(np.float32)
+    spatial = np.asarray(rigid.exp(np.concatenate([tangent[:, :2], np.zeros((7, 3)), tangent[:, 2:]], axis=1)))
+    np.testing.assert_allclose(rigid.exp(tangent), spatial[:, [[0], [1], [3]], [0, 1, 3]], **ROUNDING)
+
+
+def test_second_exp_compiles_nothing(assert_compiles_nothing) -> None:
+    rigid.exp(np.full((5, 6), 0.1, np.float32))
+    with assert_compiles_nothing():
+        rigid.exp(np.full((5, 6), 0.2, np.float32))
+
+
+def test_another_number_of_coordinates_is_no_twist(as_user) -> None:
+    with pytest.raises(ValueError, match="^tangent: expected"):
+        rigid.exp(np.zeros((2, 4), np.float32))
 
 
 @pytest.mark.parametrize("dim", [2, 3])

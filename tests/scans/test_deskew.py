@@ -78,7 +78,7 @@ def test_a_scan_of_a_moving_lidar_equals_that_of_a_resting_one() -> None:
         cloud = scan_town(town.primitives, pose, 0.0, key=jax.random.key(0), sensor=sensor, motion=moved)
         scans.append(np.asarray(cloud.points)[np.asarray(cloud.mask)])
     still, moving = scans
-    corrected = deskew(moving, offsets_by_azimuth(moving), np.asarray(se3.exp(twist)))
+    corrected = deskew(moving, offsets_by_azimuth(moving), np.asarray(rigid.exp(twist)))
     # The rays are others: surfaces are compared, along the normals of the scan at rest.
     surface = scan_surface(still)
     apart = []

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -74,6 +75,27 @@ def compose(T_a_b: Float[AnyArray, "*#n d d"], T_b_c: Float[AnyArray, "*#n d d"]
         `T_a_c`, T_a_b @ T_b_c.
     """
     return jnp.matmul(T_a_b, T_b_c, precision=jax.lax.Precision.HIGHEST)
+
+
+@jax.jit
+def exp(tangent: Float[AnyArray, "... k"]) -> Float[Array, "... d1 d1"]:
+    """Makes the motion of a twist; the gradient is right at zero too.
+
+    Args:
+        tangent: (..., 3) vx, vy, angle in the plane, or (..., 6) vx, vy, vz, wx, wy, wz in space.
+
+    Returns:
+        (..., 3, 3) or (..., 4, 4) homogeneous matrices.
+
+    Raises:
+        ValueError: the twist has neither 3 nor 6 numbers.
+    """
+    tangent = jnp.asarray(tangent)
+    groups: dict[int, Any] = {3: jaxlie.SE2, 6: jaxlie.SE3}
+    if tangent.shape[-1] not in groups:
+        raise ValueError(f"tangent: expected shape (..., 3) or (..., 6), got {tangent.shape}")
+    with jax.default_matmul_precision("highest"):
+        return groups[tangent.shape[-1]].exp(tangent).as_matrix()
 
 
 @jax.jit

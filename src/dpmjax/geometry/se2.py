@@ -226,22 +226,8 @@ def adjoint(pose_a_b: Any) -> Any:
 
 
 @jax.jit
-def exp(tangent: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
-    """Makes the motion of a planar twist; the gradient is right at zero too.
-
-    Args:
-        tangent: (..., 3) vx, vy, angle.
-
-    Returns:
-        (..., 3, 3) homogeneous matrices.
-    """
-    with jax.default_matmul_precision("highest"):
-        return jaxlie.SE2.exp(jnp.asarray(tangent)).as_matrix()
-
-
-@jax.jit
 def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
-    """The planar twist (vx, vy, angle) of a pose (x, y, heading), the inverse of `exp`.
+    """The planar twist (vx, vy, angle) of a pose (x, y, heading), the inverse of `rigid.exp`.
 
     Args:
         pose_a_b: (..., 3).
@@ -255,7 +241,7 @@ def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
 
 @jax.jit
 def log_jacobian(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
-    """The derivative of log(T_a_b @ exp(step)) by the step, at zero: the inverse right Jacobian.
+    """The derivative of log(T_a_b @ rigid.exp(step)) by the step, at zero: the inverse right Jacobian.
 
     Args:
         pose_a_b: (..., 3), heading below half a turn.

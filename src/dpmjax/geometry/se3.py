@@ -1,4 +1,4 @@
-"""Rigid motions in space as homogeneous matrices (4x4); exponential and logarithm are jaxlie's.
+"""Rigid motions in space as homogeneous matrices (4x4); the logarithm is jaxlie's.
 
 Tangents are (translation, rotation), in that order. Lengths keep their unit, angles are radians; any leading axes.
 """
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
 
 # Degrees of freedom of a camera: x, z and the angle about y (DeepMapping section 4.2); or a twist in SE(3).
@@ -19,22 +20,8 @@ Motion = Literal["planar", "full"]
 
 
 @jax.jit
-def exp(tangent: Float[AnyArray, "... 6"]) -> Float[Array, "... 4 4"]:
-    """Makes the motion of a twist; the gradient is right at zero too.
-
-    Args:
-        tangent: (..., 6) vx, vy, vz, wx, wy, wz.
-
-    Returns:
-        (..., 4, 4) homogeneous matrices.
-    """
-    with jax.default_matmul_precision("highest"):
-        return jaxlie.SE3.exp(jnp.asarray(tangent)).as_matrix()
-
-
-@jax.jit
 def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
-    """Finds the twist of a motion; not smooth at half a turn.
+    """Finds the twist of a motion, the inverse of `rigid.exp`; not smooth at half a turn.
 
     Args:
         T: (..., 4, 4) homogeneous matrices.
@@ -47,7 +34,7 @@ def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
 
 
 def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
-    """The derivative of log(T @ exp(step)) by the step, at zero: the inverse right Jacobian.
+    """The derivative of log(T @ rigid.exp(step)) by the step, at zero: the inverse right Jacobian.
 
     Args:
         T: (..., 4, 4), of angle below pi.
@@ -82,7 +69,7 @@ def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
         (n, 4, 4) rigid motions.
     """
     if values.shape[-1] == 6:
-        return exp(values)
+        return rigid.exp(values)
     x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))

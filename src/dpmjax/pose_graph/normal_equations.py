@@ -73,7 +73,7 @@ def _padded(values: NDArray[Any], fill: Any) -> NDArray[Any]:
 @jax.jit
 def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, Array, Array]:
     is_planar = poses.ndim == 2
-    poses = se2.compose(poses, step) if is_planar else rigid.compose(poses, se3.exp(step))
+    poses = se2.compose(poses, step) if is_planar else rigid.compose(poses, rigid.exp(step))
     relative = _relative(poses[edges.target], poses[edges.source])
     difference = _relative(jnp.asarray(edges.measurements), relative)
     algebra = se2 if is_planar else se3

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_shape
-from dpmjax.geometry import rigid, se2, se3
+from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
@@ -232,7 +232,7 @@ def _turning(lever: Float[Array, "n d"], vectors: Float[Array, "n d"]) -> Float[
 def _about(step: Float[Array, " k"], centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
     """Returns the motion of a twist about a centre."""
     dim = len(centre)
-    motion = se2.exp(step) if dim == 2 else se3.exp(step)
+    motion = rigid.exp(step)
     return motion.at[:dim, dim].add(centre - jnp.matmul(motion[:dim, :dim], centre, precision="highest"))
 
 

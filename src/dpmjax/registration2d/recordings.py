@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from dpmjax.checks import require_positive
-from dpmjax.geometry import se2
+from dpmjax.geometry import rigid, se2
 from dpmjax.registration2d.pair_alignment import FINE, PosePrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
@@ -168,7 +168,7 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     T_before_after = se2.relative(odometry[start], odometry[end])
     error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
     part = _share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64)
-    part = se2.from_matrix(np.asarray(se2.exp(part), np.float64))
+    part = se2.from_matrix(np.asarray(rigid.exp(part), np.float64))
     correction = se2.compose(se2.compose(T_before_after, part), se2.inverse(T_before_after))
     T_before_scan = se2.compose(correction, se2.relative(odometry[start], odometry))
     filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)

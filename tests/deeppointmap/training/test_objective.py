@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, matching_loss, training_pairs
-from dpmjax.geometry import rigid, se3
+from dpmjax.geometry import rigid
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
-T_B_A = np.asarray(se3.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
+T_B_A = np.asarray(rigid.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
 CONFIG = ObjectiveConfig(max_close=12)
 
 

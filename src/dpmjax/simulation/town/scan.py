@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import NDArray
 
 from dpmjax.checks import require_shape
-from dpmjax.geometry import se3
+from dpmjax.geometry import rigid
 from dpmjax.simulation.town.cast import Hits, NearWorld, Rays, cast_turn, near_world
 from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
 from dpmjax.types import AnyArray, PointCloud
@@ -132,8 +132,8 @@ def scan_town(
         time: time of the traffic, s.
         key: key of noise, lost returns and foliage.
         sensor: the lidar.
-        motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.se3.exp`), in its own frame. Points
-            stay in the frame of the moment of their beam, as in a raw scan. None for a sensor that stands still.
+        motion: (6,) twist of the sensor during one turn (m, radians; see `geometry.rigid.exp`), in its own frame.
+            Points stay in the frame of the moment of their beam, as in a raw scan. None for a sensor that stands still.
 
     Returns:
         (b, 3) points in the sensor frame, m, with b = beams times azimuths. Their order is beam by beam from the
@@ -215,7 +215,7 @@ def make_rays(sensor: LidarSensor, phase: Float[Array, ""], motion: Float[Array,
     azimuth = (phase + jnp.asarray(columns))[:, None, :, None]
     rays = jnp.stack(jnp.broadcast_arrays(flat * jnp.cos(azimuth), flat * jnp.sin(azimuth), up), axis=-1)
     moments = (np.arange(num_sectors, dtype=np.float32) + 0.5) / num_sectors - 0.5
-    T_lidar_sector = se3.exp(jnp.asarray(moments)[:, None] * motion)
+    T_lidar_sector = rigid.exp(jnp.asarray(moments)[:, None] * motion)
     return Rays(rays, phase + jnp.asarray(columns.mean(axis=1)), jnp.zeros(rays.shape[:-1]), T_lidar_sector)
 
 
