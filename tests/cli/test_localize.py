@@ -107,6 +107,7 @@ def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, wi
         ({"weights": "no_such_model"}, "no_such_model"),
         ({"map_poses": "none.npy"}, "none.npy"),
         ({"weights": "other.safetensors"}, "name the weights that made it with --weights"),
+        ({"weights": "other.safetensors"}, "/other.safetensors ("),
     ],
 )
 def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, changes, message) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpmjax import viz
 from dpmjax.cli import slam, slam_run
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
@@ -23,7 +24,7 @@ from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence, read_poses, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
 from tests.optional import import_or_skip
-from tests.slam.truth import TruthGeometry, TruthMatcher, laps
+from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
 
 REPOSITORY = Path(__file__).parents[2]
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
@@ -125,6 +126,17 @@ def test_what_is_known_to_be_bad_is_told_before_the_run(with_truth, tmp_path, ca
     assert len(errors) == 1
     assert "2.bin" in errors[0]
     assert not (tmp_path / "out").exists()
+
+
+def test_the_picture_has_the_reference_in_the_frame_of_the_map(with_truth, tmp_path, monkeypatch) -> None:
+    drive = write_drive(tmp_path / "drive", with_poses=False)
+    write_tum(drive / "poses_lidar.txt", pose(30.0, -8.0, 1.0) @ TRUTH)
+    drawn, draw = [], viz.trajectory_figure
+    monkeypatch.setattr(viz, "trajectory_figure", lambda *parts: drawn.append(parts) or draw(*parts))
+    assert run(drive, "-n", 20, "-o", tmp_path / "out") == EXIT_OK
+    ((_, tracks, reference, _),) = drawn
+    assert np.ptp(reference, axis=0).max() > 20
+    np.testing.assert_allclose(reference, tracks[-1].positions, atol=0.3)
 
 
 def test_results_say_what_was_done(whole, drive) -> None:

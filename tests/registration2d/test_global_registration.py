@@ -125,6 +125,22 @@ def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
     assert not ((edges.source == 6) & (edges.target == 0)).any()
 
 
+def test_a_pair_agrees_with_the_map_by_its_nearest_candidate(truth, profiles) -> None:
+    source, target, unit = np.array([1, 4, 6, 2]), np.array([0, 3, 1, 0]), profiles.scans.typical_range
+    right = se2.relative(truth[target], truth[source])
+    off = np.array([[0.3, 0.0, 0.0], [0.02, 0.02, 0.02], [0.0, 0.0, 0.0]]) * [unit, unit, 1.0]
+    poses = se2.compose(right[:, None], off)
+    poses[2] = se2.compose(right[2], np.array([0.0, 0.0, 0.3]))
+    num_beams = np.asarray(profiles.scans.mask.sum(axis=1))
+    scores = np.array([[0.9, 0.5, 0.4]] * 3 + [[0.05, 0.05, 0.05]]) * (num_beams[source] + num_beams[target])[:, None]
+    edges = agreeing_edges(truth, Candidates(source, target, poses, scores), profiles)
+    # The third pair has no candidate that is near, the fourth none with enough beams.
+    np.testing.assert_array_equal((edges.source, edges.target), ([1, 4], [0, 3]))
+    np.testing.assert_allclose(edges.measurements, right[:2], atol=1e-9)
+    expected = 0.4 / np.array([0.0045 * unit, 0.0045 * unit, 0.01]) ** 2
+    np.testing.assert_allclose(edges.information, [np.diag(expected)] * 2, rtol=1e-6)
+
+
 def test_a_block_at_a_wrong_pose_moves_back_as_a_whole(sequence, truth, found, scorer) -> None:
     torn = truth.copy()
     torn[4:] = se2.compose(np.array([300.0, 150.0, 0.4]), torn[4:])

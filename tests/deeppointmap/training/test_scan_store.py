@@ -59,7 +59,7 @@ def test_poses_follow_the_motions_of_the_scans() -> None:
     store = ScanStore([prepare_drive(short(), toy.TRAINING)])
     scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
     found = placed.T_world_scan @ scans.T_augmented_lidar
-    np.testing.assert_allclose(found, store.table.T_world_lidar, atol=1e-4)
+    np.testing.assert_allclose(found, short().T_world_lidar, atol=1e-4)
 
 
 def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
