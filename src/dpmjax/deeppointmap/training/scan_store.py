@@ -207,7 +207,7 @@ def _augmented(cloud: PointCloud, keys: Array, *, config: AugmentConfig) -> Poin
 def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
     model = config.model
     settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
-    settings[-1]["sparse_points"] = SPARSE_POINTS  # once a setting: files of that time are still found
+    settings[-1]["sparse_points"] = SPARSE_POINTS  # decides the points that are kept
     # Motions are drawn in the step, so they do not change the file.
     for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
         del settings[-1][name]
