@@ -86,6 +86,11 @@ def test_another_seed_makes_another_town(without_rays) -> None:
     assert np.abs(first.T_world_lidar[:5] - other.T_world_lidar[:5]).max() > 1e-3
 
 
+def test_another_seed_makes_another_town_of_the_demonstration(without_rays) -> None:
+    first, other = (open_drive(None, DriveOptions(seed=seed)) for seed in (0, 1))
+    assert np.abs(first.T_world_lidar[:5] - other.T_world_lidar[:5]).max() > 1e-3
+
+
 def test_a_scan_is_simulated_once_and_rounded(tmp_path) -> None:
     cast: list[int] = []
     points = np.random.default_rng(0).uniform(-90, 90, (50, 3)).astype(np.float32)

@@ -117,6 +117,7 @@ def test_too_few_pairs_give_a_finite_motion_with_little_support(num_pairs: int) 
     found = find_consensus(source, target)
     assert np.isfinite(found.T_target_source).all()
     assert found.support[0] <= num_pairs
+    assert found.is_inlier.shape == (len(found.support), num_pairs)
 
 
 def test_pairs_of_one_point_tell_nothing() -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.io import InputError, open_lidar_sequence, write_kitti, write_tum
 from dpmjax.io.references import to_seconds
-from dpmjax.io.scan_files import sort_scans, strays_among
+from dpmjax.io.scan_files import sort_scans, stamps_in_names, strays_among
 from tests.data_sets import write_pcd
 
 NUM = 8
@@ -57,6 +57,14 @@ def test_scans_between_poses_are_interpolated_and_those_beyond_are_counted(folde
     assert drive.notes[0].is_doubt
     assert "3 of 8 scans have no reference pose" in drive.notes[0].text
     assert len(drive.take(np.flatnonzero(drive.has_reference))) == 5
+
+
+def test_stamps_in_names_increase() -> None:
+    left, right, later = Path("left_12.25.pcd"), Path("right_12.25.pcd"), Path("left_12.50.pcd")
+    np.testing.assert_array_equal(stamps_in_names([left, later]), [12.25, 12.5])
+    # Two lidars at one time, and a wrong order.
+    for files in ([left, right], [left, right, later], [later, left]):
+        assert stamps_in_names(files) is None
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])

@@ -136,6 +136,16 @@ def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
     assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0
 
 
+def test_a_lost_step_is_put_back_and_not_slid(scans, truth) -> None:
+    """A step of the corridor is 18 px too long, and turned, so that it still fits a little where its shift ends."""
+    torn, steps = steps_of(torn_in_the_corridor(truth, 18.0)), steps_of(truth)
+    torn[10, 2] += 0.025
+    prior = StepPrior(steps, np.full((NUM_SCANS - 1, 3), [2.0, 2.0, 0.01]))
+    poses = np.asarray(se2.compose(truth[0], se2.chain(torn)))
+    found = restore_torn(make_profiles(scans), steps, poses, JointAlignmentConfig(), prior)
+    np.testing.assert_allclose(steps_of(found)[10], steps[10], atol=1e-3)
+
+
 def test_a_calibrated_prior_does_not_hold_a_clear_step_that_slipped(scans, truth) -> None:
     """Most steps of the odometry are exact, so their deviations are small; one step in a room has a wrong turn."""
     slipped, expected = 3, steps_of(truth)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import BuildingConfig, LidarSensor, WalkConfig, make_building, scan_town, walk
-from dpmjax.simulation.building import _put_rack
+from dpmjax.simulation.building import _furniture, _put_rack
+from dpmjax.simulation.floor_plan import Room
 from dpmjax.simulation.town.objects import Collection, Place
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -20.0, 16)), 360, min_range_m=0.2, drop_rate=0.0, mixed_rate=0.0)
@@ -87,6 +88,21 @@ def test_shelves_hang_between_uprights_that_stand_on_the_floor(seed):
     goods = ~is_upright & ~is_shelf
     np.testing.assert_allclose(low[goods], high[is_shelf])
     assert (np.abs(along[goods]) + boxes[goods, 3] <= length / 2 + 1e-9).all()
+
+
+def test_columns_stand_a_metre_from_the_walls_of_a_hall() -> None:
+    low, high, into = np.array([-4.0, 10.0]), np.array([4.0, 20.0]), Collection()
+    for seed in range(20):
+        _furniture(into, np.random.default_rng(seed), Room((*low,), (*high,), 6.0), np.full((9, 2), 1e3), is_hall=True)
+    # Nothing else is 11 m high.
+    bodies = np.array([*into.boxes, *into.cylinders])
+    columns = bodies[bodies[:, 5] > 5.0, :2]
+    assert len(columns) > 10
+    assert (columns >= low + 1.0).all()
+    assert (columns <= high - 1.0).all()
+    # They stand on all sides of the middle.
+    assert (columns < 0.5 * (low + high)).any(axis=0).all()
+    assert (columns > 0.5 * (low + high)).any(axis=0).all()
 
 
 def test_stairs_are_climbed_with_the_lidar_above_their_steps() -> None:

@@ -248,6 +248,25 @@ def test_the_second_scan_of_a_drive_is_placed_by_the_network() -> None:
     assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:, :3, 3]) < 0.5
 
 
+def test_the_local_map_has_each_scan_since_the_last_keyframe() -> None:
+    # Steps of 1 m are a tenth of the extent: far enough for each scan to join.
+    truth = np.array([pose(float(number), 0.0, 0.0) for number in range(8)])
+    exact = TruthGeometry(truth, sigma_m=0.0, sigma_rad=0.0)
+    methods = SlamMethods(TruthMatcher(truth, gross_share=0.0), exact, without_loops())
+    state, num_joined = init_slam(), 0
+    for number, scan in enumerate(scans_of(range(len(truth)))):
+        state, report = step_slam(methods, state, scan)
+        last, local_map = state.slam_map.keyframes[-1].scan, state.front_end.local_map
+        if last == number:
+            continue
+        assert report.status in ("network", "tracked")
+        # The element of a scan has its number as first coordinate, in the frame of the scan.
+        expected = {row + (row - last) for row in range(last, number + 1)}
+        assert expected <= set(local_map.surface.points[:, 0].round(3).tolist())
+        num_joined = max(num_joined, number - last)
+    assert num_joined > 1
+
+
 class CountingMatcher(TruthMatcher):
     """Notes the scans that it encodes and those that it proposes motions for."""
 
