@@ -25,6 +25,17 @@ def test_every_method_has_its_colour_and_a_lost_one_leaves_the_panel() -> None:
     assert {text.get_text() for text in legend.get_texts()} == {"reference", "ours", "lost"}
 
 
+@pytest.mark.parametrize("num_drives", [1, 5])
+def test_the_legend_lies_below_the_panels_and_within_the_figure(num_drives: int) -> None:
+    names = [f"method {number} with a long name" for number in range(6)]
+    panel = viz.TrackPanel(dict.fromkeys(names, WAY[:, [1, 0, 2]]), WAY[:, [1, 0, 2]])
+    figure = viz.trajectories_figure({f"{n}": panel for n in range(num_drives)}, dict.fromkeys(names, "blue"))
+    figure.canvas.draw()
+    box, lowest = figure.legends[0].get_window_extent(), min(axes.get_window_extent().y0 for axes in figure.axes)
+    assert 0 <= box.y0 < box.y1 < lowest
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.x1
+
+
 def test_maps_are_drawn_in_megabytes_on_a_logarithmic_axis() -> None:
     curve = (np.array([10.0, 50.0]), np.array([1e6, 5e6]))
     figure = viz.growth_figure({"street": {"points": curve}, "room": {"points": curve, "ours": curve}})

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 _COLUMNS = 4
 _CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c")
 _MARGIN = 0.12
-_PANEL_IN, _LEGEND_IN, _ENTRY_IN = 3.1, 0.6, 1.9
+# Inches: side of a panel; width of a character of the legend, height of a line.
+_PANEL_IN, _CHARACTER_IN, _LINE_IN = 3.1, 0.065, 0.18
+# Characters that the line and the gaps of an entry of the legend take.
+_NUM_BESIDE = 9
 # Trajectories are cut at this share of the extent of the reference beyond it, so that a diverged one does not set the
 # limits.
 _SHARE_OUTSIDE = 0.5
@@ -71,10 +74,10 @@ def trajectories_figure(panels: Mapping[str, TrackPanel], colors: Mapping[str, s
 
 
 def _panels(num: int, height_in: float, *, is_y_shared: bool = False) -> tuple[Figure, list[Axes]]:
-    """Makes a figure of several panels, with space for a legend below them."""
+    """Makes a figure of several panels; `_add_legend` adds the space of the legend."""
     columns = min(num, _COLUMNS)
     num_rows = math.ceil(num / columns)
-    figure = figures.new_figure(_PANEL_IN * columns, height_in * num_rows + _LEGEND_IN)
+    figure = figures.new_figure(_PANEL_IN * columns, height_in * num_rows)
     grid = figure.subplots(num_rows, columns, squeeze=False, sharey=is_y_shared).ravel().tolist()
     for axes in grid[num:]:
         axes.set_axis_off()
@@ -83,8 +86,11 @@ def _panels(num: int, height_in: float, *, is_y_shared: bool = False) -> tuple[F
 
 def _add_legend(figure: Figure, entries: Mapping[str, Artist]) -> None:
     """Adds one legend for all panels, below them."""
-    figure.tight_layout(rect=(0, _LEGEND_IN / figure.get_figheight(), 1, 1))
-    num_columns = max(int(figure.get_figwidth() / _ENTRY_IN), 1)
+    entry_in = _CHARACTER_IN * (_NUM_BESIDE + max(map(len, entries)))
+    num_columns = max(int(figure.get_figwidth() / entry_in), 1)
+    legend_in = _LINE_IN * (1 + math.ceil(len(entries) / num_columns))
+    figure.set_figheight(figure.get_figheight() + legend_in)
+    figure.tight_layout(rect=(0, legend_in / figure.get_figheight(), 1, 1))
     place = {"loc": "lower center", "bbox_to_anchor": None}
     figures.add_legend(figure, entries.values(), entries.keys(), columns=num_columns, **place)
 
