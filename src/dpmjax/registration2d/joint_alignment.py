@@ -53,7 +53,7 @@ class JointAlignmentConfig:
     """Settings of the joint alignment. Lengths are in typical ranges of the scans.
 
     Attributes:
-        radius: largest distance of neighbours in space, up to eight of them, each from another visit.
+        radius: largest distance of neighbours in space.
     """
 
     radius: float = 0.6
