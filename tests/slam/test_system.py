@@ -17,6 +17,7 @@ from dpmjax.slam import (
     SlamMethods,
     SlamResult,
     ThinnedScan,
+    finish_slam,
     init_slam,
     run_slam,
     slam_preset,
@@ -124,6 +125,22 @@ def test_same_input_gives_same_output() -> None:
     first, second = run(truth), run(truth)
     np.testing.assert_array_equal(first.T_world_scan, second.T_world_scan)
     assert first.reports[-1].reason == second.reports[-1].reason
+
+
+@pytest.mark.parametrize("proposer", ["prediction", "network"])
+def test_scans_prepared_ahead_make_the_same_map(proposer) -> None:
+    config = replace(CONFIG, odometry=replace(CONFIG.odometry, proposer=proposer))
+    truth = laps(1, side_m=20.0)
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), config)
+    scans = [*scans_of(range(30)), EMPTY, *scans_of(range(30, len(truth)))]
+    state, reports = init_slam(), []
+    for scan in scans:
+        state, report = step_slam(methods, state, scan)
+        reports.append(report)
+    result, expected = run_slam(methods, scans), finish_slam(state, reports, config)
+    np.testing.assert_array_equal(result.T_world_scan, expected.T_world_scan)
+    assert [report.num_points for report in result.reports] == [len(scan) for scan in scans]
+    assert repr(result.reports) == repr(expected.reports)
 
 
 def test_a_step_leaves_the_state_before_as_it_was() -> None:

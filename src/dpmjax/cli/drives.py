@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from io import BytesIO
@@ -278,16 +277,6 @@ class ScanReader:
         elif interval_s is None:
             offsets = offsets / self._jump
         return slam.TimedScan(points, offsets)
-
-    def iterate(self, start: int) -> Generator[slam.TimedScan | np.ndarray, None, None]:
-        """Reads scan after scan, the next one while the caller works on this one."""
-        numbers = range(start, len(self.sequence))
-        with ThreadPoolExecutor(1) as pool:
-            waiting = pool.submit(self, start) if numbers else None
-            for index in numbers:
-                done, waiting = waiting, pool.submit(self, index + 1) if index + 1 in numbers else None
-                assert done is not None
-                yield done.result()
 
     def _interval_s(self, index: int) -> float | None:
         """Returns the time between the two scans before, whose motion predicts this one; None where it is unknown."""

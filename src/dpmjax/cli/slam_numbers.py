@@ -22,10 +22,11 @@ class SlamRun(NamedTuple):
     Attributes:
         state: after the last scan.
         reports: reports of all scans.
-        stages_s: seconds of each stage in this process, without compilation.
+        stages_s: seconds of each stage in this process, without compilation; "waiting" is for the thread that reads and
+            thins the next scan.
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
-        scan_s: seconds of each scan of this process, without compilation, reading and writing.
+        scan_s: seconds of each scan of this process, without compilation and writing.
         failure: error that ended the run early; None without an error.
     """
 

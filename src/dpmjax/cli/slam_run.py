@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
 from tqdm import tqdm
 
 from dpmjax import slam, viz
@@ -18,7 +19,7 @@ from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import accepted_ends, write_scans, write_trajectory
 from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.saved_maps import RunState, load_state, save_state
-from dpmjax.sequences import LidarSequence
+from dpmjax.sequences import LidarSequence, in_advance
 
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
@@ -139,14 +140,19 @@ def run_scans(
     flushed = saved = time.perf_counter()
     resumable: RunState | None = None
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
-    with progress as bar, closing(reader.iterate(first)) as scans:
+
+    def read(index: int) -> tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]:
+        scan = reader(index)
+        return scan, slam.prepare_ahead(methods, scan)
+
+    with progress as bar, closing(in_advance(read, range(first, len(sequence)))) as scans:
         try:
             for _ in range(first, len(sequence)):
                 if is_stopped():
                     break
-                scan = watch.timed("read", next, scans)
                 before = watch.now_s()
-                state, report = slam.step_slam(timed, state, scan)
+                scan, prepared = watch.timed("waiting", next, scans)
+                state, report = slam.step_slam(timed, state, prepared)
                 scan_s.append(watch.now_s() - before)
                 reports.append(report)
                 if report.is_keyframe:

@@ -11,6 +11,7 @@ from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
 from .config import slam_preset as slam_preset
+from .front_end import PreparedInput as PreparedInput
 from .front_end import ScanReport as ScanReport
 from .front_end import TimedScan as TimedScan
 from .interfaces import Alignment as Alignment
@@ -44,5 +45,6 @@ from .system import finish_slam as finish_slam
 from .system import init_slam as init_slam
 from .system import make_methods as make_methods
 from .system import place_scans as place_scans
+from .system import prepare_ahead as prepare_ahead
 from .system import run_slam as run_slam
 from .system import step_slam as step_slam

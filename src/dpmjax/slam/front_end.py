@@ -162,6 +162,22 @@ class TimedScan(NamedTuple):
 AnyScan = Float[AnyArray, "_n 3"] | TimedScan
 
 
+class PreparedInput(NamedTuple):
+    """A scan after the work that needs no map.
+
+    Attributes:
+        num_points: number of points of the raw scan.
+        thinned: the thinned scan; None if it is empty.
+        T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
+        compact: the encoded scan; None where it was not encoded.
+    """
+
+    num_points: int
+    thinned: ThinnedScan | None
+    T_turn: Pose | None = None
+    compact: CompactScan | None = None
+
+
 class Located(NamedTuple):
     """Pose of a scan in the frame of the last keyframe, and the inputs of a new keyframe.
 
@@ -177,7 +193,7 @@ class Located(NamedTuple):
 
 
 def place_scan(
-    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: AnyScan
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: PreparedInput
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     """Estimates the pose of a scan, and makes it a keyframe where it is far enough from the last one.
 
@@ -185,25 +201,24 @@ def place_scan(
         methods: matcher, geometry, settings.
         state: after the scan before.
         slam_map: the map so far.
-        scan: points in metres, in the frame of the lidar, perhaps with times.
+        scan: the scan.
 
     Returns:
         The state and the map after the scan, and its report.
     """
-    T_turn = state.T_before_last if isinstance(scan, TimedScan) else None
-    thinned = methods.geometry.thin(corrected_points(scan, T_turn))
-    report = ScanReport(state.num_scans, "empty", "too few points", max(len(slam_map) - 1, 0), state.predicted)
+    thinned, row = scan.thinned, max(len(slam_map) - 1, 0)
+    report = ScanReport(state.num_scans, "empty", "too few points", row, state.predicted, num_points=scan.num_points)
     if thinned is None:
         return state._replace(num_scans=state.num_scans + 1, T_keyframe_last=state.predicted), slam_map, report
-    report = report._replace(T_turn=T_turn)
+    report = report._replace(T_turn=scan.T_turn)
     if not state.is_begun:
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
         report = report._replace(status="first", reason=reason, T_keyframe_scan=np.eye(4), score=1.0)
-        located = Located(report, diagonal_information(UNKNOWN_M, np.pi))
+        located = Located(report, diagonal_information(UNKNOWN_M, np.pi), scan.compact)
         return _make_keyframe(methods, state, slam_map, thinned, located)
     local_map = state.local_map or local_map_of(slam_map, state.recent, methods.config.odometry)
     state = state._replace(local_map=local_map)
-    located = _locate(methods, state, local_map, thinned, report)
+    located = _locate(methods, state, local_map, thinned, report, scan.compact)
     if located.report.status == "restarted" or _is_keyframe(methods, located.report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after, report = _advanced(state, located.report), located.report
@@ -219,6 +234,29 @@ def place_scan(
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
     return after, slam_map, report
+
+
+def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> PreparedInput:
+    """Does the work on a scan that needs no map: thins it, and encodes it where each scan is encoded.
+
+    Args:
+        methods: matcher, geometry, settings.
+        scan: points in metres, in the frame of the lidar, perhaps with times.
+        T_turn: predicted motion, by which a scan with times is deskewed; None for a scan without times.
+
+    Returns:
+        The prepared scan.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    points = scan.points if isinstance(scan, TimedScan) else scan
+    if len(np.shape(points)) != 2 or np.shape(points)[1] != 3:
+        raise ValueError(f"scan: expected shape (n, 3), got {np.shape(points)}")
+    thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
+    if thinned is not None and methods.config.odometry.proposer == "network":
+        compact = methods.matcher.encode(thinned)
+    return PreparedInput(len(points), thinned, T_turn, compact)
 
 
 def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
@@ -248,10 +286,15 @@ class _Attempt(NamedTuple):
 
 
 def _locate(
-    methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, report: ScanReport
+    methods: SlamMethods,
+    state: FrontEndState,
+    local_map: LocalMap,
+    scan: ThinnedScan,
+    report: ScanReport,
+    compact: CompactScan | None,
 ) -> Located:
     config, usual = methods.config.front_end, state.usual_score
-    tried = _attempt(methods, state, local_map, scan)
+    tried = _attempt(methods, state, local_map, scan, compact)
     best, probability = tried.best, tried.probability
     # A new part has no usual score yet, and sparse scans never score high.
     wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)

@@ -52,7 +52,7 @@ class Alignment(NamedTuple):
 
 
 class Geometry(Protocol):
-    """Thins scans and aligns them with the local map."""
+    """Thins scans and aligns them with the local map. `thin` runs in a thread of its own, one scan ahead."""
 
     def thin(self, points: Float[np.ndarray, "n 3"]) -> ThinnedScan | None:
         """Prepares a scan.
@@ -155,7 +155,7 @@ class Matcher(Protocol):
         """Returns a text that is equal for equal matchers."""
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
-        """Prepares a scan for any number of registrations.
+        """Prepares a scan for any number of registrations; runs in the thread of `Geometry.thin` for each scan ahead.
 
         Args:
             scan: the scan.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,10 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.sequences import in_advance
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.front_end import AnyScan, FrontEndState, ScanReport, TimedScan
+from dpmjax.slam.front_end import AnyScan, FrontEndState, PreparedInput, ScanReport, TimedScan, prepare_input
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
@@ -117,14 +119,30 @@ def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
     return SlamState(FrontEndState(num_scans=slam_map.keyframes[-1].scan + 1), slam_map, loops_of_map(slam_map))
 
 
-def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[SlamState, ScanReport]:
+def prepare_ahead(methods: SlamMethods, scan: AnyScan) -> PreparedInput | TimedScan:
+    """Prepares a scan before those in front of it have poses, for instance in another thread.
+
+    Args:
+        methods: methods from `make_methods`.
+        scan: see `step_slam`.
+
+    Returns:
+        The input of `step_slam`; a scan with times is unchanged, because the motion before it is not known yet.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    return scan if isinstance(scan, TimedScan) else prepare_input(methods, scan)
+
+
+def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedInput) -> tuple[SlamState, ScanReport]:
     """Estimates the pose of a scan, and searches loops of a new keyframe.
 
     Args:
         methods: methods from `make_methods`.
         state: state after the scan before.
         scan: (n, 3) points in metres, in the frame of the lidar, or a `TimedScan`, which is deskewed by the predicted
-            motion; points that are not finite are dropped.
+            motion; points that are not finite are dropped. Or the same from `prepare_ahead`.
 
     Returns:
         The state after the scan, and its report.
@@ -132,15 +150,15 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan) -> tuple[Sl
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    shape = np.shape(scan.points if isinstance(scan, TimedScan) else scan)
-    if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"scan: expected shape (n, 3), got {shape}")
+    if not isinstance(scan, PreparedInput):
+        T_turn = state.front_end.T_before_last if isinstance(scan, TimedScan) else None
+        scan = prepare_input(methods, scan, T_turn)
     front, slam_map, report = front_end.place_scan(methods, state.front_end, state.slam_map, scan)
     loops = state.loops
     if report.is_keyframe:
         slam_map, loops = close_loops(methods, slam_map, loops)
     num_new = num_accepted(loops.loops) - num_accepted(state.loops.loops)
-    return SlamState(front, slam_map, loops), report._replace(num_points=shape[0], num_accepted=num_new)
+    return SlamState(front, slam_map, loops), report._replace(num_accepted=num_new)
 
 
 def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamConfig) -> SlamResult:
@@ -213,7 +231,7 @@ def run_slam(
             other weights.
     """
     methods, state, reports = as_methods(model, config), init_slam(slam_map), []
-    for scan in scans:
+    for scan in in_advance(partial(prepare_ahead, methods), scans):
         state, report = step_slam(methods, state, scan)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
