@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import flax.linen as nn
@@ -15,7 +16,7 @@ from dpmjax.nets.layers import ComputeDtype, TwoLayers, layer_norm, linear
 
 EMBEDDING_TEMPERATURE = 10_000.0
 
-# Largest number of logits of one head that a CPU holds at once: 1 MB.
+# Largest number of logits that a CPU holds at once: 1 MB.
 MAX_LIVE_LOGITS = 1 << 18
 
 
@@ -89,7 +90,10 @@ def _attend_forward(
 
         return _one_after_the_other(of_block, queries)
 
-    mixed, log_total = _one_after_the_other(of_head, queries, keys, values)
+    # All heads at once where their logits fit the cache of a CPU.
+    num_logits = queries.shape[0] * queries.shape[1] * queries.shape[3] * keys.shape[2]
+    over_heads = partial(_one_after_the_other, of_head) if num_logits > MAX_LIVE_LOGITS else jax.vmap(of_head)
+    mixed, log_total = over_heads(queries, keys, values)
     return mixed, (queries, keys, values, bias, mixed, log_total)
 
 
