@@ -33,8 +33,8 @@ PRECISIONS: tuple[Precision, ...] = ("float32", "int8")
 # Sizes of maps are measured this number of times during a drive.
 NUM_SIZES = 8
 # Stages of a run that no other program's time has.
-_FILE_STAGES = ("read", "write", "viewer")
-_ODOMETRY_STAGES = ("thinning", "odometry")
+_FILE_STAGES = ("write", "viewer")
+_ODOMETRY_STAGES = ("thinning ahead", "odometry")
 
 
 class Scale(NamedTuple):

@@ -147,7 +147,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert metrics["t_rel_percent"] < 1.0
     assert metrics["seed"] == 0
     assert metrics["is_interrupted"] is False
-    assert {"odometry", "encoder", "decoder", "loops", "waiting", "write"} <= set(metrics["stages_s"])
+    assert {"thinning ahead", "odometry", "encoder", "decoder", "loops", "waiting", "write"} <= set(metrics["stages_s"])
     scans, loops = table(whole / "scans.csv"), table(whole / "loops.csv")
     assert [int(row["scan"]) for row in scans] == list(range(len(TRUTH)))
     assert {row["status"] for row in scans} == {"first", "tracked"}

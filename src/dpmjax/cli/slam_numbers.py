@@ -22,8 +22,8 @@ class SlamRun(NamedTuple):
     Attributes:
         state: after the last scan.
         reports: reports of all scans.
-        stages_s: seconds of each stage in this process, without compilation; "waiting" is for the thread that reads and
-            thins the next scan.
+        stages_s: seconds of each stage in this process, without compilation. "waiting" is for the next scan; a stage
+            "ahead" runs in the thread that reads and thins it, at the same time as the others.
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
         scan_s: seconds of each scan of this process, without compilation and writing.

@@ -133,8 +133,8 @@ def run_scans(
     Returns:
         The run.
     """
-    watch, sequence = Stopwatch(), reader.sequence
-    timed = methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
+    watch, ahead, sequence = Stopwatch(), Stopwatch(), reader.sequence
+    timed, timed_ahead = _timed(methods, watch), _timed(methods, ahead)
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
     first, failure, started = len(reports), None, watch.now_s()
     flushed = saved = time.perf_counter()
@@ -143,7 +143,7 @@ def run_scans(
 
     def read(index: int) -> tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]:
         scan = reader(index)
-        return scan, slam.prepare_ahead(methods, scan)
+        return scan, slam.prepare_ahead(timed_ahead, scan)
 
     with progress as bar, closing(in_advance(read, range(first, len(sequence)))) as scans:
         try:
@@ -174,7 +174,12 @@ def run_scans(
                 watch.timed("write", save_state, folder / STATE, *resumable)
     run_s = watch.now_s() - started
     watch.stages_s["rest"] = run_s - sum(watch.stages_s.values())
-    return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
+    stages_s = {**watch.stages_s, **{f"{stage} ahead": seconds for stage, seconds in ahead.stages_s.items()}}
+    return SlamRun(state, tuple(reports), stages_s, watch.compile_s, run_s, tuple(scan_s), failure)
+
+
+def _timed(methods: slam.SlamMethods, watch: Stopwatch) -> slam.SlamMethods:
+    return methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
 
 
 def write_interim(
