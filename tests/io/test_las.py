@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError, open_lidar_sequence, read_lidar_file
-from dpmjax.io.scan_file import read_point_times
+from dpmjax.io.lidar_file import read_point_times
 from tests.optional import import_or_skip
 
 

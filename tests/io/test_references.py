@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.io import InputError, open_lidar_sequence, write_kitti, write_tum
 from dpmjax.io.references import to_seconds
-from dpmjax.io.scan_files import sort_scans, stamps_in_names, strays_among
+from dpmjax.io.scan_names import sort_scans, stamps_in_names, strays_among
 from tests.data_sets import write_pcd
 
 NUM = 8

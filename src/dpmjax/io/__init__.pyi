@@ -10,6 +10,9 @@ from .lidar import LidarSequence as LidarSequence
 from .lidar import list_lidar_sequences as list_lidar_sequences
 from .lidar import open_lidar_sequence as open_lidar_sequence
 from .lidar import require_whole_files as require_whole_files
+from .lidar_file import read_lidar_file as read_lidar_file
+from .lidar_file import scan_notes as scan_notes
+from .lidar_file import unit_note as unit_note
 from .poses import read_planar_poses as read_planar_poses
 from .poses import read_poses as read_poses
 from .poses import write_kitti as write_kitti
@@ -17,7 +20,4 @@ from .poses import write_poses_npy as write_poses_npy
 from .poses import write_tum as write_tum
 from .references import read_lidar_trajectory as read_lidar_trajectory
 from .references import read_relations as read_relations
-from .scan_file import read_lidar_file as read_lidar_file
-from .scan_file import scan_notes as scan_notes
-from .scan_file import unit_note as unit_note
 from .scans2d import read_sequence as read_sequence

@@ -19,11 +19,11 @@ from dpmjax.io.lidar_datasets import (
     read_plain_folder,
     read_velodyne_points,
 )
+from dpmjax.io.lidar_file import read_point_times, read_timed_cloud, with_unit_doubt
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
 from dpmjax.io.scan_bags import open_lidar_bag
-from dpmjax.io.scan_file import read_point_times, read_timed_cloud, with_unit_doubt
-from dpmjax.io.scan_files import scan_files, stray_note
+from dpmjax.io.scan_names import scan_files, stray_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
 _FORMATS = (

@@ -11,7 +11,7 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.io.files import read_table
 from dpmjax.io.poses import StampedPoses, interpolate_poses, read_poses
-from dpmjax.io.scan_files import match_rows, stamps_in_names
+from dpmjax.io.scan_names import match_rows, stamps_in_names
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, require
 
 # Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.

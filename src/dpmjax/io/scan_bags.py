@@ -13,8 +13,8 @@ from dpmjax.io.array_files import to_float32
 from dpmjax.io.bags import LASER_SCAN, LIVOX_CLOUDS, MULTI_ECHO_SCAN, POINT_CLOUD, Bag
 from dpmjax.io.clouds import TimedCloud, cloud_of
 from dpmjax.io.files import refusing
+from dpmjax.io.lidar_file import check_scan, with_unit_doubt
 from dpmjax.io.poses import homogeneous, interpolate_poses
-from dpmjax.io.scan_file import check_scan, with_unit_doubt
 from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, has_angular_order, pad_scans
 
 _ODOMETRY, _TRANSFORMS = "nav_msgs/msg/Odometry", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import natural_key
-from dpmjax.io.scan_file import SCAN_SUFFIXES
+from dpmjax.io.lidar_file import SCAN_SUFFIXES
 from dpmjax.sequences import FloatArray, Note
 
 # Usual names of files of reference poses in the lidar's frame.
