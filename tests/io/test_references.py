@@ -47,6 +47,15 @@ def test_a_reference_of_another_rate_is_matched_by_time(folder: Path) -> None:
     assert "matched by time, tolerance 0.005 s; 0 of 8 scans have no reference pose" in note.text
 
 
+@pytest.mark.parametrize("name", ["groundtruth.csv", "poses.csv"])
+def test_references_with_commas_are_found(folder: Path, name: str) -> None:
+    times = EPOCH + 0.1 * np.arange(NUM)
+    write_times(folder, times)
+    rows = write_tum(folder / name, drive_along(times - EPOCH), times=times).read_text()
+    (folder / name).write_text(rows.replace(" ", ","))
+    np.testing.assert_allclose(open_lidar_sequence(folder).T_world_lidar, drive_along(times - EPOCH), atol=1e-4)
+
+
 def test_scans_between_poses_are_interpolated_and_those_beyond_are_counted(folder: Path) -> None:
     times, coarse = EPOCH + 0.1 * np.arange(NUM) + 0.04, EPOCH + 0.1 * np.arange(5)
     write_times(folder, times)

@@ -16,7 +16,7 @@ from dpmjax.sequences import FloatArray, Note
 
 # Usual names of files of reference poses in the lidar's frame.
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
-              "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+              "trajectory.npy", "gt_poses.txt", "groundtruth.txt", "groundtruth.csv", "poses.csv")  # fmt: skip
 _NUMBER = re.compile(r"\d+(?:\.\d+)?|\.\d+")
 # A number of that many digits is a time stamp: seconds since 1970, or a smaller unit.
 _STAMP_DIGITS = 10
