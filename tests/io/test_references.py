@@ -103,6 +103,31 @@ def test_names_that_are_stamps_are_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(drive.T_world_lidar, drive_along(times - EPOCH), atol=1e-3)
 
 
+@pytest.mark.parametrize("form", ["{0}_{1:09}", "left-{0}-{1:09}", "{0}.{1:09}", "{0}.{1}"])
+def test_names_of_seconds_and_nanoseconds_are_times(form: str) -> None:
+    stamps_ns = np.arange(23) * 100_000_000 + 12_345_678
+    files = [Path(f"{form.format(1_600_000_000 + ns // 10**9, ns % 10**9)}.pcd") for ns in stamps_ns.tolist()]
+    assert sort_scans(files[::-1]) == files
+    np.testing.assert_allclose(stamps_in_names(files), EPOCH + 1e-9 * stamps_ns, atol=1e-6)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_numbers_of_rows_are_no_times(folder: Path, first: int) -> None:
+    times = EPOCH + 0.1 * np.arange(NUM)
+    (folder / "times.txt").write_text("".join(f"{first + row} {time:.6f}\n" for row, time in enumerate(times)))
+    np.testing.assert_allclose(open_lidar_sequence(folder).times, times, atol=1e-6)
+    write_times(folder, np.arange(float(NUM)))  # once a second
+    np.testing.assert_array_equal(open_lidar_sequence(folder).times, np.arange(float(NUM)))
+
+
+def test_a_refused_reference_tells_what_is_wrong_with_the_times(folder: Path, caplog) -> None:
+    (folder / "times.txt").write_text("".join(f"{row:06}.pcd {0.1 * row}\n" for row in range(NUM)))
+    write_tum(folder / "groundtruth.txt", drive_along(np.arange(30.0)), times=0.01 * np.arange(30))
+    with pytest.raises(InputError, match="the scans have no times"):
+        open_lidar_sequence(folder)
+    assert "times.txt: line 1, column 1: '000000.pcd' is not a number; these times are not used" in caplog.text
+
+
 def test_stamps_may_be_the_numbers_of_scans(folder: Path) -> None:
     poses = drive_along(0.1 * np.arange(NUM))
     write_times(folder, 0.1 * np.arange(NUM))
@@ -159,6 +184,10 @@ def test_poses_of_a_camera_are_named_and_with_a_calibration_converted(folder: Pa
         ["1600000000.900000", "1600000001.000000"],
         [".0", ".05", ".1", ".15"],
         ["2", "10", "11"],
+        # Nanoseconds without leading zeros: 0.0123, 0.1123 and 0.2123 s.
+        ["1600000000.12345678", "1600000000.112345678", "1600000000.212345678", "1600000000.312345678"],
+        # Decimals whose last zeros are left out.
+        ["1600000000.15", "1600000000.2", "1600000000.25", "1600000000.3"],
     ],
 )
 def test_names_are_sorted_as_numbers(names: list[str]) -> None:
