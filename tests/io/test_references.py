@@ -203,6 +203,16 @@ def test_a_stray_map_is_named_and_left_out(folder: Path) -> None:
     assert strays_among([Path("a.pcd"), Path("b.pcd"), Path("c1.pcd")]) == []
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".bin", ".npz"])
+@pytest.mark.parametrize("num", [2, NUM])
+def test_labels_beside_scans_are_left_out_and_named(folder: Path, suffix: str, num: int) -> None:
+    for index in range(num):
+        (folder / f"{index:06d}{suffix}").write_bytes(bytes(30))
+    drive = open_lidar_sequence(folder)
+    assert {Path(source).suffix for source in drive.sources} == {".pcd"}
+    assert f"{num} {suffix} left out beside {NUM} .pcd" in drive.notes[0].text
+
+
 def test_kitti_folders_take_rows_of_tum_by_time(tmp_path: Path) -> None:
     (tmp_path / "velodyne").mkdir()
     rng = np.random.default_rng(0)

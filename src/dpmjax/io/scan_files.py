@@ -43,7 +43,7 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
 
 
 def stray_note(folder: Path) -> Note | None:
-    """Lists the files of a folder that have the ending of scans but are no scans, such as map.pcd.
+    """Lists the files of a folder with endings of scans that are not read: of rarer endings, or such as map.pcd.
 
     Args:
         folder: folder of the scans.
@@ -51,11 +51,15 @@ def stray_note(folder: Path) -> Note | None:
     Returns:
         The note, or None.
     """
-    strays = strays_among(_files_of_one_ending(folder, SCAN_SUFFIXES))
-    if not strays:
-        return None
-    text = f"{folder}: {strays[0].name} is no scan, as its name has no number; {len(strays)} such left out"
-    return Note(text, is_doubt=True)
+    most = _files_of_one_ending(folder, SCAN_SUFFIXES)
+    read, left_out = {file.suffix.lower() for file in most}, []
+    if strays := strays_among(most):
+        left_out.append(f"{strays[0].name} is no scan, as its name has no number; {len(strays)} such left out")
+    for suffix in SCAN_SUFFIXES:
+        others = _files_of_one_ending(folder, (suffix,))
+        if others and suffix not in read:
+            left_out.append(f"{len(others)} {suffix} left out beside {len(most)} {most[0].suffix}")
+    return Note(f"{folder}: {', '.join(left_out)}", is_doubt=True) if left_out else None
 
 
 def _files_of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
