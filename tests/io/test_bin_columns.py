@@ -54,6 +54,8 @@ def test_float64_is_named(tmp_path: Path, table: np.ndarray, columns: int, digit
     points.astype("<f8").tofile(path)
     with pytest.raises(InputError, match=r"0\.bin: the values are float64; save them as float32"):
         read_lidar_file(path)
+    with pytest.raises(InputError, match="the values are float64"):
+        open_lidar_sequence(tmp_path)
     points[np.random.default_rng(0).permutation(NUM)[: NUM // 2]] = 0  # beams without a hit
     points.tofile(path)
     assert len(read_lidar_file(path)) == NUM // 2

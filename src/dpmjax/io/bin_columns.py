@@ -25,6 +25,10 @@ _SIX_RATIO = 1.1
 _USUAL, _LEAST_DOUBLES, _MOST_HALVES = (1e-4, 1e5), 0.95, 0.7
 
 
+class Float64Error(InputError):
+    """A raw file of float64, as all files of its drive are."""
+
+
 class Columns(NamedTuple):
     """The layout of raw files.
 
@@ -52,11 +56,13 @@ def find_columns(path: Path, content: bytes) -> Columns:
         The layout, with a note where it is not KITTI's, or where the values fit another as well.
 
     Raises:
-        InputError: the file has no whole number of points of the layout, or of any; or it holds float64.
+        Float64Error: the file holds float64.
+        InputError: the file has no whole number of points of the layout, or of any.
     """
     fitting = [n for n in _LAYOUTS if len(content) % (4 * n) == 0]
     values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")
-    require(not _are_doubles(values), path, "the values are float64", "save them as float32, or the points as .npy")
+    if _are_doubles(values):
+        raise Float64Error(path, "the values are float64", "save them as float32, or the points as .npy")
     inferred = _columns_by_values(values)
     is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
     if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
@@ -115,6 +121,9 @@ def columns_of_drive(files: Iterable[Path]) -> Columns:
 
     Returns:
         The layout; KITTI's where no file is raw, or none can be inferred.
+
+    Raises:
+        Float64Error: the first file holds float64.
     """
     for file in files:
         if file.suffix.lower() != ".bin":
@@ -123,6 +132,8 @@ def columns_of_drive(files: Iterable[Path]) -> Columns:
             content = read_bytes(file)
             if content:
                 return find_columns(file, content)
+        except Float64Error:
+            raise
         except InputError:  # named where it is read
             continue
     return Columns(USUAL_COLUMNS)
