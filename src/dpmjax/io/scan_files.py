@@ -79,8 +79,8 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
     """Sorts scans by the numbers in their names: 2 before 10, and 0.05 before 0.1 where the numbers are decimals.
 
     A number with a point is a decimal where the digits after the point differ in count and none of the longer ones ends
-    in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10; so
-    are seconds and nanoseconds without leading zeros, whose steps are even only in this way.
+    in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10.
+    Seconds and nanoseconds without leading zeros are counted so too: their steps are even only in this way.
 
     Args:
         files: files in any order.
