@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -242,6 +243,16 @@ def test_a_run_of_the_first_scans_can_be_continued(whole, drive, with_truth, tmp
     assert len(np.load(tmp_path / "out" / "trajectory.npy")) == 40
     assert run("--resume", "-o", tmp_path / "out", "-n", len(TRUTH)) == EXIT_OK
     assert_same_results(tmp_path / "out", whole)
+
+
+def test_a_run_of_fewer_scans_than_are_done_is_refused(whole, with_truth, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    files = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    capsys.readouterr()
+    assert run("--resume", "-o", out, "-n", 3) == EXIT_BAD_INPUT
+    assert "scans done, 3 wanted; give -n" in capsys.readouterr().err
+    assert files == {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
 
 
 def test_every_nth_scan_keeps_its_reference(drive, with_truth, tmp_path) -> None:

@@ -45,6 +45,22 @@ def test_a_cut_file_is_not_taken_for_one_of_other_columns(tmp_path: Path, table:
         read_lidar_file(path)
 
 
+@pytest.mark.parametrize("columns", [3, 4, 5])
+@pytest.mark.parametrize("digits", [2, 9])
+@pytest.mark.parametrize("scale", [0.1, 1.0])
+def test_float64_is_named(tmp_path: Path, table: np.ndarray, columns: int, digits: int, scale: float) -> None:
+    path = tmp_path / "0.bin"
+    points = np.round(table[:, :columns] * scale, digits)
+    points.astype("<f8").tofile(path)
+    with pytest.raises(InputError, match=r"0\.bin: the values are float64; save them as float32"):
+        read_lidar_file(path)
+    with pytest.raises(InputError, match="the values are float64"):
+        open_lidar_sequence(tmp_path)
+    points[np.random.default_rng(0).permutation(NUM)[: NUM // 2]] = 0  # beams without a hit
+    points.tofile(path)
+    assert len(read_lidar_file(path)) == NUM // 2
+
+
 def test_values_that_do_not_tell_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     np.random.default_rng(0).normal(0, 10, (NUM, 4)).astype("<f4").tofile(tmp_path / "0.bin")
     with caplog.at_level(logging.WARNING):

@@ -254,7 +254,8 @@ def test_one_bad_scan_is_named_and_the_others_are_read(tmp_path, clouds, poses, 
 
 
 @pytest.mark.parametrize(
-    "content", [np.zeros((5, 2)), np.zeros(7), np.array(["a"]), np.zeros((0, 3)), np.full((4, 3), np.inf)]
+    "content",
+    [np.zeros((5, 2)), np.zeros(7), np.array(["a"]), np.zeros((0, 3)), np.full((4, 3), np.inf), np.ones((3, 900))],
 )
 def test_wrong_arrays_are_named(tmp_path, content):
     np.save(tmp_path / "0.npy", content)
@@ -270,6 +271,13 @@ def test_a_scan_in_millimetres_is_warned_of(tmp_path, clouds, caplog):
     assert caplog.text.count("are these millimetres or centimetres?") == 1
     read_lidar_file(tmp_path / "1.bin")
     assert "1.bin" in caplog.text
+
+
+def test_a_scan_far_from_its_origin_is_taken_for_a_map(tmp_path, clouds, caplog):
+    np.save(tmp_path / "0.npy", 0.1 * clouds[0] + np.array([300, 100, 0], np.float32))
+    with caplog.at_level(logging.WARNING):
+        read_lidar_file(tmp_path / "0.npy")
+    assert "are these coordinates of a map?" in caplog.text
 
 
 def test_other_columns_can_be_said(tmp_path, clouds):

@@ -47,6 +47,15 @@ def test_a_reference_of_another_rate_is_matched_by_time(folder: Path) -> None:
     assert "matched by time, tolerance 0.005 s; 0 of 8 scans have no reference pose" in note.text
 
 
+@pytest.mark.parametrize("name", ["groundtruth.csv", "poses.csv"])
+def test_references_with_commas_are_found(folder: Path, name: str) -> None:
+    times = EPOCH + 0.1 * np.arange(NUM)
+    write_times(folder, times)
+    rows = write_tum(folder / name, drive_along(times - EPOCH), times=times).read_text()
+    (folder / name).write_text(rows.replace(" ", ","))
+    np.testing.assert_allclose(open_lidar_sequence(folder).T_world_lidar, drive_along(times - EPOCH), atol=1e-4)
+
+
 def test_scans_between_poses_are_interpolated_and_those_beyond_are_counted(folder: Path) -> None:
     times, coarse = EPOCH + 0.1 * np.arange(NUM) + 0.04, EPOCH + 0.1 * np.arange(5)
     write_times(folder, times)
@@ -92,6 +101,31 @@ def test_names_that_are_stamps_are_times(tmp_path: Path) -> None:
     drive = open_lidar_sequence(tmp_path)
     np.testing.assert_allclose(drive.times, times, atol=1e-6)
     np.testing.assert_allclose(drive.T_world_lidar, drive_along(times - EPOCH), atol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["{0}_{1:09}", "left-{0}-{1:09}", "{0}.{1:09}", "{0}.{1}"])
+def test_names_of_seconds_and_nanoseconds_are_times(form: str) -> None:
+    stamps_ns = np.arange(23) * 100_000_000 + 12_345_678
+    files = [Path(f"{form.format(1_600_000_000 + ns // 10**9, ns % 10**9)}.pcd") for ns in stamps_ns.tolist()]
+    assert sort_scans(files[::-1]) == files
+    np.testing.assert_allclose(stamps_in_names(files), EPOCH + 1e-9 * stamps_ns, atol=1e-6)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_numbers_of_rows_are_no_times(folder: Path, first: int) -> None:
+    times = EPOCH + 0.1 * np.arange(NUM)
+    (folder / "times.txt").write_text("".join(f"{first + row} {time:.6f}\n" for row, time in enumerate(times)))
+    np.testing.assert_allclose(open_lidar_sequence(folder).times, times, atol=1e-6)
+    write_times(folder, np.arange(float(NUM)))  # once a second
+    np.testing.assert_array_equal(open_lidar_sequence(folder).times, np.arange(float(NUM)))
+
+
+def test_a_refused_reference_tells_what_is_wrong_with_the_times(folder: Path, caplog) -> None:
+    (folder / "times.txt").write_text("".join(f"{row:06}.pcd {0.1 * row}\n" for row in range(NUM)))
+    write_tum(folder / "groundtruth.txt", drive_along(np.arange(30.0)), times=0.01 * np.arange(30))
+    with pytest.raises(InputError, match="the scans have no times"):
+        open_lidar_sequence(folder)
+    assert "times.txt: line 1, column 1: '000000.pcd' is not a number; these times are not used" in caplog.text
 
 
 def test_stamps_may_be_the_numbers_of_scans(folder: Path) -> None:
@@ -150,6 +184,10 @@ def test_poses_of_a_camera_are_named_and_with_a_calibration_converted(folder: Pa
         ["1600000000.900000", "1600000001.000000"],
         [".0", ".05", ".1", ".15"],
         ["2", "10", "11"],
+        # Nanoseconds without leading zeros: 0.0123, 0.1123 and 0.2123 s.
+        ["1600000000.12345678", "1600000000.112345678", "1600000000.212345678", "1600000000.312345678"],
+        # Decimals whose last zeros are left out.
+        ["1600000000.15", "1600000000.2", "1600000000.25", "1600000000.3"],
     ],
 )
 def test_names_are_sorted_as_numbers(names: list[str]) -> None:
@@ -163,6 +201,16 @@ def test_a_stray_map_is_named_and_left_out(folder: Path) -> None:
     assert len(drive) == NUM
     assert "map.pcd is no scan" in drive.notes[0].text
     assert strays_among([Path("a.pcd"), Path("b.pcd"), Path("c1.pcd")]) == []
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".bin", ".npz"])
+@pytest.mark.parametrize("num", [2, NUM])
+def test_labels_beside_scans_are_left_out_and_named(folder: Path, suffix: str, num: int) -> None:
+    for index in range(num):
+        (folder / f"{index:06d}{suffix}").write_bytes(bytes(30))
+    drive = open_lidar_sequence(folder)
+    assert {Path(source).suffix for source in drive.sources} == {".pcd"}
+    assert f"{num} {suffix} left out beside {NUM} .pcd" in drive.notes[0].text
 
 
 def test_kitti_folders_take_rows_of_tum_by_time(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpmjax.io import (
     InputError,
@@ -14,7 +15,7 @@ from dpmjax.io import (
     write_poses_npy,
     write_tum,
 )
-from dpmjax.io.poses import planar_to_homogeneous
+from dpmjax.io.poses import homogeneous, planar_to_homogeneous, read_stamped_poses
 from tests.optional import import_or_skip
 
 POSES = np.column_stack([np.random.default_rng(0).uniform(-500, 500, (9, 2)), np.linspace(-3.1, 3.1, 9)])
@@ -67,6 +68,38 @@ def test_planar_columns_are_read_with_comments(tmp_path):
     path = tmp_path / "start.txt"
     path.write_text("# x_px y_px theta_rad\n\n1 2 0.5\n3, 4, -0.5\n")
     np.testing.assert_array_equal(read_planar_poses(path, 2, "px"), [[1, 2, 0.5], [3, 4, -0.5]])
+
+
+EUROC = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+
+
+@pytest.mark.parametrize("separator", [",", "; ", "\t"])
+@pytest.mark.parametrize(
+    ("names", "is_w_first", "num_more"),
+    [
+        (EUROC, True, 0),
+        (f"{EUROC}, v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]", True, 9),
+        ("timestamp,tx,ty,tz,qw,qx,qy,qz", True, 0),
+        ("timestamp,tx,ty,tz,qx,qy,qz,qw", False, 0),
+        ("\ufeff% time x y z", False, 0),
+    ],
+)
+def test_the_names_of_the_columns_order_the_quaternion(tmp_path, names, is_w_first, num_more, separator):
+    turns = Rotation.random(5, rng=np.random.default_rng(0))
+    poses = homogeneous(turns.as_matrix(), np.arange(15.0).reshape(5, 3))
+    quaternions = np.roll(turns.as_quat(), int(is_w_first), axis=1)
+    rows = np.column_stack([np.arange(5), poses[:, :3, 3], quaternions, np.ones((5, num_more))])
+    lines = [names, *(separator.join(f"{value:.9f}" for value in row) for row in rows)]
+    (tmp_path / "a.txt").write_text("\r\n".join(lines), encoding="utf-8")
+    found = read_stamped_poses(tmp_path / "a.txt")
+    np.testing.assert_allclose(found.poses, poses, atol=1e-8)
+    np.testing.assert_array_equal(found.stamps, np.arange(5))
+
+
+def test_a_row_of_nan_is_named(tmp_path):
+    (tmp_path / "a.txt").write_text("0 1 2 3 0 0 0 1\n1 nan nan nan nan nan nan nan\n")
+    with pytest.raises(InputError, match=r"in pose 1; remove its line"):
+        read_stamped_poses(tmp_path / "a.txt")
 
 
 def test_homogeneous_planar_matrices_are_read(tmp_path):

@@ -32,8 +32,8 @@ from dpmjax.cli import slam_numbers as numbers
 from dpmjax.cli.command import StopFlag, progress_bar
 from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, report_notes
 from dpmjax.cli.info import require_importable
-from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.sequences import InputError, LidarSequence
+from dpmjax.cli.run_folder import RunFolder, find_run, open_run_folder, recording, write_metrics
+from dpmjax.sequences import InputError, LidarSequence, require
 
 NAME = "slam"
 LOGGER = logging.getLogger(__name__)
@@ -82,8 +82,12 @@ def main(config: Config) -> dict[str, Any]:
     start = slam.init_slam(None if config.map is None else files.open_map(config.map, methods))
     sequence = open_drive(config.data, config, config.sequence)
     reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
+    earlier = RunFolder(find_run(NAME, config.output) if config.resume else Path(), is_resumed=config.resume)
+    beginning = find_beginning(earlier, methods, start)
+    num_done = len(beginning.reports)
+    found = f"{numbers.counted(num_done, 'scan')} done, {len(sequence)} wanted"
+    require(num_done <= len(sequence), earlier.path, found, f"give -n {num_done} or more, or another folder with -o")
     folder = open_run_folder(config, NAME)
-    beginning = find_beginning(folder, methods, start)
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""
         tell(f"{sequence.name}: {numbers.counted(len(sequence), 'scan')}{done}")

@@ -19,7 +19,7 @@ POINT_CLOUD, LASER_SCAN = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserS
 LIVOX_CLOUDS = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 MULTI_ECHO_SCAN = "sensor_msgs/msg/MultiEchoLaserScan"
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_ADVICE = "copy the bag again, or reindex it (rosbag reindex, ros2 bag reindex)"
+_ADVICE = "copy the bag again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
 # Advice for bags without scans of the wanted kind, by the types that they have.
 _OTHER_KINDS = {
     ("LaserScan", "MultiEchoLaserScan"): "planar scans are mapped by dpmjax map2d",

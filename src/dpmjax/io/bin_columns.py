@@ -21,6 +21,12 @@ _MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
 _LEAST_BITS, _LEAST_RATIO = 0.05, 1.3
 # Six columns repeat the order of three, so their information must be larger by this ratio.
 _SIX_RATIO = 1.1
+# Usual magnitudes of coordinates, least share of such float64, and largest share of their lower halves as float32.
+_USUAL, _LEAST_DOUBLES, _MOST_HALVES = (1e-4, 1e5), 0.95, 0.7
+
+
+class Float64Error(InputError):
+    """A raw file of float64, as all files of its drive are."""
 
 
 class Columns(NamedTuple):
@@ -50,10 +56,14 @@ def find_columns(path: Path, content: bytes) -> Columns:
         The layout, with a note where it is not KITTI's, or where the values fit another as well.
 
     Raises:
+        Float64Error: the file holds float64.
         InputError: the file has no whole number of points of the layout, or of any.
     """
     fitting = [n for n in _LAYOUTS if len(content) % (4 * n) == 0]
-    inferred = _columns_by_values(np.frombuffer(content[: len(content) // 4 * 4], "<f4"))
+    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")
+    if _are_doubles(values):
+        raise Float64Error(path, "the values are float64", "save them as float32, or the points as .npy")
+    inferred = _columns_by_values(values)
     is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
     if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
         return Columns(_NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides"))
@@ -111,6 +121,9 @@ def columns_of_drive(files: Iterable[Path]) -> Columns:
 
     Returns:
         The layout; KITTI's where no file is raw, or none can be inferred.
+
+    Raises:
+        Float64Error: the first file holds float64.
     """
     for file in files:
         if file.suffix.lower() != ".bin":
@@ -119,9 +132,26 @@ def columns_of_drive(files: Iterable[Path]) -> Columns:
             content = read_bytes(file)
             if content:
                 return find_columns(file, content)
+        except Float64Error:
+            raise
         except InputError:  # named where it is read
             continue
     return Columns(USUAL_COLUMNS)
+
+
+def _are_doubles(values: NDArray[np.float32]) -> bool:
+    """Returns True for coordinates in float64, whose lower halves are bits without a meaning."""
+    halves = values[: min(len(values), _MOST_VALUES) // 2 * 2]
+    doubles = halves.view("<f8")
+    is_there = doubles != 0
+    if not is_there.any():
+        return False
+    with np.errstate(invalid="ignore"):
+        shares = [
+            float(((_USUAL[0] < np.abs(numbers)) & (np.abs(numbers) < _USUAL[1])).mean())
+            for numbers in (doubles[is_there], halves[::2][is_there])
+        ]
+    return shares[0] >= _LEAST_DOUBLES and shares[1] <= _MOST_HALVES
 
 
 def _columns_by_values(values: NDArray[np.float32]) -> int | None:
@@ -130,7 +160,8 @@ def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(_LAYOUTS)))
     if num_bins < 4:
         return None
-    finite = np.nan_to_num(values.astype(np.float64))
+    with np.errstate(invalid="ignore"):
+        finite = np.nan_to_num(values.astype(np.float64))
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
     bins = np.searchsorted(edges, finite, side="right")
     bits = {n: _information_bits(bins, n, len(edges) + 1) for n in _LAYOUTS}

@@ -145,7 +145,7 @@ def read_lines(path: str | Path) -> list[str]:
     Raises:
         InputError: there is no such file, or it cannot be read.
     """
-    return read_bytes(path).decode("utf-8", errors="replace").splitlines()
+    return read_bytes(path).decode("utf-8-sig", errors="replace").splitlines()
 
 
 def is_number(word: str, kind: type[int | float] = float) -> bool:
@@ -185,7 +185,9 @@ def to_numbers(rows: Sequence[Sequence[str]], lines: Sequence[int], source: str 
 
 
 def read_table(path: str | Path) -> FloatArray:
-    """Reads rows of numbers, separated by blanks or commas; empty lines and lines with # in front are left out.
+    """Reads rows of numbers, separated by blanks, commas or semicolons.
+
+    Empty lines, lines with # in front, and one line of names above the numbers are left out.
 
     Args:
         path: the file.
@@ -196,5 +198,8 @@ def read_table(path: str | Path) -> FloatArray:
     Raises:
         InputError: there is no such file, no row, rows differ in length, or a word is no number.
     """
-    lines = [(number, line) for number, line in enumerate(read_lines(path), 1) if line.strip()[:1] not in ("", "#")]
-    return to_numbers([line.replace(",", " ").split() for _, line in lines], [number for number, _ in lines], path)
+    lines = [(number, re.sub("[,;]", " ", line).split()) for number, line in enumerate(read_lines(path), 1)]
+    lines = [(number, words) for number, words in lines if words and words[0][:1] != "#"]
+    if len(lines) > 1 and not any(map(is_number, lines[0][1])):
+        lines = lines[1:]
+    return to_numbers([words for _, words in lines], [number for number, _ in lines], path)

@@ -10,7 +10,7 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import natural_key, read_lines, read_table
+from dpmjax.io.files import log_notes, natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
 from dpmjax.io.scan_names import POSE_FILES, match_rows, numbers_of, scan_files
@@ -68,7 +68,11 @@ def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
     drive = Drive3D(folder.resolve().name, files, None, times, notes)
     if path is None:
         return drive
-    T, pose_notes = match_reference(read_stamped_poses(path), times, len(files), path)
+    try:
+        T, pose_notes = match_reference(read_stamped_poses(path), times, len(files), path)
+    except InputError:
+        log_notes(notes)  # times.txt may be the reason
+        raise
     calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
     if calibration is not None and camera_note(T, path) is not None:
         T_cam0_lidar = _read_camera_calibration(calibration)

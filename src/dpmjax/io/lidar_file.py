@@ -18,11 +18,14 @@ from dpmjax.io.files import import_for, log_notes, read_bytes, refusing
 from dpmjax.io.pcd import parse_pcd
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
 
-SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".pcd", ".ply", ".las", ".laz")
+# Of equally many files of several endings the first is read; arrays may be labels, so they are last.
+SCAN_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".bin", ".npz", ".npy")
 _NPZ_KEYS, _NPZ_TIMES = ("lidar_pcd", "points", "xyz", "arr_0"), "times"
 # Least range, usual range and largest range of lidars on the ground, m; nearly all points are within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
 _LEAST_USUAL_SHARE = 0.05
+# An array of fewer rows and more columns than this has the coordinates in its rows.
+_MOST_ROWS_OF_TRANSPOSE = 16
 # Points in map coordinates are nearer to their middle than to the origin by this factor.
 _MAP_RATIO = 5.0
 _LAS_ADVICE = "copy the file again, or save it anew as LAS 1.2 or 1.4"
@@ -130,6 +133,7 @@ def _read_arrays(path: Path) -> TimedCloud:
         raise InputError(path, "no array of points", "call it lidar_pcd or points")
     is_good = values.ndim in (2, 3) and values.shape[-1] >= 3 and values.dtype.kind in "fiu"
     found = f"an array of {values.shape} {values.dtype}"
+    is_good = is_good and not (values.ndim == 2 and len(values) < _MOST_ROWS_OF_TRANSPOSE < values.shape[1])
     require(is_good, path, found, "give points (n, 3), or organised (rows, columns, 3): x, y and z in metres")
     points = values.reshape(-1, values.shape[-1])
     times = None
@@ -220,11 +224,9 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
 
 def _why_too_far(points: FloatArray, median: float) -> tuple[str, str]:
     """Returns finding and advice for a too large median range: map coordinates, another unit, or garbage."""
-    middle = np.median(points, axis=0)
-    spread = float(np.median(np.linalg.norm(points - middle, axis=1)))
     found = f"the median range is {median:.4g} m"
-    if spread * _MAP_RATIO < float(np.linalg.norm(middle)):
-        at = " ".join(f"{value:.0f}" for value in middle)
+    if _is_far_place(points):
+        at = " ".join(f"{value:.0f}" for value in np.median(points, axis=0))
         advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
         return f"{found}, around one place far away: coordinates of a map, such as UTM", advice
     is_unit = median < 1000 * _FARTHEST_M
@@ -267,4 +269,11 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
     if share >= _LEAST_USUAL_SHARE:
         return None
     found = f"{100 * share:.1f} % of the points lie within {_USUAL_M:g} m"
-    return Note(f"{source}: {found}; are these millimetres or centimetres?", is_doubt=True)
+    what = "coordinates of a map" if _is_far_place(points) else "millimetres or centimetres"
+    return Note(f"{source}: {found}; are these {what}?", is_doubt=True)
+
+
+def _is_far_place(points: NDArray[Any]) -> bool:
+    """Returns True for points around one place far from the origin."""
+    middle = np.median(points, axis=0)
+    return bool(np.median(np.linalg.norm(points - middle, axis=1)) * _MAP_RATIO < np.linalg.norm(middle))

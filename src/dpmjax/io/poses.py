@@ -19,16 +19,20 @@ from dpmjax.io.files import read_lines, read_table, write_atomically
 from dpmjax.sequences import FloatArray, InputError, Unit, require
 
 _LAYOUTS = (
-    "x y theta, TUM (stamp tx ty tz qx qy qz qw), KITTI (12 numbers a row), or .npy of (n, 3), (n, 3, 3) or (n, 4, 4)"
+    "x y theta, TUM (stamp tx ty tz qx qy qz qw), EuRoC (with its line of names), KITTI (12 numbers a row), or .npy of "
+    "(n, 3), (n, 3, 3) or (n, 4, 4)"
 )
 _LARGEST_TILT_DEG = 10.0
+# Names of the columns of quaternions that begin with their real part, as of EuRoC: q_RS_w, q_RS_x or qw, qx.
+_IS_W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b", re.IGNORECASE)
+_W_FIRST_COLUMNS = [0, 1, 2, 3, 5, 6, 7, 4]
 
 
 def read_poses(path: str | Path) -> FloatArray:
     """Reads poses in the frame of the file.
 
     Args:
-        path: text with rows of x y theta, TUM or KITTI; or `.npy` of (n, 3), (n, 3, 3), (n, 4, 4) or (n, 12).
+        path: text with rows of x y theta, TUM, EuRoC or KITTI; or `.npy` of (n, 3), (n, 3, 3), (n, 4, 4) or (n, 12).
 
     Returns:
         (n, 4, 4).
@@ -273,6 +277,8 @@ def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
         values = array.astype(np.float64)
     else:
         values = read_table(path)
+        if values.shape[1] >= 8 and any(map(_IS_W_FIRST.search, read_lines(path))):
+            values = values[:, _W_FIRST_COLUMNS]
     if values.shape[1:] == (3, 3):
         return se2.from_matrix(check_poses(values, path)), None
     if values.shape[1:] == (4, 4):
@@ -288,7 +294,8 @@ def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
 def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
-    require(np.isfinite(rows).all(), path, "NaN or infinite values", "give a pose to every scan")
+    bad = ~np.isfinite(rows).all(axis=1)
+    require(not bad.any(), path, f"NaN or infinite values in pose {bad.argmax()}", "remove its line")
     is_unit = (np.abs(np.linalg.norm(np.clip(rows[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all()
     require(is_unit, path, "quaternions of another length than 1", "write TUM rows: stamp tx ty tz qx qy qz qw")
     return homogeneous(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])

@@ -100,13 +100,20 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     if path is None:
         return in_names, ()
     try:
-        stamps = read_table(path)[:, 0]
+        stamps = _stamps_of(read_table(path))
         if len(stamps) == len(files) and _are_times(stamps):
             return to_seconds(stamps), ()
         found = f"{len(stamps)} rows, or some that are no times, for {len(files)} scans"
     except InputError as error:
         found = error.found
     return in_names, (Note(f"{path}: {found}; these times are not used", is_doubt=True),)
+
+
+def _stamps_of(table: FloatArray) -> FloatArray:
+    """Returns the first column of a table that does not number its rows, from 0 or 1; else the first."""
+    rows = np.arange(len(table))
+    columns = (column for column in table.T if not any(np.array_equal(column, rows + first) for first in (0, 1)))
+    return next(columns, table[:, 0])
 
 
 def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
@@ -120,7 +127,7 @@ def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
         (n,) s, or None.
     """
     try:
-        times = match_rows(read_table(path)[:, 0], files)
+        times = match_rows(_stamps_of(read_table(path)), files)
     except InputError:
         return None
     return to_seconds(times) if times is not None and _are_times(times) else None

@@ -16,10 +16,14 @@ from dpmjax.sequences import FloatArray, Note
 
 # Usual names of files of reference poses in the lidar's frame.
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
-              "trajectory.npy", "gt_poses.txt", "groundtruth.txt")  # fmt: skip
+              "trajectory.npy", "gt_poses.txt", "groundtruth.txt", "groundtruth.csv", "poses.csv")  # fmt: skip
 _NUMBER = re.compile(r"\d+(?:\.\d+)?|\.\d+")
 # A number of that many digits is a time stamp: seconds since 1970, or a smaller unit.
 _STAMP_DIGITS = 10
+# Seconds since 1970 with a fraction, and with nanoseconds as a number of their own.
+_FRACTION, _SPLIT_STAMP = re.compile(r"(\d{10,})\.(\d+)"), re.compile(r"(?<!\d)(\d{10})[_-](\d{9})$")
+# Least ratio of the spreads of the steps of stamps of which one reading is wrong.
+_LEAST_SPREAD_RATIO = 2.0
 _LEAST_NUMBERED = 3
 
 
@@ -39,7 +43,7 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
 
 
 def stray_note(folder: Path) -> Note | None:
-    """Lists the files of a folder that have the ending of scans but are no scans, such as map.pcd.
+    """Lists the files of a folder with endings of scans that are not read: of rarer endings, or such as map.pcd.
 
     Args:
         folder: folder of the scans.
@@ -47,11 +51,15 @@ def stray_note(folder: Path) -> Note | None:
     Returns:
         The note, or None.
     """
-    strays = strays_among(_files_of_one_ending(folder, SCAN_SUFFIXES))
-    if not strays:
-        return None
-    text = f"{folder}: {strays[0].name} is no scan, as its name has no number; {len(strays)} such left out"
-    return Note(text, is_doubt=True)
+    most = _files_of_one_ending(folder, SCAN_SUFFIXES)
+    read, left_out = {file.suffix.lower() for file in most}, []
+    if strays := strays_among(most):
+        left_out.append(f"{strays[0].name} is no scan, as its name has no number; {len(strays)} such left out")
+    for suffix in SCAN_SUFFIXES:
+        others = _files_of_one_ending(folder, (suffix,))
+        if others and suffix not in read:
+            left_out.append(f"{len(others)} {suffix} left out beside {len(most)} {most[0].suffix}")
+    return Note(f"{folder}: {', '.join(left_out)}", is_doubt=True) if left_out else None
 
 
 def _files_of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -72,6 +80,7 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
 
     A number with a point is a decimal where the digits after the point differ in count and none of the longer ones ends
     in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10.
+    Seconds and nanoseconds without leading zeros are counted so too: their steps are even only in this way.
 
     Args:
         files: files in any order.
@@ -84,6 +93,7 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
     is_decimal = len({len(fraction) for fraction in fractions}) > 1 and not any(
         len(fraction) > 1 and fraction.endswith("0") for fraction in fractions
     )
+    is_decimal = is_decimal and _counted_stamps([_NUMBER.findall(stem)[-1:] for stem in stems]) is None
     return sorted(files, key=lambda file: _decimal_key(_stem_of(file)) if is_decimal else natural_key(file.name))
 
 
@@ -110,18 +120,41 @@ def strays_among(files: Sequence[Path]) -> list[Path]:
 def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
     """Reads the time stamps that are the last numbers in the names: decimals, or numbers of ten digits or more.
 
+    Seconds and nanoseconds may be numbers of their own, as in 1600000000_250000000.
+
     Args:
         files: the scans in order.
 
     Returns:
         (n,) in any unit; None where a name has none, or they do not increase.
     """
-    found = [_NUMBER.findall(_stem_of(file)) for file in files]
+    found = [_NUMBER.findall(_SPLIT_STAMP.sub(r"\1.\2", _stem_of(file))) for file in files]
     last = [numbers[-1] if numbers else "" for numbers in found]
     if not last or not all("." in number or _STAMP_DIGITS <= len(number) < 20 for number in last):
         return None
-    stamps = np.array([float(number) for number in last])
+    counted = _counted_stamps(found)
+    stamps = np.array([float(number) for number in last]) if counted is None else counted
     return stamps if bool((np.diff(stamps) > 0).all()) else None
+
+
+def _counted_stamps(numbers: Sequence[Sequence[str]]) -> FloatArray | None:
+    """Reads stamps whose nanoseconds have no leading zeros, so that 5.7 is 5 s and 7 ns.
+
+    Args:
+        numbers: numbers in each of n names, the stamp last.
+
+    Returns:
+        (n,) s; None where these are no such stamps, or where their steps are no more even than those of decimals.
+    """
+    parts = [_FRACTION.fullmatch(found[-1]) if found else None for found in numbers]
+    pairs = [part.groups() for part in parts if part is not None]
+    if len(pairs) < max(len(parts), _LEAST_NUMBERED):
+        return None
+    digits = max(len(fraction) for _, fraction in pairs)
+    counted = np.array([int(seconds) + int(fraction) / 10.0**digits for seconds, fraction in pairs])
+    decimals = np.array([float(f"{seconds}.{fraction}") for seconds, fraction in pairs])
+    spread, spread_of_decimals = (np.diff(np.sort(stamps)).std() for stamps in (counted, decimals))
+    return counted if _LEAST_SPREAD_RATIO * spread < spread_of_decimals else None
 
 
 def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
