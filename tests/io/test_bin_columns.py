@@ -22,13 +22,14 @@ def table() -> np.ndarray:
     ranges = rng.uniform(3, 40, NUM)
     height = ranges * np.tan(np.radians(ring - 25.0))
     xyz = [ranges * np.cos(azimuth), ranges * np.sin(azimuth), height]
-    return np.stack([*xyz, rng.integers(0, 255, NUM), ring, np.linspace(0, 0.1, NUM)], axis=1).astype("<f4")
+    more = [rng.integers(0, 255, NUM), ring, np.linspace(0, 0.1, NUM), rng.normal(900, 90, NUM), rng.integers(0, 9, NUM)]
+    return np.stack([*xyz, *more], axis=1).astype("<f4")
 
 
-@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("columns", [3, 4, 5, 6, 7, 8])
 def test_columns_are_judged_by_the_values(tmp_path: Path, table: np.ndarray, columns: int) -> None:
     path = tmp_path / "0.bin"
-    table[:, :columns].tofile(path)  # 1200 points of any number of columns fit all of 3, 4, 5 and 6
+    table[:, :columns].tofile(path)  # 1200 points of any number of columns fit all of 3, 4, 5, 6 and 8
     found = find_columns(path, path.read_bytes())
     assert found.num_columns == columns
     assert (found.note is None) == (columns == 4)
@@ -65,7 +66,7 @@ def test_values_that_do_not_tell_are_said(tmp_path: Path, caplog: pytest.LogCapt
     np.random.default_rng(0).normal(0, 10, (NUM, 4)).astype("<f4").tofile(tmp_path / "0.bin")
     with caplog.at_level(logging.WARNING):
         read_lidar_file(tmp_path / "0.bin")
-    assert "4 columns a point are assumed, 3 or 5 or 6 would fit as well; --columns decides" in caplog.text
+    assert "4 columns a point are assumed, 3 or 5 or 6 or 8 would fit as well; --columns decides" in caplog.text
     caplog.clear()
     assert len(read_lidar_file(tmp_path / "0.bin", bin_columns=3)) == NUM // 3 * 4
     assert not caplog.records

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from dpmjax.io.files import read_bytes
 from dpmjax.sequences import InputError, Note, require
 
-_LAYOUTS = (3, 4, 5, 6)
+_LAYOUTS = (3, 4, 5, 6, 7, 8)
 USUAL_COLUMNS = 4
 _NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
 # Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
 _MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
 # Mutual information of column and value: least value of the best layout, bits, and least ratio to the next layout.
 _LEAST_BITS, _LEAST_RATIO = 0.05, 1.3
-# Six columns repeat the order of three, so their information must be larger by this ratio.
-_SIX_RATIO = 1.1
+# Six and eight columns repeat the order of three and four, so their information must be larger by this ratio.
+_DOUBLED_RATIO = 1.1
 # Usual magnitudes of coordinates, least share of such float64, and largest share of their lower halves as float32.
 _USUAL, _LEAST_DOUBLES, _MOST_HALVES = (1e-4, 1e5), 0.95, 0.7
 
@@ -165,8 +165,9 @@ def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
     bins = np.searchsorted(edges, finite, side="right")
     bits = {n: _information_bits(bins, n, len(edges) + 1) for n in _LAYOUTS}
-    if bits[6] < _SIX_RATIO * bits[3]:
-        del bits[6]
+    for doubled in (6, 8):
+        if bits[doubled] < _DOUBLED_RATIO * bits[doubled // 2]:
+            del bits[doubled]
     (best, most), (_, second), *_ = sorted(bits.items(), key=lambda entry: -entry[1])
     is_clear = most >= _LEAST_BITS and most >= _LEAST_RATIO * second
     return best if is_clear else None
