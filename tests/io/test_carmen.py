@@ -47,6 +47,12 @@ def test_field_of_view_is_half_a_turn_from_right_to_left(num_beams, last_deg):
     assert (np.diff(angles) > 0).all()
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_the_mark_of_an_encoding_hides_no_scan(tmp_path, encoding):
+    (tmp_path / "a.log").write_text("\n".join([flaser([1, 2])] * 3), encoding=encoding)
+    assert len(read_carmen_log(tmp_path / "a.log")) == 3
+
+
 def test_ragged_scans_are_masked(tmp_path):
     log = read_carmen_log(write(tmp_path, flaser([1, 2, 3]), flaser([4]), flaser([5, 6])))
     np.testing.assert_array_equal(log.mask.sum(axis=1), [3, 1, 2])

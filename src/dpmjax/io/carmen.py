@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.io.files import read_bytes, refusing
+from dpmjax.io.files import read_bytes, refusing, to_lines
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, pad_scans, require
 
 _log = logging.getLogger(__name__)
@@ -75,9 +75,9 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     """
     content = read_bytes(path)
     with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
-        text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
+        text = to_lines(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ("FLASER", "ROBOTLASER1", "ODOM", "NEFF")}
-    for number, words in enumerate(map(str.split, text.splitlines()), 1):
+    for number, words in enumerate(map(str.split, text), 1):
         if words and words[0] in lines:
             lines[words[0]].append((number, words))
     is_newer = not lines["FLASER"]

@@ -146,7 +146,18 @@ def read_lines(path: str | Path) -> list[str]:
     Raises:
         InputError: there is no such file, or it cannot be read.
     """
-    content = read_bytes(path)
+    return to_lines(read_bytes(path))
+
+
+def to_lines(content: bytes) -> list[str]:
+    """Decodes the lines of a text; see `read_lines`.
+
+    Args:
+        content: the bytes of the text.
+
+    Returns:
+        The lines without their ends.
+    """
     encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     return content.decode(encoding, errors="replace").splitlines()
 
