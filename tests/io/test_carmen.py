@@ -47,6 +47,12 @@ def test_field_of_view_is_half_a_turn_from_right_to_left(num_beams, last_deg):
     assert (np.diff(angles) > 0).all()
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_the_mark_of_an_encoding_hides_no_scan(tmp_path, encoding):
+    (tmp_path / "a.log").write_text("\n".join([flaser([1, 2])] * 3), encoding=encoding)
+    assert len(read_carmen_log(tmp_path / "a.log")) == 3
+
+
 def test_ragged_scans_are_masked(tmp_path):
     log = read_carmen_log(write(tmp_path, flaser([1, 2, 3]), flaser([4]), flaser([5, 6])))
     np.testing.assert_array_equal(log.mask.sum(axis=1), [3, 1, 2])
@@ -76,6 +82,39 @@ def test_a_log_as_recorded_has_odometry_and_no_reference(tmp_path):
         log = read_carmen_log(write(tmp_path, *others, *lines))
         assert log.odometry_poses is None
         np.testing.assert_allclose(log.reference_poses, poses)
+
+
+def test_a_log_as_recorded_is_known_in_thinned_lines_too(tmp_path):
+    """The wheels were read just before each scan, 0.8 m after the scan before."""
+    poses = [(0.8 * i, 2, 0.3) for i in range(6)]
+    lines = [
+        line for i, pose in enumerate(poses) for line in (odom(pose, 0.9 + i), flaser([1, 2], pose, pose, 1.0 + i))
+    ]
+    log = read_carmen_log(write(tmp_path, *lines))
+    assert log.reference_poses is None
+    np.testing.assert_allclose(log.odometry_poses, poses)
+
+
+@pytest.mark.parametrize("kind", ["twice", "set back for good", "set back for a while", "missing stamps"])
+def test_wrong_stamps_alone_change_no_odometry(tmp_path, kind):
+    turns = np.linspace(0, 3, 30)
+    odometry = np.column_stack([5 * np.sin(turns), 5 - 5 * np.cos(turns), turns])
+    times = 100.0 + np.arange(30)
+    if kind == "twice":
+        odometry, times = np.repeat(odometry, 2, axis=0), np.repeat(times, 2)
+    elif kind.startswith("set back"):
+        times[18:] -= 60.0 if kind.endswith("good") else 5.0
+    else:
+        times[5::7] = 0.0
+    lines = [
+        flaser([1 + i / 20], (i, 0, 0), pose, time) for i, (pose, time) in enumerate(zip(odometry, times, strict=True))
+    ]
+    log = read_carmen_log(write(tmp_path, *lines))
+    np.testing.assert_allclose(log.odometry_poses, odometry)
+    np.testing.assert_allclose(log.points[:, 0, 1], -1.0 - np.arange(len(odometry)) / 20, rtol=1e-6)
+    np.testing.assert_array_equal(log.reference_poses[:, 0], range(len(odometry)))
+    assert (np.diff(log.times) >= 0).all()
+    assert np.ptp(log.times) > 20
 
 
 def robotlaser(ranges, laser, robot, time, start=-np.pi / 2, step=np.pi / 2):

@@ -90,11 +90,14 @@ def test_gtsam_reads_the_same_cost(tmp_path: Path, text: str) -> None:
         (PLANAR + "VERTEX_SE2 8 0 zero 0\n", "line 7: column 4, 'zero', is not a number"),
         (PLANAR + "VERTEX_SE2 x 0 0 0\n", "line 7: column 2, 'x', is not a whole number"),
         (PLANAR + "VERTEX_SE2 8 0 nan 0\n", "expected finite numbers"),
-        (PLANAR + "VERTEX_SE2 7 0 0 0\n", "every id once"),
-        (PLANAR + "FIX 12\n", "node 12 has no vertex"),
-        (PLANAR + "FIX one\n", "one"),
+        (PLANAR + "VERTEX_SE2 7 0 0 0\n", "line 7: node 7 has a vertex in line 2, too"),
+        (PLANAR + "FIX 12\n", "line 7: node 12 has no vertex"),
+        (PLANAR + "FIX one\n", "line 7: invalid literal for int() with base 10: 'one'; give the numbers of nodes"),
         (PLANAR + "EDGE_SE2 7 5 1 2 3 1 0 0 1 0 1\n", "node 5 has no vertex"),
-        (PLANAR + "EDGE_SE2 7 7 1 2 3 1 0 0 1 0 1\n", "another node"),
+        (PLANAR + "EDGE_SE2 7 7 1 2 3 1 0 0 1 0 1\n", "line 7: an edge from node 7 to itself"),
+        (PLANAR + "EDGE_SE2 7 3 1e200 2 3 1 0 0 1 0 1\n", "line 7: expected finite numbers below 1e+75, got 1e+200"),
+        (PLANAR + "EDGE_SE2 7 3 1 2 3 1e200 0 0 1 0 1\n", "line 7: the information of edge 7 3 is not finite, or huge"),
+        (PLANAR + "EDGE_SE2_DCS 7 3 1 2 3 1 0 0 1 0 1\n", "switchable and mixture edges are not read"),
         (PLANAR + "EDGE_SE2 7 3 1 2 3 1 0 0 -1 0 1\n", "positive semidefinite"),
         (spatial_text()[0].replace("0.6 0.8", "0 0"), "quaternion"),
         ("VERTEX_SE2 99999999999999999999 0 0 0", "graph.g2o"),
@@ -106,6 +109,14 @@ def test_bad_file_is_refused_in_one_line(tmp_path: Path, text: str, message: str
         read_g2o(path)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_the_mark_of_an_encoding_is_no_text(tmp_path: Path, encoding: str) -> None:
+    text = PLANAR.partition("\n")[2]
+    graph = read_g2o(written(tmp_path, text))
+    (tmp_path / "graph.g2o").write_text(text, encoding=encoding)
+    assert_same(read_g2o(tmp_path / "graph.g2o"), graph)
 
 
 EDGES = """EDGE_SE2 5 6 1 0 0.5 1 0 0 1 0 1

@@ -246,3 +246,12 @@ def test_angles_in_degrees_are_recognised(tmp_path):
     np.testing.assert_allclose(degrees.points, POINTS, rtol=1e-5)
     assert "degrees" in degrees.notes[0].text
     assert degrees.notes[0].is_doubt
+
+
+@pytest.mark.parametrize("is_constant", [True, False])
+def test_odometry_of_one_pose_is_none(tmp_path, is_constant, caplog):
+    ranges = np.random.default_rng(0).uniform(1, 5, (6, 40))
+    odometry = np.tile([3.0, 1.0, 0.5], (6, 1)) + [[0.0 if is_constant else 0.01 * i, 0, 0] for i in range(6)]
+    np.savez(tmp_path / "a.npz", ranges=ranges, angles=np.linspace(-2, 2, 40), odometry=odometry)
+    assert (read_sequence(tmp_path / "a.npz").odometry_poses is None) == is_constant
+    assert ("same pose at every scan" in caplog.text) == is_constant

@@ -13,6 +13,7 @@ from dpmjax.registration2d import LoopConfig, RefinementConfig, correct_by_loops
 from dpmjax.registration2d.joint_alignment import choose_pairs
 from dpmjax.registration2d.loop_closure import LoopResult, count_support, find_candidates
 from dpmjax.registration2d.planar_scans import rounded_up
+from dpmjax.registration2d.step_prior import StepPrior
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -51,6 +52,16 @@ def test_refinement_never_uses_masked_beams(walk) -> None:
         results.append(refine(planar_scans(points, mask), start, WITHOUT_LOOPS).poses)
     np.testing.assert_array_equal(results[0], results[1])
     assert ate(results[0], walk.reference_poses) < 0.05
+
+
+def test_two_scans_that_share_nothing_are_refined_without_pairs(walk) -> None:
+    """Both stand at one place, where their surroundings contradict each other, by odometry that may be off by far."""
+    ends = [0, len(walk.points) // 2]
+    scans = planar_scans(walk.points[ends], walk.mask[ends])
+    poses = np.zeros((2, 3))
+    prior = StepPrior(poses[1:], np.array([[scans.typical_range, scans.typical_range, 1.0]]))
+    refined = refine(scans, poses, prior=prior)
+    assert np.isfinite(refined.poses).all()
 
 
 def test_refinement_stays_in_the_world_of_the_start(walk, walk_scans) -> None:

@@ -149,6 +149,19 @@ def test_pose_folders_are_read_in_natural_order(pose_folder):
         (lambda path: (path / "frame-2.depth.png").unlink(), "at least two"),
         (lambda path: (path / "frame-2.pose.txt").write_text("1 2 3"), "a matrix of"),
         (lambda path: (path / "camera-intrinsics.txt").write_text("6 0 3.5\n0 -6.5 2.5\n0 0 1"), "y axis of its poses"),
+        (
+            lambda path: (path / "camera-intrinsics.txt").write_text("6 0 0\n0 6 0\n3 2 1"),
+            "axis at column 0, row 0, beside",
+        ),
+        (
+            lambda path: (path / "camera-intrinsics.txt").write_text("12 0 7\n0 13 5\n0 0 1"),
+            "beside the images of 8 x 6",
+        ),
+        (
+            lambda path: np.savetxt(path / "frame-10.pose.txt", np.zeros((4, 4))),
+            "frame-10.pose.txt: pose 0 is no rigid",
+        ),
+        (lambda path: np.savetxt(path / "frame-10.pose.txt", np.diag([2, 2, 2, 1])), "no rigid motion"),
     ],
 )
 def test_damaged_pose_folders_are_told_in_one_line(pose_folder, spoil, message):
@@ -156,6 +169,19 @@ def test_damaged_pose_folders_are_told_in_one_line(pose_folder, spoil, message):
     with pytest.raises(InputError, match=message) as caught:
         io.read_pose_folder(pose_folder, height=6, width=8)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("scale", "is_refused"), [(0, True), (10, True), (3, False)])
+def test_depth_of_another_unit_is_named(pose_folder, caplog, scale, is_refused):
+    """Images of 1 and 5 m."""
+    for index in (2, 10):
+        write_png(pose_folder / f"frame-{index}.depth.png", np.full((6, 8), 500 * index * scale))
+    if is_refused:
+        with pytest.raises(InputError, match=f"median depth is {3 * scale} m, .* give millimetres"):
+            io.read_pose_folder(pose_folder, height=6, width=8)
+    else:
+        assert io.read_pose_folder(pose_folder, height=6, width=8).mask[0].all()
+        assert "the median depth is 9 m" in caplog.text
 
 
 @pytest.fixture

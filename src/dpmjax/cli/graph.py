@@ -21,8 +21,10 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import io, pose_graph, viz
 from dpmjax.cli.command import check_least
+from dpmjax.cli.drives import report_notes
 from dpmjax.cli.run_folder import OutputOptions, open_run_folder, recording, write_metrics
-from dpmjax.sequences import InputError
+from dpmjax.pose_graph.graph import label_parts
+from dpmjax.sequences import InputError, Note
 
 NAME = "graph"
 # Edges below this weight are rejected.
@@ -58,8 +60,9 @@ def main(config: Config) -> dict[str, Any]:
     settings = pose_graph.PoseGraphConfig(outlier_chi2=config.outlier_chi2, max_iterations=config.iterations)
     folder = open_run_folder(config, NAME)
     with recording(folder):
+        notes = report_notes(notes_on_parts(config.graph, graph))
         found = pose_graph.optimize_pose_graph(graph, settings)
-        metrics = {"graph": config.graph.name, **graph_numbers(found), "wall_s": time.perf_counter() - started}
+        metrics = {"graph": config.graph.name, **graph_numbers(found), **notes, "wall_s": time.perf_counter() - started}
         poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
         write_g2o(folder / "graph.g2o", found.graph)
         io.write_tum(folder / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
@@ -78,6 +81,15 @@ def main(config: Config) -> dict[str, Any]:
             advice = "give more --iterations, or a kernel by --outlier-chi2"
             raise InputError(config.graph, f"no minimum after {found.iterations} iterations", advice)
     return metrics
+
+
+def notes_on_parts(path: Path, graph: pose_graph.PoseGraph) -> tuple[Note, ...]:
+    """Returns a note on a graph whose edges, those with any information, do not join all nodes."""
+    source, target, _, information = graph.edges
+    has_any = information.any(axis=(1, 2))
+    sizes = np.bincount(label_parts(len(graph.poses), source[has_any], target[has_any]))
+    text = f"{path}: no edge joins its {len(sizes)} parts, the largest of {sizes.max()} nodes"
+    return () if len(sizes) == 1 else (Note(f"{text}; each stays where its first or its fixed nodes are"),)
 
 
 def graph_numbers(found: pose_graph.OptimizedPoseGraph) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.io.files import read_bytes, refusing
+from dpmjax.io.files import read_bytes, refusing, to_lines
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, pad_scans, require
 
 _log = logging.getLogger(__name__)
@@ -41,6 +41,8 @@ _SAME_PLACE_M = 0.5
 _SAME_POSE = 1e-4
 # A line is moved to the position of its time stamp if that shortens the detour of its odometry to this share.
 _SHORTER_WAY = 0.5
+# The odometry does not jump in steps of up to this many times the median.
+_USUAL_STEP = 4.0
 
 
 class _Scan(NamedTuple):
@@ -73,9 +75,9 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     """
     content = read_bytes(path)
     with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
-        text = (gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content).decode("latin-1")
+        text = to_lines(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ("FLASER", "ROBOTLASER1", "ODOM", "NEFF")}
-    for number, words in enumerate(map(str.split, text.splitlines()), 1):
+    for number, words in enumerate(map(str.split, text), 1):
         if words and words[0] in lines:
             lines[words[0]].append((number, words))
     is_newer = not lines["FLASER"]
@@ -153,7 +155,7 @@ def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> 
 
 
 def _is_at_wheels(lines: list[list[str]], poses: FloatArray, times: FloatArray) -> bool:
-    """Returns True where most poses lie at the ODOM line next in time; damaged lines do not count."""
+    """Returns True where most poses lie at an ODOM line beside them in time; damaged lines do not count."""
     wheels = []
     for words in lines:
         try:
@@ -165,16 +167,18 @@ def _is_at_wheels(lines: list[list[str]], poses: FloatArray, times: FloatArray) 
     if not wheels:
         return False
     ordered = np.array(sorted(wheels, key=lambda row: row[0]))
-    nearest = ordered[np.clip(np.searchsorted(ordered[:, 0], times), 0, len(ordered) - 1)]
-    return float(np.median(np.hypot(*(nearest[:, 1:3] - poses[:, :2]).T))) < _SAME_PLACE_M
+    after = np.searchsorted(ordered[:, 0], times)
+    beside = ordered[np.clip([after - 1, after], 0, len(ordered) - 1), 1:3]
+    return float(np.median(np.linalg.norm(beside - poses[:, :2], axis=-1).min(axis=0))) < _SAME_PLACE_M
 
 
 def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     """Moves scans of another time to the positions of their time stamps.
 
     Some published logs have lines with the scan, time stamp and odometry of another time, while their corrected poses
-    are in order. There the time stamps are out of order, and the odometry jumps by metres and back. Time and odometry
-    are interpolated where the stamp alone is wrong. Without any order of the stamps the sequence gets no times.
+    are in order. There the time stamps are out of order, and the odometry jumps by metres and back. Where the stamp
+    alone is wrong, the time is interpolated, and the odometry, too, if it jumps. A clock that was set back for the
+    remaining lines goes on from there. Without any order of the stamps the sequence gets no times.
 
     Returns:
         The scans in the order of time.
@@ -183,7 +187,9 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     assert times is not None
     if np.ptp(times) == 0:
         return dataclasses.replace(sequence, times=None)
-    ordered = _longest_increasing(times)
+    is_usual = np.ones(len(rows) - 1, bool) if odometry is None else _are_usual_steps(odometry)
+    times = _with_one_clock(times, is_usual)
+    ordered = _longest_ascending(times)
     late = np.setdiff1d(rows, ordered)
     if 2 * len(late) > len(times):
         _log.warning("%s: time stamps are in no order; lines stay in their order, times are dropped", path)
@@ -200,9 +206,27 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     stamps[known] = times[known]
     order = np.argsort(stamps, kind="stable")
     if odometry is not None:
-        odometry = _interpolated(odometry, ordered, known)
+        # Lines that join lines in order by usual steps alone have the odometry of their place.
+        piece = np.concatenate([[0], np.cumsum(~is_usual)])
+        is_continuous = np.isin(piece, piece[ordered])
+        odometry = _interpolated(odometry, ordered, np.union1d(known, np.flatnonzero(is_continuous)))
     repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=odometry)
     return _carry_reference(repaired.take(order), moved[order])
+
+
+def _are_usual_steps(odometry: FloatArray) -> BoolArray:
+    """Returns True for steps (n - 1,) of the odometry that are not much longer than half of them."""
+    length = _ways(odometry[:-1], odometry[1:])
+    return np.asarray(length <= _USUAL_STEP * np.median(length))
+
+
+def _with_one_clock(times: FloatArray, is_usual: BoolArray) -> FloatArray:
+    """Continues the times where a clock was set back: all later stamps precede half of those before it."""
+    steps, times = np.diff(times), times.copy()
+    for last in np.flatnonzero((steps < 0) & is_usual):
+        if times[last + 1 :].max() < np.median(times[: last + 1]):
+            times[last + 1 :] += times[last] - times[last + 1] + np.median(steps)
+    return times
 
 
 def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArray[np.int64]) -> FloatArray:
@@ -215,14 +239,19 @@ def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArr
     return between
 
 
+def _ways(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Computes the lengths of motions, metres and radians added."""
+    step = se2.relative(start, end)
+    return np.asarray(np.hypot(step[:, 0], step[:, 1]) + np.abs(se2.wrap_angle(step[:, 2])))
+
+
 def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.int64], keys: FloatArray) -> FloatArray:
     """Computes the increase of the path length by each late line, inserted at the position of its key."""
     after = np.searchsorted(keys[ordered], keys[late])
     before, after = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
 
     def way(start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
-        step = se2.relative(odometry[start], odometry[end])
-        return np.hypot(step[:, 0], step[:, 1]) + np.abs(se2.wrap_angle(step[:, 2]))
+        return _ways(odometry[start], odometry[end])
 
     return way(before, late) + way(late, after) - way(before, after)
 
@@ -239,13 +268,13 @@ def _carry_reference(sequence: ScanSequence, moved: BoolArray) -> ScanSequence:
     return dataclasses.replace(sequence, reference_poses=np.where(moved[:, None], carried, reference))
 
 
-def _longest_increasing(values: FloatArray) -> NDArray[np.int64]:
-    """Finds the indices of the longest strictly increasing subsequence (patience sorting)."""
+def _longest_ascending(values: FloatArray) -> NDArray[np.int64]:
+    """Finds the indices of the longest subsequence that never falls (patience sorting)."""
     tails: list[float] = []
     ends: list[int] = []
     before = np.full(len(values), -1)
     for index, value in enumerate(values.tolist()):
-        pile = bisect.bisect_left(tails, value)
+        pile = bisect.bisect_right(tails, value)
         tails[pile : pile + 1] = [value]
         ends[pile : pile + 1] = [index]
         before[index] = ends[pile - 1] if pile else -1

@@ -13,6 +13,7 @@ A scene is a grid of places with twelve views each; a trajectory is a random wal
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,10 @@ from numpy.typing import NDArray
 
 from dpmjax.io.array_files import parse_mat, read_depth_png
 from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
-from dpmjax.io.poses import homogeneous
+from dpmjax.io.poses import check_poses, homogeneous
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 
+_log = logging.getLogger(__name__)
 _NOTHING_MM = 65535  # besides 0
 _MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
 
@@ -43,7 +45,8 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
         The sequence in natural order of the names, moving in SE(3); without a reference where no pose file is there.
 
     Raises:
-        InputError: no such folder, no depth image, no intrinsics, poses for some images only, or a damaged file.
+        InputError: no such folder, no depth image, no intrinsics, poses for some images only, or a damaged file. Also
+            for intrinsics of images of another size, poses that are no rigid motions, and images without valid pixels.
     """
     folder = Path(path)
     require(folder.is_dir(), folder, "no such folder", "give a folder of NAME.depth.png files")
@@ -59,8 +62,15 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
     require(len(missing) in (0, len(poses)), folder, found, "give a pose to every image or to none")
     rows, columns = read_depth_png(images[0]).shape
     camera = _make_camera(intrinsics, columns, rows, matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
+    found = (
+        f"the optical axis at column {camera.cx:g}, row {camera.cy:g}, beside the images of {columns} x {rows} pixels"
+    )
+    is_inside = 0 < camera.cx < columns - 1 and 0 < camera.cy < rows - 1
+    require(is_inside, intrinsics, found, "give rows fx 0 cx, 0 fy cy, 0 0 1, of the size of the images")
     points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
-    T_world_camera = None if missing else np.stack([_read_matrix(pose, (4, 4)) for pose in poses])
+    T_world_camera = None
+    if not missing:
+        T_world_camera = np.concatenate([check_poses(_read_matrix(pose, (4, 4))[None], pose) for pose in poses])
     return DepthSequence(folder.name, points, mask, False, T_world_camera)
 
 
@@ -145,14 +155,20 @@ def back_project(
 def _read_clouds(
     images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
 ) -> tuple[NDArray[np.float32], BoolArray]:
-    """Reads points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres."""
-    clouds = []
+    """Reads points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres; warns of most pixels too deep."""
+    clouds, depths = [], []
     for image in images:
         depth_mm = read_depth_png(image)
         depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
+        depths.append(float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0)
         with refusing(image, "{error}", "give images of the camera's size, not smaller than a cloud", (ValueError,)):
             clouds.append(back_project(depth_m, camera, height=shape[0], width=shape[1], max_depth_m=max_depth_m))
     points, mask = zip(*clouds, strict=True)
+    found = f"the median depth is {np.median(depths):.3g} m, deeper pixels than {max_depth_m:g} m are left out"
+    advice = "give millimetres, 0 for nothing; TUM's images have 5000 a metre"
+    require(any(map(np.any, mask)), image.parent, found, advice)
+    if np.median(depths) > max_depth_m:
+        _log.warning("%s: %s; %s", image.parent, found, advice)
     return np.stack(points), np.stack(mask)
 
 

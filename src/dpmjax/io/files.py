@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
 import logging
 import os
@@ -134,7 +135,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def read_lines(path: str | Path) -> list[str]:
-    """Reads the lines of a text file; bytes that are no UTF-8 are replaced.
+    """Reads the lines of a text file in UTF-8, or UTF-16 with its mark in front; other bytes are replaced.
 
     Args:
         path: the file.
@@ -145,7 +146,20 @@ def read_lines(path: str | Path) -> list[str]:
     Raises:
         InputError: there is no such file, or it cannot be read.
     """
-    return read_bytes(path).decode("utf-8-sig", errors="replace").splitlines()
+    return to_lines(read_bytes(path))
+
+
+def to_lines(content: bytes) -> list[str]:
+    """Decodes the lines of a text; see `read_lines`.
+
+    Args:
+        content: the bytes of the text.
+
+    Returns:
+        The lines without their ends.
+    """
+    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    return content.decode(encoding, errors="replace").splitlines()
 
 
 def is_number(word: str, kind: type[int | float] = float) -> bool:

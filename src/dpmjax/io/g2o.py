@@ -63,12 +63,14 @@ _TAGS = {
 }
 # EQUIV marks nodes that TORO may collapse on request; their edges stand in the file, too.
 _IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET", "EQUIV")
+_LARGEST_NUMBER = 1e75  # Squared and weighted errors of larger numbers overflow.
 _READ = "give VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO)"
 # Advice for other tags, by parts of their names.
 _OTHER_TAGS = {
     (
         "SWITCH",
         "MAXMIX",
+        "DCS",
     ): "switchable and mixture edges are not read: give plain edges, a robust kernel lets wrong ones go",
     ("PRIOR",): "priors of single poses are not read: leave them out, and fix nodes with FIX",
     ("XY", "LANDMARK", "POINT", "LINE", "PLANE", "BEARING", "CAM"): (
@@ -96,6 +98,7 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
             edge.
     """
     lines, fixed = _read_lines(path)
+    _check_nodes(path, lines)
     vertices = [line for line in lines if _TAGS[line.tag].num_nodes == 1]
     edge_lines = [line for line in lines if _TAGS[line.tag].num_nodes == 2]
     require(len(lines) > 0, path, "no vertices and no edges", _READ)
@@ -104,6 +107,8 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
     else:
         ids = np.unique([node for line in edge_lines for node in line.nodes])
     row_of = {int(node): row for row, node in enumerate(ids)}
+    for number, node in fixed:
+        require(node in row_of, f"{path}: line {number}", f"node {node} has no vertex", "add its VERTEX line")
     size = _TAGS[lines[0].tag].tangent_size
     for end in (0, 1):
         for line in edge_lines:
@@ -112,28 +117,38 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
     target, source = np.array([[row_of[node] for node in line.nodes] for line in edge_lines], np.int64).reshape(-1, 2).T
     measurements, information = _poses(path, edge_lines, size), _information(path, edge_lines, size, nearest_psd)
     edges, poses = Edges(source, target, measurements, information), _poses(path, vertices, size)
-    with (
-        refusing(path, "node {error} has no vertex", "add its VERTEX line", (KeyError,)),
-        refusing(path, "{error}", "mend the file", (ValueError,)),
-    ):
+    with refusing(path, "{error}", "mend the file", (ValueError,)):
         is_fixed = np.zeros(len(ids), bool)
-        is_fixed[[row_of[int(node)] for node in fixed]] = True
+        is_fixed[[row_of[node] for _, node in fixed]] = True
         poses = poses if vertices else spanning_tree_poses(len(ids), edges)
         return PoseGraph.create(poses, edges, is_fixed=is_fixed, ids=ids)
 
 
-def _read_lines(path: str | Path) -> tuple[list[_Line], list[str]]:
-    """Reads vertices and edges in the order of the file, and the nodes after FIX."""
+def _check_nodes(path: str | Path, lines: list[_Line]) -> None:
+    """Refuses a second vertex of a node, and an edge from a node to itself."""
+    line_of: dict[int, int] = {}
+    for line in lines:
+        source, node = f"{path}: line {line.number}", line.nodes[0]
+        if len(line.nodes) == 1:
+            found = f"node {node} has a vertex in line {line_of.get(node)}, too"
+            require(line_of.setdefault(node, line.number) == line.number, source, found, "give every node once")
+        else:
+            require(node != line.nodes[1], source, f"an edge from node {node} to itself", "remove it")
+
+
+def _read_lines(path: str | Path) -> tuple[list[_Line], list[tuple[int, int]]]:
+    """Reads vertices and edges in the order of the file, and the nodes after FIX, each with its line."""
     lines: list[_Line] = []
-    fixed: list[str] = []
+    fixed: list[tuple[int, int]] = []
     for number, text in enumerate(read_lines(path), 1):
         tag, *words = text.split() or ["#"]
         if tag.startswith("#") or tag in _IGNORED:
             continue
-        if tag == "FIX":
-            fixed += words
-            continue
         source = f"{path}: line {number}"
+        if tag == "FIX":
+            with refusing(source, "{error}", "give the numbers of nodes after FIX", (ValueError,)):
+                fixed += [(number, int(word)) for word in words]
+            continue
         advice = next((advice for parts, advice in _OTHER_TAGS.items() if any(part in tag for part in parts)), _READ)
         require(tag in _TAGS, source, f"'{tag[:40]}' is not read here", advice)
         if lines and _TAGS[lines[0].tag].tangent_size != _TAGS[tag].tangent_size:
@@ -176,14 +191,15 @@ def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
     poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
     for tag, places, values in _by_tag(lines):
         numbers = values[:, : tag.pose_size]
-        is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(numbers).all(axis=1))
+        is_finite: NDArray[np.bool_] = np.asarray((np.abs(numbers) < _LARGEST_NUMBER).all(axis=1))
         lengths = np.linalg.norm(np.clip(numbers[:, 3:], -2, 2), axis=1)
         is_good = is_finite & ((tag.pose_size != 7) | (np.abs(lengths - 1) <= 0.1))
         if not is_good.all():
             row = int(np.argmin(is_good))
             found = "a quaternion that is not of length 1"
             if not is_finite[row]:
-                found = f"expected finite numbers, got {numbers[row][~np.isfinite(numbers[row])][0]}"
+                wrong = numbers[row][~(np.abs(numbers[row]) < _LARGEST_NUMBER)][0]
+                found = f"expected finite numbers below {_LARGEST_NUMBER:g}, got {wrong:g}"
             raise InputError(f"{path}: line {lines[places[row]].number}", found, "mend the line")
         if tag.pose_size == 3:
             poses[places] = numbers
@@ -201,7 +217,8 @@ def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: b
         rows, columns = tag.triangle
         places, numbers = places[:, None], values[:, tag.pose_size :]
         matrices[places, rows, columns] = matrices[places, columns, rows] = numbers
-    is_finite: NDArray[np.bool_] = np.asarray(np.isfinite(matrices.reshape(len(lines), size * size)).all(axis=1))
+    is_small = np.abs(matrices.reshape(len(lines), size * size)) < _LARGEST_NUMBER
+    is_finite: NDArray[np.bool_] = np.asarray(is_small.all(axis=1))
     is_good = np.zeros(len(lines), bool)
     is_good[is_finite] = is_semidefinite(matrices[is_finite])
     if nearest_psd:
@@ -209,7 +226,7 @@ def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: b
         is_good = is_finite
     if not is_good.all():
         place = int(np.argmin(is_good))
-        why, advice = "not finite", "give expected finite numbers"
+        why, advice = "not finite, or huge", f"give finite numbers below {_LARGEST_NUMBER:g}"
         if is_finite[place]:
             least = float(np.linalg.eigvalsh(matrices[place])[0])
             why = f"not positive semidefinite, its least eigenvalue is {least:.4g}"

@@ -75,7 +75,7 @@ def read_sequence(
     require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
     whole = _read(path, unit, max_range, topic)
     whole = _without_maxima(whole, path) if max_range is None else _limit(whole, max_range)
-    sequence = whole.take(slice(start, stop, stride))
+    sequence = _without_constant_odometry(whole, path).take(slice(start, stop, stride))
     found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
     require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
     _check_beams(sequence, path, start, stride)
@@ -138,6 +138,15 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
         return sequence
     found = f"{100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
     return replace(_limit(sequence, limit), notes=(*sequence.notes, Note(f"{path}: {found}")))
+
+
+def _without_constant_odometry(sequence: ScanSequence, path: Path) -> ScanSequence:
+    """Leaves out odometry with one pose for all scans, as logs of robots without odometry have it."""
+    odometry = sequence.odometry_poses
+    if odometry is None or len(odometry) < 2 or np.ptp(odometry, axis=0).any():
+        return sequence
+    note = Note(f"{path}: the odometry has the same pose at every scan; it is not used", is_doubt=True)
+    return replace(sequence, odometry_poses=None, notes=(*sequence.notes, note))
 
 
 def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) -> None:

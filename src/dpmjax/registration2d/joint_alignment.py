@@ -263,6 +263,8 @@ def _linearise(
     """Linearises all pairs at these poses, gate and kernel; their number is rounded up, so that few shapes compile."""
     source, target, across, _ = pairs
     relative = se2.relative(poses[target], poses[source])
+    if not len(source):
+        return Edges(source, target, relative, np.zeros((0, 3, 3))), np.zeros((0, 3))
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
     filled = np.resize(np.arange(len(source)), rounded_up(len(source), _PAIRS_AT_ONCE, _PAIRS_ROUNDED))
     rows = source[filled], target[filled], relative[filled].astype(np.float32)
