@@ -22,7 +22,13 @@ def table() -> np.ndarray:
     ranges = rng.uniform(3, 40, NUM)
     height = ranges * np.tan(np.radians(ring - 25.0))
     xyz = [ranges * np.cos(azimuth), ranges * np.sin(azimuth), height]
-    more = [rng.integers(0, 255, NUM), ring, np.linspace(0, 0.1, NUM), rng.normal(900, 90, NUM), rng.integers(0, 9, NUM)]
+    more = [
+        rng.integers(0, 255, NUM),
+        ring,
+        np.linspace(0, 0.1, NUM),
+        rng.normal(900, 90, NUM),
+        rng.integers(0, 9, NUM),
+    ]
     return np.stack([*xyz, *more], axis=1).astype("<f4")
 
 
