@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from typing import Any
@@ -26,6 +26,10 @@ STATE = "run_state.npz"
 SAVE_EVERY_S = 10.0
 # Seconds between interim results.
 FLUSH_EVERY_S = 30.0
+# End of the names of stages that run in the thread of the next scan.
+AHEAD = " ahead"
+# A scan as it was read, and as it is placed.
+_Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
 _STAGES = {
     "thin": "thinning",
     **dict.fromkeys(("align", "search"), "odometry"),
@@ -51,6 +55,11 @@ class Stopwatch:
         finally:
             self.stages_s[stage] += self.now_s() - started
 
+    def count_rest(self, run_s: float) -> None:
+        """Counts the seconds that no stage has; stages ahead run at the same time as others."""
+        counted = (seconds for stage, seconds in self.stages_s.items() if not stage.endswith(AHEAD))
+        self.stages_s["rest"] = run_s - sum(counted)
+
     def now_s(self) -> float:
         """Returns the time of a clock that stands still during compilation."""
         return time.perf_counter() - self.compile_s
@@ -66,14 +75,15 @@ class Timed:
     Args:
         wrapped: the matcher or the geometry.
         watch: counts.
+        suffix: of the names of the stages.
     """
 
-    def __init__(self, wrapped: Any, watch: Stopwatch) -> None:
-        self._wrapped, self._watch = wrapped, watch
+    def __init__(self, wrapped: Any, watch: Stopwatch, suffix: str = "") -> None:
+        self._wrapped, self._watch, self._suffix = wrapped, watch, suffix
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._wrapped, name)
-        return partial(self._watch.timed, _STAGES[name], found) if name in _STAGES else found
+        return partial(self._watch.timed, _STAGES[name] + self._suffix, found) if name in _STAGES else found
 
 
 def find_beginning(folder: RunFolder, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
@@ -133,19 +143,14 @@ def run_scans(
     Returns:
         The run.
     """
-    watch, ahead, sequence = Stopwatch(), Stopwatch(), reader.sequence
-    timed, timed_ahead = _timed(methods, watch), _timed(methods, ahead)
+    watch, sequence = Stopwatch(), reader.sequence
+    timed = _timed(methods, watch)
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
     first, failure, started = len(reports), None, watch.now_s()
     flushed = saved = time.perf_counter()
     resumable: RunState | None = None
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
-
-    def read(index: int) -> tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]:
-        scan = reader(index)
-        return scan, slam.prepare_ahead(timed_ahead, scan)
-
-    with progress as bar, closing(in_advance(read, range(first, len(sequence)))) as scans:
+    with progress as bar, closing(_prepared_scans(reader, _timed(methods, watch, AHEAD), first)) as scans:
         try:
             for _ in range(first, len(sequence)):
                 if is_stopped():
@@ -173,13 +178,23 @@ def run_scans(
             if resumable is not None:
                 watch.timed("write", save_state, folder / STATE, *resumable)
     run_s = watch.now_s() - started
-    watch.stages_s["rest"] = run_s - sum(watch.stages_s.values())
-    stages_s = {**watch.stages_s, **{f"{stage} ahead": seconds for stage, seconds in ahead.stages_s.items()}}
-    return SlamRun(state, tuple(reports), stages_s, watch.compile_s, run_s, tuple(scan_s), failure)
+    watch.count_rest(run_s)
+    return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
 
 
-def _timed(methods: slam.SlamMethods, watch: Stopwatch) -> slam.SlamMethods:
-    return methods._replace(matcher=Timed(methods.matcher, watch), geometry=Timed(methods.geometry, watch))
+def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -> Generator[_Prepared, None, None]:
+    """Reads and prepares each scan while the caller works on the one before."""
+
+    def prepare(index: int) -> _Prepared:
+        scan = reader(index)
+        return scan, slam.prepare_ahead(methods, scan)
+
+    return in_advance(prepare, range(first, len(reader.sequence)))
+
+
+def _timed(methods: slam.SlamMethods, watch: Stopwatch, suffix: str = "") -> slam.SlamMethods:
+    matcher, geometry = (Timed(part, watch, suffix) for part in (methods.matcher, methods.geometry))
+    return methods._replace(matcher=matcher, geometry=geometry)
 
 
 def write_interim(
