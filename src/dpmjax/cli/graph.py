@@ -23,7 +23,6 @@ from dpmjax import io, pose_graph, viz
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import report_notes
 from dpmjax.cli.run_folder import OutputOptions, open_run_folder, recording, write_metrics
-from dpmjax.pose_graph.graph import label_parts
 from dpmjax.sequences import InputError, Note
 
 NAME = "graph"
@@ -85,6 +84,8 @@ def main(config: Config) -> dict[str, Any]:
 
 def notes_on_parts(path: Path, graph: pose_graph.PoseGraph) -> tuple[Note, ...]:
     """Returns a note on a graph whose edges, those with any information, do not join all nodes."""
+    from dpmjax.pose_graph.graph import label_parts
+
     source, target, _, information = graph.edges
     has_any = information.any(axis=(1, 2))
     sizes = np.bincount(label_parts(len(graph.poses), source[has_any], target[has_any]))
