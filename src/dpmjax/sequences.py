@@ -5,17 +5,14 @@ NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 FloatArray = NDArray[np.float64]
 Unit = Literal["px", "m"]
 BoolArray = NDArray[np.bool_]
@@ -53,27 +50,6 @@ class Note(NamedTuple):
 
     text: str
     is_doubt: bool = False
-
-
-def in_advance(work: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
-    """Works on each item in a thread, the next one while the caller uses this one.
-
-    Args:
-        work: called with one item after another.
-        items: the items, taken one ahead by the thread of the caller.
-
-    Yields:
-        The results, in order; an error of the work is raised in place of its result.
-    """
-    with ThreadPoolExecutor(1) as pool:
-        done: Future[Result] | None = None
-        for item in items:
-            begun = pool.submit(work, item)
-            if done is not None:
-                yield done.result()
-            done = begun
-        if done is not None:
-            yield done.result()
 
 
 def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: str) -> None:

@@ -19,7 +19,7 @@ from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.slam_files import accepted_ends, write_scans, write_trajectory
 from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.saved_maps import RunState, load_state, save_state
-from dpmjax.sequences import LidarSequence, in_advance
+from dpmjax.sequences import LidarSequence
 
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
@@ -189,7 +189,7 @@ def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -
         scan = reader(index)
         return scan, slam.prepare_ahead(methods, scan)
 
-    return in_advance(prepare, range(first, len(reader.sequence)))
+    return slam.in_advance(prepare, range(first, len(reader.sequence)))
 
 
 def _timed(methods: slam.SlamMethods, watch: Stopwatch, suffix: str = "") -> slam.SlamMethods:
@@ -219,15 +219,13 @@ def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[Callab
     if not is_on:
         yield None
         return
-    from dpmjax.slam.front_end import corrected_points
-
     viewer = viz.LiveViewer(name, folder / "slam.rrd")
 
     def show(scan: Any, state: slam.SlamState, report: slam.ScanReport) -> None:
         T_world_keyframe = state.slam_map.T_world_keyframe
         if not len(T_world_keyframe):
             return
-        points = corrected_points(scan, report.T_turn)
+        points = slam.corrected_points(scan, report.T_turn)
         viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
         if report.is_keyframe:
             positions = T_world_keyframe[accepted_ends(state.loops.loops), :3, 3]

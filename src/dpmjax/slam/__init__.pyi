@@ -11,9 +11,7 @@ from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
 from .config import SlamConfig as SlamConfig
 from .config import slam_preset as slam_preset
-from .front_end import PreparedInput as PreparedInput
 from .front_end import ScanReport as ScanReport
-from .front_end import TimedScan as TimedScan
 from .interfaces import Alignment as Alignment
 from .interfaces import Geometry as Geometry
 from .interfaces import Match as Match
@@ -39,12 +37,16 @@ from .map_thinning import thin_map as thin_map
 from .matcher import NetworkMatcher as NetworkMatcher
 from .matcher import pooled_vector as pooled_vector
 from .odometry import SurfaceGeometry as SurfaceGeometry
+from .scan_input import PreparedInput as PreparedInput
+from .scan_input import TimedScan as TimedScan
+from .scan_input import corrected_points as corrected_points
+from .scan_input import in_advance as in_advance
+from .scan_input import prepare_ahead as prepare_ahead
 from .system import SlamResult as SlamResult
 from .system import SlamState as SlamState
 from .system import finish_slam as finish_slam
 from .system import init_slam as init_slam
 from .system import make_methods as make_methods
 from .system import place_scans as place_scans
-from .system import prepare_ahead as prepare_ahead
 from .system import run_slam as run_slam
 from .system import step_slam as step_slam

@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.scans.corrections import deskew
 from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan, best_of
 from dpmjax.slam.keyframes import (
     Keyframe,
@@ -37,7 +36,7 @@ from dpmjax.slam.local_map import (
     placed_scan,
     with_scan,
 )
-from dpmjax.types import AnyArray
+from dpmjax.slam.scan_input import PreparedInput
 
 # Turn between keyframes at a smaller distance.
 KEYFRAME_RAD = 0.6
@@ -147,37 +146,6 @@ class FrontEndState(NamedTuple):
         return float(np.median(self.scores)) if self.scores else 1.0
 
 
-class TimedScan(NamedTuple):
-    """A raw scan with the time of each point, to be deskewed by the predicted motion.
-
-    Attributes:
-        points: (n, 3) metres, each in the frame of the lidar at its own moment.
-        offsets: (n,) times since the scan's pose, as shares of the time between scans; see `scans.deskew`.
-    """
-
-    points: Float[AnyArray, "n 3"]
-    offsets: Float[AnyArray, " n"]
-
-
-AnyScan = Float[AnyArray, "_n 3"] | TimedScan
-
-
-class PreparedInput(NamedTuple):
-    """A scan after the work that needs no map.
-
-    Attributes:
-        num_points: number of points of the raw scan.
-        thinned: the thinned scan; None if it is empty.
-        T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
-        compact: the encoded scan; None where it was not encoded.
-    """
-
-    num_points: int
-    thinned: ThinnedScan | None
-    T_turn: Pose | None = None
-    compact: CompactScan | None = None
-
-
 class Located(NamedTuple):
     """Pose of a scan in the frame of the last keyframe, and the inputs of a new keyframe.
 
@@ -234,46 +202,6 @@ def place_scan(
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
     return after, slam_map, report
-
-
-def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> PreparedInput:
-    """Does the work on a scan that needs no map: thins it, and encodes it where each scan is encoded.
-
-    Args:
-        methods: matcher, geometry, settings.
-        scan: points in metres, in the frame of the lidar, perhaps with times.
-        T_turn: predicted motion, by which a scan with times is deskewed; None for a scan without times.
-
-    Returns:
-        The prepared scan.
-
-    Raises:
-        ValueError: if the shape is not (n, 3).
-    """
-    points = scan.points if isinstance(scan, TimedScan) else scan
-    if len(np.shape(points)) != 2 or np.shape(points)[1] != 3:
-        raise ValueError(f"scan: expected shape (n, 3), got {np.shape(points)}")
-    thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
-    if thinned is not None and methods.config.odometry.proposer == "network":
-        compact = methods.matcher.encode(thinned)
-    return PreparedInput(len(points), thinned, T_turn, compact)
-
-
-def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
-    """Returns the finite points of a scan, and undoes the motion of the lidar where the scan has times.
-
-    Args:
-        scan: points in metres, in the frame of the lidar, perhaps with times.
-        T_turn: motion from one scan to the next; None leaves the points unchanged.
-
-    Returns:
-        The points.
-    """
-    points = np.asarray(scan.points if isinstance(scan, TimedScan) else scan)
-    is_finite = np.isfinite(points).all(axis=1)
-    if not isinstance(scan, TimedScan) or T_turn is None:
-        return points[is_finite]
-    return deskew(points[is_finite], np.asarray(scan.offsets)[is_finite], T_turn)
 
 
 class _Attempt(NamedTuple):

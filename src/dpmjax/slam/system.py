@@ -12,10 +12,9 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
-from dpmjax.sequences import in_advance
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.front_end import AnyScan, FrontEndState, PreparedInput, ScanReport, TimedScan, prepare_input
+from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
@@ -23,6 +22,7 @@ from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.matcher import NetworkMatcher
 from dpmjax.slam.odometry import SurfaceGeometry
+from dpmjax.slam.scan_input import AnyScan, PreparedInput, TimedScan, in_advance, prepare_ahead, prepare_input
 
 
 class SlamState(NamedTuple):
@@ -117,22 +117,6 @@ def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
     if slam_map is None or len(slam_map) == 0:
         return SlamState(FrontEndState(), KeyframeMap(), LoopState())
     return SlamState(FrontEndState(num_scans=slam_map.keyframes[-1].scan + 1), slam_map, loops_of_map(slam_map))
-
-
-def prepare_ahead(methods: SlamMethods, scan: AnyScan) -> PreparedInput | TimedScan:
-    """Prepares a scan before those in front of it have poses, for instance in another thread.
-
-    Args:
-        methods: methods from `make_methods`.
-        scan: see `step_slam`.
-
-    Returns:
-        The input of `step_slam`; a scan with times is unchanged, because the motion before it is not known yet.
-
-    Raises:
-        ValueError: if the shape is not (n, 3).
-    """
-    return scan if isinstance(scan, TimedScan) else prepare_input(methods, scan)
 
 
 def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedInput) -> tuple[SlamState, ScanReport]:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from dpmjax.sequences import in_advance
+from dpmjax.slam import in_advance
 
 
 @pytest.mark.parametrize("num", [0, 1, 5])
