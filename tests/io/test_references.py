@@ -203,6 +203,13 @@ def test_a_stray_map_is_named_and_left_out(folder: Path) -> None:
     assert strays_among([Path("a.pcd"), Path("b.pcd"), Path("c1.pcd")]) == []
 
 
+def test_scans_of_two_lidars_in_one_folder_are_named(folder: Path) -> None:
+    for file in sorted(folder.glob("*.pcd"))[:2]:
+        file.rename(file.with_name(f"left_{file.name}"))
+    (note,) = (note.text for note in open_lidar_sequence(folder).notes if "kinds" in note.text)
+    assert f"names of 2 kinds, {NUM - 2} *, 2 left_*;" in note
+
+
 @pytest.mark.parametrize("suffix", [".npy", ".bin", ".npz"])
 @pytest.mark.parametrize("num", [2, NUM])
 def test_labels_beside_scans_are_left_out_and_named(folder: Path, suffix: str, num: int) -> None:

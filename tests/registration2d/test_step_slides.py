@@ -82,6 +82,10 @@ def test_odometry_is_calibrated_by_the_clear_steps(scans, truth, odometry) -> No
     assert (found.prior.deviations[:, 0] < 5.0).all()
 
 
+def turned(poses, angle: float):
+    return np.column_stack([poses[:, :2], poses[:, 2] + angle])
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [
@@ -89,6 +93,9 @@ def test_odometry_is_calibrated_by_the_clear_steps(scans, truth, odometry) -> No
         (lambda poses: np.column_stack([poses[:, :2], np.degrees(poses[:, 2])]), "degrees"),
         (lambda poses: poses * [1000.0, 1000.0, 1.0], "millimetres"),
         (lambda poses: poses * [100.0, 100.0, 1.0], "centimetres"),
+        (lambda poses: turned(poses, -np.pi), "backwards"),
+        (lambda poses: turned(poses, -np.pi / 2), "to the left"),
+        (lambda poses: turned(poses, np.pi / 2), "to the right"),
     ],
 )
 def test_faults_of_the_odometry_are_named_and_corrected(scans, odometry, change, word: str) -> None:

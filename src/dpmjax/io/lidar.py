@@ -23,7 +23,7 @@ from dpmjax.io.lidar_file import read_point_times, read_timed_cloud, with_unit_d
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
 from dpmjax.io.scan_bags import open_lidar_bag
-from dpmjax.io.scan_names import scan_files, stray_note
+from dpmjax.io.scan_names import folder_note, scan_files
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
 _FORMATS = (
@@ -90,7 +90,7 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     drive = _read(path, poses)
     files = drive.files
     require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    notes: list[Note | None] = [stray_note(files[0].parent), *drive.notes]
+    notes: list[Note | None] = [folder_note(files[0].parent), *drive.notes]
     if bin_columns is None:
         bin_columns, note = columns_of_drive(files)
         notes.append(note)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ _FRACTION, _SPLIT_STAMP = re.compile(r"(\d{10,})\.(\d+)"), re.compile(r"(?<!\d)(
 # Least ratio of the spreads of the steps of stamps of which one reading is wrong.
 _LEAST_SPREAD_RATIO = 2.0
 _LEAST_NUMBERED = 3
+# Number of listed kinds of names.
+_NUM_KINDS = 4
 
 
 def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
@@ -35,15 +38,15 @@ def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[
         suffixes: endings of scans.
 
     Returns:
-        The files, without those that `stray_note` names; none where there is no such folder.
+        The files, without those that `folder_note` names; none where there is no such folder.
     """
     most = _files_of_one_ending(folder, suffixes)
     strays = strays_among(most)
     return sort_scans([file for file in most if file not in strays])
 
 
-def stray_note(folder: Path) -> Note | None:
-    """Lists the files of a folder with endings of scans that are not read: of rarer endings, or such as map.pcd.
+def folder_note(folder: Path) -> Note | None:
+    """Names files that are not read, of rarer endings or such as map.pcd, and scans whose names are of several kinds.
 
     Args:
         folder: folder of the scans.
@@ -52,14 +55,20 @@ def stray_note(folder: Path) -> Note | None:
         The note, or None.
     """
     most = _files_of_one_ending(folder, SCAN_SUFFIXES)
-    read, left_out = {file.suffix.lower() for file in most}, []
-    if strays := strays_among(most):
-        left_out.append(f"{strays[0].name} is no scan, as its name has no number; {len(strays)} such left out")
+    strays, doubts = strays_among(most), []
+    read = {file.suffix.lower() for file in most}
+    if strays:
+        doubts.append(f"{strays[0].name} is no scan, as its name has no number; {len(strays)} such left out")
+    kinds = collections.Counter(_NUMBER.sub("*", _stem_of(file)) for file in most if file not in strays)
+    counts = [f"{count} {kind}" for kind, count in sorted(kinds.items()) if count > 1]
+    if len(counts) > 1:
+        listed = ", ".join(counts[:_NUM_KINDS])
+        doubts.append(f"names of {len(counts)} kinds, {listed}; give each lidar, and each drive, its own folder")
     for suffix in SCAN_SUFFIXES:
         others = _files_of_one_ending(folder, (suffix,))
         if others and suffix not in read:
-            left_out.append(f"{len(others)} {suffix} left out beside {len(most)} {most[0].suffix}")
-    return Note(f"{folder}: {', '.join(left_out)}", is_doubt=True) if left_out else None
+            doubts.append(f"{len(others)} {suffix} left out beside {len(most)} {most[0].suffix}")
+    return Note(f"{folder}: {'; '.join(doubts)}", is_doubt=True) if doubts else None
 
 
 def _files_of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

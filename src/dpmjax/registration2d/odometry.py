@@ -38,6 +38,10 @@ _FAULT_SHARE, _SOUND_SHARE = 0.7, 0.4
 _SCALES, _CLEAR_SCALE = (0.7, 1.4), 4.0
 
 
+def _turned(poses: Floats, angle: float) -> Floats:
+    return np.column_stack([poses[:, :2], se2.wrap_angle(poses[:, 2] + angle)])
+
+
 def _turned_in_degrees(poses: Floats) -> Floats:
     return np.column_stack([poses[:, :2], se2.wrap_angle(np.radians(poses[:, 2]))])
 
@@ -45,8 +49,12 @@ def _turned_in_degrees(poses: Floats) -> Floats:
 MIRRORED = (
     "the scans are mirrored against the odometry: the beams are in reversed order, or one y axis points to the right"
 )
+# The first of equal ones counts.
 _FAULTS: dict[str, Callable[[Floats], Floats]] = {
     MIRRORED: lambda poses: poses * [1.0, -1.0, -1.0],
+    "the sensor looks backwards: the odometry moves against the scans": lambda poses: _turned(poses, np.pi),
+    "the sensor looks to the left of the odometry's heading": lambda poses: _turned(poses, np.pi / 2),
+    "the sensor looks to the right of the odometry's heading": lambda poses: _turned(poses, -np.pi / 2),
     "the headings of the odometry are degrees, not radians": _turned_in_degrees,
     "the odometry is in millimetres": lambda poses: poses * [1e-3, 1e-3, 1.0],
     "the odometry is in centimetres": lambda poses: poses * [1e-2, 1e-2, 1.0],
