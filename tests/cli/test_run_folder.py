@@ -168,6 +168,9 @@ def test_the_file_names_the_rows_of_other_commits(monkeypatch):
         "1 of aaaaaaaaaa (icp); 1 of unknown (swarm)"
     )
     assert commits_note(first, "a" * 40) is None
+    # Rows that summarise others carry no commit.
+    assert write_metrics(run, {}, seed=0, rows=rows, table=[{"num_rows": 3}]) == note
+    assert json.loads((run / "metrics.json").read_text())["rows"] == [{"num_rows": 3}]
 
 
 def test_a_failed_row_leaves_no_file_and_no_two_cases_share_one():

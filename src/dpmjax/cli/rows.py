@@ -93,7 +93,7 @@ def run_table(
         summary = report(rows) if rows else Summary({}, "no row is finished")
         # Numbers come before pictures, so that they are written even if a picture fails.
         metrics = {**summary.numbers, "is_interrupted": stop.is_requested}
-        note = write_metrics(folder, metrics, seed=config.seed, rows=rows if summary.rows is None else summary.rows)
+        note = write_metrics(folder, metrics, seed=config.seed, rows=rows, table=summary.rows)
         write_atomically(folder / "table.md", summary.text + (f"\n\n{note}.\n" if note else "\n"))
         print(summary.text)
         if summary.write_more is not None:

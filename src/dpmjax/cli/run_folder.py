@@ -217,6 +217,7 @@ def write_metrics(
     *,
     seed: int | None = None,
     rows: Sequence[Mapping[str, Any]] | None = None,
+    table: Sequence[Mapping[str, Any]] | None = None,
 ) -> str | None:
     """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine.
 
@@ -225,15 +226,16 @@ def write_metrics(
         metrics: numbers by name.
         seed: seed of the run; None where nothing is random.
         rows: rows made by `do_row`; the file names those of another commit than its own.
+        table: rows of the file; None: those of `do_row`.
 
     Returns:
         The note about such rows, or None where all rows are of this commit.
     """
     made_by = environment()
     note = commits_note(rows or (), made_by["git_hash"])
-    table = {} if rows is None else {"note": note, "rows": rows}
+    noted_rows = {} if rows is None else {"note": note, "rows": rows if table is None else table}
     seeds = {} if seed is None else {"seed": seed}
-    write_json(folder / METRICS, {**metrics, **seeds, **made_by, **table})
+    write_json(folder / METRICS, {**metrics, **seeds, **made_by, **noted_rows})
     return note
 
 
