@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import (
     Alignment,
     LocalMap,
+    Proposal,
     SlamConfig,
     SlamMethods,
     SlamResult,
@@ -300,11 +301,11 @@ class CountingMatcher(TruthMatcher):
         return super().propose(source, target, num_motions)
 
 
-def test_networks_run_for_keyframes_alone_where_the_prediction_is_right() -> None:
+def test_networks_run_for_the_first_scans_and_keyframes_alone_where_the_prediction_is_right() -> None:
     truth = np.array([pose(float(number), 0.0, 0.0) for number in range(40)])
     result = run(truth, matcher=CountingMatcher(truth, gross_share=0.0), config=without_loops())
-    assert CountingMatcher.proposed == [1]
-    assert CountingMatcher.encoded == sorted({1, *result.keyframes.tolist()})
+    assert CountingMatcher.proposed == [*range(1, 11)]
+    assert CountingMatcher.encoded == sorted({*range(1, 11), *result.keyframes.tolist()})
 
 
 def test_a_scan_where_nothing_agrees_is_predicted() -> None:
@@ -376,6 +377,40 @@ def test_a_fast_drive_of_sparse_scans_starts_though_the_network_is_unsure() -> N
     matcher = UnsureMatcher(truth, gross_share=0.0)
     result = run(truth, matcher=matcher, geometry=SparseGeometry(truth))
     assert "predicted" not in {report.status for report in result.reports}
+
+
+@dataclass(frozen=True)
+class LookAlikeMatcher(TruthMatcher):
+    """Proposes a pose that only looks like the place, and knows that it may be wrong."""
+
+    T_true_found: np.ndarray = field(default_factory=lambda: np.eye(4))
+    probability: float = 0.3
+
+    def propose(self, source, target, num_motions):
+        T = rigid.inverse(self.T_world_scan[number_of(target)]) @ self.T_world_scan[number_of(source)]
+        # The second scan has nothing but the decoder.
+        T = T if number_of(source) == 1 else T @ self.T_true_found
+        return Proposal(T[None], self.probability)
+
+
+class LookAlikeGeometry(TruthGeometry):
+    """A scan fits everywhere, and best at the pose that looks alike."""
+
+    def search(self, local_map, scan, T_map_scan):
+        found = super().search(local_map, scan, T_map_scan)
+        off = rigid.inverse(found.T_map_scan) @ T_map_scan[0]
+        is_other = bool(np.linalg.norm(off[:3, 3]) > 2.0 or off[0, 0] < 0.0)
+        return found._replace(T_map_scan=T_map_scan[0], score=0.99) if is_other else found._replace(score=0.6)
+
+
+@pytest.mark.parametrize("T_true_found", [pose(0.0, 0.0, np.pi), pose(3.0, 2.0, 0.0)], ids=["turned", "elsewhere"])
+@pytest.mark.parametrize(("probability", "is_moved"), [(0.3, False), (0.9, True)])
+def test_a_pose_that_looks_alike_needs_a_sure_decoder(T_true_found, probability, is_moved) -> None:
+    truth = np.array([pose(0.5 * number, 0.0, 0.0) for number in range(8)])
+    matcher = LookAlikeMatcher(truth, T_true_found=T_true_found, probability=probability)
+    result = run(truth, matcher=matcher, geometry=LookAlikeGeometry(truth), config=without_loops())
+    off = np.linalg.norm(result.T_world_scan - truth, axis=(1, 2)).max()
+    assert (off > 1.5) == is_moved
 
 
 def test_the_settings_of_the_paper_ask_the_network_for_every_scan() -> None:

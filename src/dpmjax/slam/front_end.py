@@ -53,17 +53,18 @@ NUM_HYPOTHESES = 3
 # Share of the usual score above which no other start is tried.
 GOOD_SHARE = 0.85
 
-# Largest distance between two poses of one place.
-NEAR_M = 2.0
+# Largest distance and turn between two poses of one place.
+PLACE_M, PLACE_RAD = 2.0, 0.8
 
 # Largest turn between the decoder's motion and the pose that it confirms.
-NEAR_RAD = 0.087
+CONFIRMED_RAD = 0.087
 
 # Least lead in score with which the pose by the decoder replaces a pose of another place.
-MIN_MARGIN = 0.1
+MIN_LEAD = 0.1
 
-# Number of scans whose median is the usual score.
-USUAL_WINDOW = 20
+# Number of scans whose median is the usual score, and of those before which the decoder proposes every pose: a wrong
+# pose among the first scans makes low scores usual.
+USUAL_WINDOW, NUM_USUAL = 20, 10
 
 # Standard deviation of a predicted translation.
 GUESS_M = 1.0
@@ -226,7 +227,7 @@ def _locate(
     best, probability = tried.best, tried.probability
     # A new part has no usual score yet, and sparse scans never score high.
     wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
-    is_far = not are_near(state.predicted, best.T_map_scan, NEAR_M, np.inf)
+    is_far = not are_near(state.predicted, best.T_map_scan, PLACE_M, PLACE_RAD)
     if is_far and state.scores and (probability or 0.0) < config.min_probability:
         # A motion that neither the last motion nor the decoder supports needs the usual score.
         wanted = GOOD_SHARE * usual
@@ -265,11 +266,11 @@ def _attempt(
     geometry, predicted = methods.geometry, state.predicted
     is_predicted = methods.config.odometry.proposer == "prediction"
     good_score = GOOD_SHARE * state.usual_score
+    tracked = None
     # The second scan of a drive has no last motion.
-    has_motion, tracked = len(state.scores) > 0, None
-    if is_predicted and has_motion:
+    if is_predicted and state.scores:
         tracked = geometry.align(local_map, scan, predicted)
-        if tracked.score >= good_score:
+        if tracked.score >= good_score and len(state.scores) >= NUM_USUAL:
             return _Attempt(tracked, tracked)
     compact = methods.matcher.encode(scan) if compact is None else compact
     row = nearest_keyframe(local_map, predicted[:3, 3])
@@ -282,11 +283,20 @@ def _attempt(
         if matched.score < good_score:
             others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
             tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
-        # Another place must fit better by a margin; nothing supports the prediction before any motion is known.
-        is_same = are_near(tracked.T_map_scan, matched.T_map_scan, NEAR_M, np.inf)
-        if matched.score <= tracked.score + (0.0 if is_same or not has_motion else MIN_MARGIN):
+        if matched.score <= tracked.score + _needed_lead(methods, state, tracked, matched, proposal.probability):
             best = tracked
     return _Attempt(best, tracked, starts[0], proposal.probability, compact)
+
+
+def _needed_lead(
+    methods: SlamMethods, state: FrontEndState, tracked: Alignment, matched: Alignment, probability: float
+) -> float:
+    """Returns the lead in score that the decoder's pose needs over that from the prediction."""
+    # Nothing supports the prediction before any motion is known.
+    if not state.scores or are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
+        return 0.0
+    # Symmetric places fit at other poses, too: an unsure decoder does not move a scan there.
+    return MIN_LEAD if probability >= methods.config.front_end.min_probability else np.inf
 
 
 def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
@@ -294,7 +304,7 @@ def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
     if tried.tracked is None or tried.T_map_scan is None or (tried.probability or 0.0) < min_probability:
         return False
     ends = (tried.tracked.T_map_scan, tried.T_map_scan)
-    are_equal = all(are_near(T, tried.best.T_map_scan, NEAR_M, NEAR_RAD) for T in ends)
+    are_equal = all(are_near(T, tried.best.T_map_scan, PLACE_M, CONFIRMED_RAD) for T in ends)
     return are_equal and tried.best.score >= MIN_SCORE
 
 
