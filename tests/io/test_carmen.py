@@ -135,6 +135,14 @@ def test_newer_lines_tell_their_angles_and_the_pose_of_the_laser(tmp_path):
     np.testing.assert_array_equal(log.times, [1, 2, 3])
 
 
+def test_the_lines_of_a_second_laser_are_named(tmp_path, caplog):
+    newer = robotlaser([3, 3, 3], (0, 0, 0), (0, 0, 0), 2.0)
+    log = write(tmp_path, flaser([1, 2, 3], time=1.0), newer, newer)
+    with caplog.at_level(logging.WARNING):
+        assert read_carmen_log(log).points.shape[0] == 1
+    assert "ROBOTLASER1 lines are left out" in caplog.text
+
+
 def test_corrected_newer_lines_have_reference_and_odometry(tmp_path):
     lines = [robotlaser([1, 2, 3], (i, 0.1 * i * i, 0), (i, 0, 0), 1.0 + i) for i in range(3)]
     log = read_carmen_log(write(tmp_path, *lines))

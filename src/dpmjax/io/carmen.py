@@ -83,6 +83,8 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     is_newer = not lines["FLASER"]
     found, parse = (lines["ROBOTLASER1"], _parse_newer) if is_newer else (lines["FLASER"], _parse_older)
     require(len(found) > 0, path, "no FLASER and no ROBOTLASER1 line", "give a CARMEN log of a front laser")
+    if not is_newer and lines["ROBOTLASER1"]:
+        _log.warning("%s: only its FLASER lines are read, its ROBOTLASER1 lines are left out", path)
     scans = [parse(words, f"{path}:{number}") for number, words in found]
     largest = max(float(scan.ranges.max()) for scan in scans)
     limit = largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
