@@ -413,6 +413,21 @@ def test_a_pose_that_looks_alike_needs_a_sure_decoder(T_true_found, probability,
     assert (off > 1.5) == is_moved
 
 
+class HollowGeometry(TruthGeometry):
+    """Scans of so few walls that a right pose meets no plane."""
+
+    def search(self, local_map, scan, T_map_scan):
+        return super().search(local_map, scan, T_map_scan)._replace(score=-0.1)
+
+
+@pytest.mark.parametrize(("probability", "is_placed"), [(0.95, True), (0.85, False)])
+def test_only_a_sure_decoder_places_scans_that_meet_no_plane(probability, is_placed) -> None:
+    truth = laps(1, side_m=20.0)
+    matcher = LookAlikeMatcher(truth, probability=probability)
+    result = run(truth, range(30), matcher=matcher, geometry=HollowGeometry(truth), config=without_loops())
+    assert ("predicted" not in {report.status for report in result.reports}) == is_placed
+
+
 def test_the_settings_of_the_paper_ask_the_network_for_every_scan() -> None:
     paper = slam_preset("paper")
     assert slam_preset("default") == SlamConfig()

@@ -59,6 +59,9 @@ PLACE_M, PLACE_RAD = 2.0, 0.8
 # Largest turn between the decoder's motion and the pose that it confirms.
 CONFIRMED_RAD = 0.087
 
+# Smallest P(correct) of a decoder's motion that is accepted at any score: few elements of sparse scans meet planes.
+SURE_PROBABILITY = 0.9
+
 # Least lead in score with which the pose by the decoder replaces a pose of another place.
 MIN_LEAD = 0.1
 
@@ -265,7 +268,7 @@ def _attempt(
     """Aligns from the prediction and from the decoder's motions, in the order that the configuration names."""
     geometry, predicted = methods.geometry, state.predicted
     is_predicted = methods.config.odometry.proposer == "prediction"
-    good_score = GOOD_SHARE * state.usual_score
+    good_score = max(MIN_SCORE, GOOD_SHARE * state.usual_score)
     tracked = None
     # The second scan of a drive has no last motion.
     if is_predicted and state.scores:
@@ -300,12 +303,15 @@ def _needed_lead(
 
 
 def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
-    """Returns True where the decoder alone and the alignment from other starts end at the same pose."""
-    if tried.tracked is None or tried.T_map_scan is None or (tried.probability or 0.0) < min_probability:
+    """Returns True where the decoder is sure of the pose, or where it and the alignment from other starts end there."""
+    best, probability = tried.best, tried.probability or 0.0
+    if tried.T_map_scan is None or not are_near(tried.T_map_scan, best.T_map_scan, PLACE_M, CONFIRMED_RAD):
         return False
-    ends = (tried.tracked.T_map_scan, tried.T_map_scan)
-    are_equal = all(are_near(T, tried.best.T_map_scan, PLACE_M, CONFIRMED_RAD) for T in ends)
-    return are_equal and tried.best.score >= MIN_SCORE
+    if probability >= SURE_PROBABILITY:
+        return True
+    if tried.tracked is None or probability < min_probability or best.score < MIN_SCORE:
+        return False
+    return are_near(tried.tracked.T_map_scan, best.T_map_scan, PLACE_M, CONFIRMED_RAD)
 
 
 def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: ThinnedScan) -> bool:
