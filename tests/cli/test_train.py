@@ -153,6 +153,7 @@ def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(t
     weights = load_model("dpm_small")
     settings = training_settings(Config(weights="dpm_small"), weights)
     assert settings.model == replace(weights.config, calibration=None, overlap=None)
+    assert settings.learning_rate == pytest.approx(0.2 * training_settings(Config()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)

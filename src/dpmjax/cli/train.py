@@ -41,6 +41,8 @@ NAME = "train"
 MODEL = "model.safetensors"
 # Largest number of listed damaged scans; further ones are only counted.
 MAX_LISTED = 10
+# Share of the learning rate at which trained weights are tuned: at the full rate they forget pairs far apart.
+TUNING_SHARE = 0.2
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
 
@@ -67,7 +69,8 @@ class Config(ProcessOptions):
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """Go on from these weights, whose network takes the place of that of the preset; without it, from random ones."""
+    """Go on from these weights at a fifth of the learning rate; their network takes the place of that of the preset.
+    Without it, begin from random ones."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2)."""
     frame: Literal["lidar", "bearing", "local"] | None = None
@@ -169,7 +172,8 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
     """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
     settings = deeppointmap.training_preset(config.preset)
     if first is not None:
-        settings = replace(settings, model=replace(first.config, calibration=None, overlap=None))
+        model = replace(first.config, calibration=None, overlap=None)
+        settings = replace(settings, model=model, learning_rate=TUNING_SHARE * settings.learning_rate)
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
