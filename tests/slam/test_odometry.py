@@ -81,7 +81,9 @@ def test_a_scan_finds_its_pose_from_a_guess_that_is_nearly_right(geometry, room,
     assert found.score > 0.5
 
 
-@pytest.mark.parametrize(("x", "y", "heading_deg"), [(1.0, -0.2, -20.0), (0.0, 0.0, 35.0), (1.5, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("x", "y", "heading_deg"), [(1.0, -0.2, -20.0), (0.0, 0.0, 35.0), (1.5, 0.0, 0.0), (0.0, 0.0, 170.0)]
+)
 def test_a_scan_finds_its_pose_among_other_motions(geometry, room, x, y, heading_deg) -> None:
     true = motion(x, y, heading_deg)
     scan = geometry.thin(seen_from(planes(np.random.default_rng(1)), true))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan, best_of
+from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframes import (
     Keyframe,
     KeyframeMap,
@@ -62,8 +62,9 @@ CONFIRMED_RAD = 0.087
 # Smallest P(correct) of a decoder's motion that is accepted at any score: few elements of sparse scans meet planes.
 SURE_PROBABILITY = 0.9
 
-# Least lead in score with which the pose by the decoder replaces a pose of another place.
-MIN_LEAD = 0.1
+# Least lead in score with which a pose replaces the tracked one of another place; for the pose of an unsure decoder it
+# is this share of the usual score.
+MIN_LEAD, UNSURE_LEAD_SHARE = 0.1, 0.5
 
 # Number of scans whose median is the usual score, and of those before which the decoder proposes every pose: a wrong
 # pose among the first scans makes low scores usual.
@@ -285,21 +286,18 @@ def _attempt(
     if tracked is not None:
         if matched.score < good_score:
             others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
-            tracked = best_of([tracked, geometry.search(local_map, scan, orthonormal(others))])
-        if matched.score <= tracked.score + _needed_lead(methods, state, tracked, matched, proposal.probability):
-            best = tracked
+            tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
+        # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
+        is_sure = proposal.probability >= methods.config.front_end.min_probability
+        lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
+        best = _better_of(tracked, matched, lead if state.scores else 0.0)
     return _Attempt(best, tracked, starts[0], proposal.probability, compact)
 
 
-def _needed_lead(
-    methods: SlamMethods, state: FrontEndState, tracked: Alignment, matched: Alignment, probability: float
-) -> float:
-    """Returns the lead in score that the decoder's pose needs over that from the prediction."""
-    # Nothing supports the prediction before any motion is known.
-    if not state.scores or are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
-        return 0.0
-    # Symmetric places fit at other poses, too: an unsure decoder does not move a scan there.
-    return MIN_LEAD if probability >= methods.config.front_end.min_probability else np.inf
+def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
+    """Returns the other alignment where it scores higher than the tracked one, at another place higher by a lead."""
+    is_same = are_near(tracked.T_map_scan, other.T_map_scan, PLACE_M, PLACE_RAD)
+    return other if other.score > tracked.score + (0.0 if is_same else lead) else tracked
 
 
 def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:

@@ -26,6 +26,9 @@ TILTS_DEG = (-8.0, 8.0)
 # Turns about the vertical among the further starts.
 TURNS_DEG = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
 
+# Turns on the spot, of a robot between two scans.
+SPINS_DEG = (-80.0, 80.0, -110.0, 110.0, -145.0, 145.0, 180.0)
+
 # A scan with fewer flat surface elements counts as empty.
 MIN_NUM_POINTS = 100
 
@@ -127,7 +130,7 @@ class SurfaceGeometry:
         return best_of(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])))
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
-        """Returns the predicted step, shorter, longer, turned and tilted, and steps straight ahead; see `Geometry`.
+        """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
 
         Args:
             T_last_scan: the predicted motion.
@@ -137,11 +140,12 @@ class SurfaceGeometry:
             The motions.
         """
         R, step = T_last_scan[:3, :3], T_last_scan[:3, 3]
-        turns = [R @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix() for turn_deg in TURNS_DEG]
+        turns, spins = ([R @ _turned(turn_deg) for turn_deg in several] for several in (TURNS_DEG, SPINS_DEG))
         tilts = [Rotation.from_euler(*tilt, degrees=True).as_matrix() for tilt in itertools.product("xy", TILTS_DEG)]
         motions = [(R, factor * step) for factor in STEP_FACTORS]
         motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
         motions += [(turned, translation) for turned in turns for translation in (np.zeros(3), step)]
+        motions += [(turned, np.zeros(3)) for turned in spins]
         # A rocking vehicle tilts back, so its last rotation does not continue.
         motions.append((np.eye(3), step))
         motions += [(rotation, step) for tilt in tilts for rotation in (R @ tilt, tilt)]
@@ -163,6 +167,11 @@ class SurfaceGeometry:
     def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
         level = AlignmentLevel(self.config.plane_radius_m, num_samples, 1)
         return nearest_planes(surface, local_map.surface, T_map_scan[None], level)
+
+
+def _turned(turn_deg: float) -> Float[np.ndarray, "3 3"]:
+    """Returns a rotation about the vertical."""
+    return np.asarray(Rotation.from_euler("z", turn_deg, degrees=True).as_matrix())
 
 
 def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
