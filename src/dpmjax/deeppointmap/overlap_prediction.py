@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from dpmjax.checks import require_pairs
 from dpmjax.deeppointmap.confidence import OverlapEvidence
 from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
-from dpmjax.deeppointmap.prepared_scans import PreparedScan, RawScan, ScanOrCloud, descriptors_of, require_pairs
+from dpmjax.deeppointmap.prepared_scans import PreparedScan, RawScan, ScanOrCloud, descriptors_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dpmjax.checks import require_pairs
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import encode, scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
@@ -26,7 +27,6 @@ from dpmjax.deeppointmap.prepared_scans import (
     ScanOrCloud,
     descriptors_of,
     prepare_scans,
-    require_pairs,
 )
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
