@@ -24,9 +24,9 @@ from dpmjax.deepmapping.spatial_sensors import CLOUDS, DEPTH
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
-from dpmjax.registration_rgbd.initialization import initialize_depth
 from dpmjax.registration_rgbd.motion_search import depth_search
 from dpmjax.registration_rgbd.projective_consistency import projective_consistency
+from dpmjax.registration_rgbd.trajectory_search import initialize_depth
 from dpmjax.types import ScanSet
 
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}
