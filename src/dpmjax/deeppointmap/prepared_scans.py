@@ -20,7 +20,8 @@ from dpmjax.scans.compact import (
     expand_elements,
     expand_image,
 )
-from dpmjax.scans.surfaces import RangeImage, surface_of_elements
+from dpmjax.scans.range_images import RangeImage
+from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud
 
 MAX_CODE = np.iinfo(np.int8).max
