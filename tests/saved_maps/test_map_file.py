@@ -18,11 +18,11 @@ from dpmjax.saved_maps import map_bytes
 from dpmjax.scans.range_images import range_image
 from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
 from dpmjax.slam import SlamConfig
-from dpmjax.slam.config import MapOrigin
-from dpmjax.slam.keyframes import (
+from dpmjax.slam.keyframe_map import (
     Keyframe,
     KeyframeMap,
     MapEdge,
+    MapOrigin,
     add_keyframe,
     diagonal_information,
     with_origin,

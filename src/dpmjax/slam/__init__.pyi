@@ -19,9 +19,9 @@ from .interfaces import Matcher as Matcher
 from .interfaces import Proposal as Proposal
 from .interfaces import SlamMethods as SlamMethods
 from .interfaces import ThinnedScan as ThinnedScan
-from .keyframes import KeyframeMap as KeyframeMap
-from .keyframes import Submap as Submap
-from .keyframes import as_pose_graph as as_pose_graph
+from .keyframe_map import KeyframeMap as KeyframeMap
+from .keyframe_map import Submap as Submap
+from .keyframe_map import as_pose_graph as as_pose_graph
 from .local_map import LocalMap as LocalMap
 from .local_map import local_map_of as local_map_of
 from .localization import Localization as Localization

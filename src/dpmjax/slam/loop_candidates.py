@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.slam.config import LoopClosureConfig
-from dpmjax.slam.keyframes import KeyframeMap
+from dpmjax.slam.keyframe_map import KeyframeMap
 from dpmjax.slam.loops import Loop
 
 # Upper bound of the radius (DeepPointMap: 100 m).

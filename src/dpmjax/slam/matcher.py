@@ -23,7 +23,7 @@ from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_
 from dpmjax.scans.surfaces import Surface
 from dpmjax.scans.weak_directions import plane_information
 from dpmjax.slam.interfaces import Match, Proposal, ThinnedScan
-from dpmjax.slam.keyframes import Submap
+from dpmjax.slam.keyframe_map import Submap
 from dpmjax.slam.local_map import joined_surface, placed_keyframe
 from dpmjax.types import DescriptorCloud, Registration
 
