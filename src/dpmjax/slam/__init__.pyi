@@ -29,13 +29,13 @@ from .localization import LocalizationConfig as LocalizationConfig
 from .localization import localize as localize
 from .localization import localize_each as localize_each
 from .loop_candidates import most_similar as most_similar
+from .loop_candidates import pooled_vector as pooled_vector
 from .loops import DESCRIPTOR_INFORMATION as DESCRIPTOR_INFORMATION
 from .loops import Loop as Loop
 from .map_optimization import RefinedKeyframes as RefinedKeyframes
 from .map_optimization import refine_keyframes as refine_keyframes
 from .map_thinning import thin_map as thin_map
 from .matcher import NetworkMatcher as NetworkMatcher
-from .matcher import pooled_vector as pooled_vector
 from .odometry import SurfaceGeometry as SurfaceGeometry
 from .scan_input import PreparedInput as PreparedInput
 from .scan_input import TimedScan as TimedScan
