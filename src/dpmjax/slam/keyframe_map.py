@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.scans.compact import expand_elements
 from dpmjax.slam.config import SlamConfig
 
 # Largest distance of the keyframes of a submap (DeepPointMap's published configuration).
@@ -256,6 +257,20 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap
     rows = nearest_in_graph(slam_map, row, num_keyframes, SUBMAP_RADIUS_M)
     T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
     return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
+
+
+def keyframe_points(slam_map: KeyframeMap, row: int) -> Float[np.ndarray, "n 3"]:
+    """Returns the surface elements of a keyframe.
+
+    Args:
+        slam_map: the map.
+        row: row of the keyframe.
+
+    Returns:
+        (n, 3) metres, in the frame of the keyframe's lidar.
+    """
+    elements = expand_elements(slam_map.keyframes[row].compact.elements)
+    return np.asarray(elements.positions)[np.asarray(elements.mask)]
 
 
 def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
