@@ -71,7 +71,7 @@ from .slam.agents import AgentsResult as AgentsResult
 from .slam.agents import merge_maps as merge_maps
 from .slam.agents import run_agents as run_agents
 from .slam.config import SlamConfig as SlamConfig
-from .slam.keyframes import KeyframeMap as KeyframeMap
+from .slam.keyframe_map import KeyframeMap as KeyframeMap
 from .slam.localization import Localization as Localization
 from .slam.localization import localize as localize
 from .slam.system import SlamResult as SlamResult

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -147,6 +147,35 @@ def require_count(name: str, value: int) -> None:
     """
     if value < 1:
         raise ValueError(f"{name}: expected at least 1, got {value}")
+
+
+def require_some(name: str, items: Sequence[Any]) -> None:
+    """Checks that a sequence has an item.
+
+    Args:
+        name: name of the argument, for the message.
+        items: the argument.
+
+    Raises:
+        ValueError: there is no item.
+    """
+    if len(items) == 0:
+        raise ValueError(f"{name}: expected at least one, got none")
+
+
+def require_pairs(sources: Sequence[Any], targets: Sequence[Any]) -> None:
+    """Checks that each source has a target, and that there is a pair.
+
+    Args:
+        sources: the argument `sources`.
+        targets: the argument `targets`.
+
+    Raises:
+        ValueError: the lengths differ or are 0.
+    """
+    require_some("sources", sources)
+    if len(sources) != len(targets):
+        raise ValueError(f"targets: expected {len(sources)}, one for each source, got {len(targets)}")
 
 
 def require_fields(config: object, *names: str, low: float, high: float = math.inf) -> None:

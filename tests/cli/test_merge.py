@@ -14,7 +14,7 @@ from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.program import main
 from dpmjax.cli.result_files import load_json
 from dpmjax.slam import JoinedMaps, MergedMaps
-from dpmjax.slam.keyframes import MapEdge
+from dpmjax.slam.keyframe_map import MapEdge
 from dpmjax.slam.loops import Loop
 from tests.deeppointmap import toy
 

@@ -11,10 +11,9 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dpmjax.cli import rows as row_files
-from dpmjax.cli import run_folder
+from dpmjax.cli import resumable_table, run_folder
 from dpmjax.cli.result_files import HistoryFile, commits_note, read_history, write_json
-from dpmjax.cli.rows import do_row, row_path
+from dpmjax.cli.resumable_table import do_row, row_path
 from dpmjax.cli.run_folder import (
     RunFailedError,
     RunOptions,
@@ -139,7 +138,7 @@ def test_metrics_are_valid_json_with_seed_and_versions():
 
 
 def run_rows(folder, commit, monkeypatch, methods):
-    monkeypatch.setattr(row_files, "git_hash", lambda: commit)
+    monkeypatch.setattr(resumable_table, "git_hash", lambda: commit)
     return [do_row(folder.path, {"method": method}, lambda: {"ate_px": 1.5}, seed=3) for method in methods]
 
 

@@ -13,7 +13,7 @@ from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.engine import fit, init
 from dpmjax.deepmapping.mapping import mapping_problem
 from dpmjax.deepmapping.objective import scans_of_step
-from dpmjax.deepmapping.planar import as_scan_set
+from dpmjax.deepmapping.planar_sensor import as_scan_set
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error

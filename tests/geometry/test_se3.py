@@ -41,3 +41,12 @@ def test_derivative_of_log_is_that_of_finite_differences(scale: float, float64) 
     forward, backward = (np.asarray(se3.log(T[:, None] @ np.asarray(rigid.exp(sign * steps)))) for sign in (1, -1))
     expected = np.swapaxes(forward - backward, 1, 2) / (2 * h)
     np.testing.assert_allclose(se3.log_jacobian(T), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_rounding_errors_of_a_rotation_are_removed() -> None:
+    T = random_motions(6, 1)[0]
+    rough = T.copy()
+    rough[:3, :3] += 1e-4 * np.random.default_rng(0).normal(size=(3, 3))
+    R = se3.orthonormal(rough)[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(se3.orthonormal(T), T, atol=1e-12)

@@ -15,14 +15,13 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import GlobalConfig, PlanarScans, nearest_tour, planar_scans, refine, register_globally
 from dpmjax.registration2d.global_registration import _Task, find_unregistered, place_others
-from dpmjax.registration2d.map_assembly import PoseScorer, add_up, assemble, move_blocks, weakest_cuts
+from dpmjax.registration2d.map_assembly import PoseScorer, add_up, agreeing_edges, assemble, move_blocks, weakest_cuts
 from dpmjax.registration2d.pair_search import (
     APART,
     Candidates,
     CorrelativeConfig,
     Hypotheses,
     _spectra,
-    agreeing_edges,
     search_pairs,
 )
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles

@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d import PlanarScans
-from dpmjax.registration2d.pair_alignment import FINE, PosePrior, linearise_pair, match_pairs
+from dpmjax.registration2d.pair_alignment import FINE, PairPrior, linearise_pair, match_pairs
 
 GATE, KERNEL = 20.0, 4.0
 
@@ -75,7 +75,7 @@ def test_prior_decides_along_a_corridor_and_the_walls_across_it() -> None:
     guess = np.array([[[0.0, 1.0, 0.02]]])
 
     def aligned(information: float) -> np.ndarray:
-        prior = PosePrior(np.array([[7.0, 3.0, 0.1]]), np.full((1, 3), information))
+        prior = PairPrior(np.array([[7.0, 3.0, 0.1]]), np.full((1, 3), information))
         return match_pairs(corridor(7.0), corridor(0.0), guess, FINE, prior).poses[0]
 
     with_prior, without = aligned(1.0), aligned(0.0)

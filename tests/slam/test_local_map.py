@@ -11,7 +11,7 @@ from dpmjax.geometry import rigid
 from dpmjax.scans.compact import compact_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
-from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe
 from dpmjax.slam.local_map import (
     PlacedElements,
     joined_surface,

@@ -10,12 +10,11 @@ from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
-from dpmjax.slam.keyframes import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, most_similar, nearest_pairs
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
+from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, most_similar, nearest_pairs, pooled_vector
 from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
 from dpmjax.slam.loops import Loop, LoopState, are_consistent
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.matcher import pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 

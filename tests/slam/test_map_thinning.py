@@ -7,7 +7,7 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.slam import SlamConfig, SlamMethods, run_slam
-from dpmjax.slam.keyframes import KeyframeMap, connected_parts
+from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts
 from dpmjax.slam.map_thinning import thin_map
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 

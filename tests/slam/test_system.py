@@ -25,7 +25,7 @@ from dpmjax.slam import (
     step_slam,
 )
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframes import diagonal_information
+from dpmjax.slam.keyframe_map import diagonal_information
 from tests.slam.truth import (
     EMPTY,
     MistakenMatcher,

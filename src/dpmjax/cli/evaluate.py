@@ -27,7 +27,7 @@ from tyro.conf import Positional, arg
 from dpmjax import deeppointmap, metrics, simulation, viz, weights
 from dpmjax.cli.command import check_least
 from dpmjax.cli.drives import Source, check_names_differ, find_sources
-from dpmjax.cli.rows import Row, Summary, TableRun, cell_text, group_rows, markdown, run_table
+from dpmjax.cli.resumable_table import Row, Summary, TableRun, cell_text, group_rows, markdown, run_table
 from dpmjax.cli.run_folder import ModelOptions, RunFolder, RunOptions
 from dpmjax.sequences import LidarSequence
 

@@ -26,7 +26,7 @@ from dpmjax.cli.command import StopFlag
 from dpmjax.cli.drives import DriveOptions, open_drive, report_notes
 from dpmjax.cli.result_files import HistoryFile, read_history
 from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.cli.slam_files import keyframe_points, open_map
+from dpmjax.cli.slam_files import open_map
 from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.sequences import InputError, LidarSequence
 
@@ -197,7 +197,10 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[st
 def map_points(slam_map: slam.KeyframeMap) -> np.ndarray:
     """Returns surface points of the map, thinned at random."""
     points = np.concatenate(
-        [keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3] for row, T in enumerate(slam_map.T_world_keyframe)]
+        [
+            slam.keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3]
+            for row, T in enumerate(slam_map.T_world_keyframe)
+        ]
     )
     return points[np.random.default_rng(0).permutation(len(points))[:NUM_MAP_POINTS]]
 

@@ -131,7 +131,7 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
-    cloud = files.gather_map(T_world_keyframe, lambda row: files.keyframe_points(slam_map, int(rows[row])))
+    cloud = files.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
     return files.map_track(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 

@@ -127,7 +127,7 @@ class MappedDrive(NamedTuple):
     def read_keyframe(self, slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
         """Reads the points of a keyframe; those of the extended map are the points of its surface."""
         if row < self.num_keyframes_before:
-            return files.keyframe_points(slam_map, row)
+            return slam.keyframe_points(slam_map, row)
         return self.sequence.read_points(slam_map.keyframes[row].scan - self.first_scan)
 
 

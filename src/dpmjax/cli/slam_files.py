@@ -218,19 +218,3 @@ def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
         found = f"made with weights {slam_map.origin}, these are {origin}"
         raise ValueError(f"{path}: {found}; name the weights that made it with --weights")
     return slam_map
-
-
-def keyframe_points(slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
-    """Returns the surface elements of a keyframe.
-
-    Args:
-        slam_map: the map.
-        row: row of the keyframe.
-
-    Returns:
-        (n, 3) metres, in the frame of the keyframe's lidar.
-    """
-    from dpmjax.scans.compact import expand_elements
-
-    elements = expand_elements(slam_map.keyframes[row].compact.elements)
-    return np.asarray(elements.positions)[np.asarray(elements.mask)]

@@ -196,7 +196,7 @@ def run_status(numbers: Mapping[str, Any]) -> str:
 
 def count_parts(slam_map: slam.KeyframeMap) -> int:
     """Returns the number of parts of a map that measured motions join."""
-    from dpmjax.slam.keyframes import connected_parts
+    from dpmjax.slam.keyframe_map import connected_parts
 
     measured = [edge for edge in slam_map.edges if edge.kind != "guess"]
     return len(set(connected_parts(len(slam_map), measured).tolist()))

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.mapping import Fitted
-from dpmjax.deepmapping.planar import as_scan_set, choose_beams, localize_scans
+from dpmjax.deepmapping.planar_sensor import as_scan_set, choose_beams, localize_scans
 from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet

@@ -17,16 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Report, fit
-from dpmjax.deepmapping.planar import PLANAR, as_scan_set
+from dpmjax.deepmapping.planar_sensor import PLANAR, as_scan_set
 from dpmjax.deepmapping.presets import preset
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
-from dpmjax.deepmapping.spatial import CLOUDS, DEPTH
+from dpmjax.deepmapping.spatial_sensors import CLOUDS, DEPTH
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
-from dpmjax.registration_rgbd.initialization import initialize_depth
 from dpmjax.registration_rgbd.motion_search import depth_search
 from dpmjax.registration_rgbd.projective_consistency import projective_consistency
+from dpmjax.registration_rgbd.trajectory_search import initialize_depth
 from dpmjax.types import ScanSet
 
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}

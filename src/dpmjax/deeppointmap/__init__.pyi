@@ -13,6 +13,13 @@ from .encoding import encode as encode
 from .encoding import encode_scans as encode_scans
 from .encoding import pyramid_of_cloud as pyramid_of_cloud
 from .encoding import scene_scale as scene_scale
+from .evaluation_pairs import DISTANCE_BANDS_M as DISTANCE_BANDS_M
+from .evaluation_pairs import ScanPair as ScanPair
+from .evaluation_pairs import draw_rows as draw_rows
+from .evaluation_pairs import draw_rows_apart as draw_rows_apart
+from .evaluation_pairs import draw_scan_pairs as draw_scan_pairs
+from .evaluation_pairs import read_scan_pairs as read_scan_pairs
+from .evaluation_pairs import scan_distances as scan_distances
 from .matching import MatchConfig as MatchConfig
 from .matching import match_hypotheses as match_hypotheses
 from .matching import merge_clouds as merge_clouds
@@ -44,13 +51,6 @@ from .scan_evaluation import evaluate_overlap as evaluate_overlap
 from .scan_evaluation import evaluate_scan_pairs as evaluate_scan_pairs
 from .scan_evaluation import overlap_candidates as overlap_candidates
 from .scan_evaluation import register_in_stages as register_in_stages
-from .scan_pairs import DISTANCE_BANDS_M as DISTANCE_BANDS_M
-from .scan_pairs import ScanPair as ScanPair
-from .scan_pairs import draw_rows as draw_rows
-from .scan_pairs import draw_rows_apart as draw_rows_apart
-from .scan_pairs import draw_scan_pairs as draw_scan_pairs
-from .scan_pairs import read_scan_pairs as read_scan_pairs
-from .scan_pairs import scan_distances as scan_distances
 from .scan_registration import distinct_motions as distinct_motions
 from .scan_registration import match_clouds as match_clouds
 from .scan_registration import register as register

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import require_positive
+from dpmjax.checks import require_positive, require_some
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid_host import build_pyramid_on_host
@@ -187,9 +187,3 @@ def stack_chunk(items: list[Any]) -> Any:
 def join_chunks(parts: Sequence[Any], num: int) -> Any:
     """Joins the results of chunks, on the host: there, another number of parts compiles nothing."""
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num]), *jax.device_get(parts))
-
-
-def require_some(name: str, items: Sequence[Any]) -> None:
-    """Raises a `ValueError` if there is no item."""
-    if len(items) == 0:
-        raise ValueError(f"{name}: expected at least one, got none")

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from dpmjax.checks import require_pairs
 from dpmjax.deeppointmap.confidence import OverlapEvidence
 from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
-from dpmjax.deeppointmap.prepared_scans import PreparedScan, RawScan, ScanOrCloud, descriptors_of, require_pairs
+from dpmjax.deeppointmap.prepared_scans import PreparedScan, RawScan, ScanOrCloud, descriptors_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
@@ -85,7 +86,7 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
     Returns:
         The probabilities.
     """
-    return _of_pairs(overlap_probability, model, sources, targets)
+    return _apply_to_pairs(overlap_probability, model, sources, targets)
 
 
 def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
@@ -101,7 +102,7 @@ def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequen
     Returns:
         A row for each pair, in the order of `confidence.OVERLAP_FEATURES`.
     """
-    return jnp.stack(_of_pairs(overlap_evidence, model, sources, targets), axis=1)
+    return jnp.stack(_apply_to_pairs(overlap_evidence, model, sources, targets), axis=1)
 
 
 @jax.jit
@@ -164,7 +165,7 @@ def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) ->
     return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
 
 
-def _of_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
+def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
     """Applies a function of one pair to all pairs; each scan is encoded once."""
     require_pairs(sources, targets)
     clouds: dict[int, DescriptorCloud] = {}
@@ -179,11 +180,12 @@ def _of_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targe
         clouds |= {key: jax.tree.map(lambda leaf, row=row: leaf[row], encoded) for row, key in enumerate(raw)}
     pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]
     chunks = (stack_chunk(pairs[start : start + CHUNK]) for start in range(0, len(pairs), CHUNK))
-    return join_chunks([_of_chunk(function, model, some) for some in chunks], len(pairs))
+    return join_chunks([_apply_to_chunk(function, model, some) for some in chunks], len(pairs))
 
 
 @functools.partial(jax.jit, static_argnames="function")
-def _of_chunk(function: Any, model: Model, pairs: Any) -> Any:
+def _apply_to_chunk(function: Any, model: Model, pairs: Any) -> Any:
+    """Applies a function of one pair to the pairs of a chunk, in one compiled program."""
     return jax.vmap(lambda pair: function(model, *pair))(pairs)
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int8
 
-from dpmjax.deeppointmap.encoding import pyramid_of_scan, require_some, valid_points
+from dpmjax.deeppointmap.encoding import pyramid_of_scan, valid_points
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.verification import MeasuredScan, measure_scan
 from dpmjax.scans.compact import (
@@ -20,7 +20,8 @@ from dpmjax.scans.compact import (
     expand_elements,
     expand_image,
 )
-from dpmjax.scans.surfaces import RangeImage, surface_of_elements
+from dpmjax.scans.range_images import RangeImage
+from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud
 
 MAX_CODE = np.iinfo(np.int8).max
@@ -55,13 +56,6 @@ Scale = float | Literal["auto"]
 def descriptors_of(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
     """Returns the descriptors of a prepared scan, or the cloud itself."""
     return scan.descriptors if isinstance(scan, PreparedScan) else scan
-
-
-def require_pairs(sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> None:
-    """Raises a `ValueError` if the lengths differ or are 0."""
-    require_some("sources", sources)
-    if len(sources) != len(targets):
-        raise ValueError(f"targets: expected {len(sources)}, one for each source, got {len(targets)}")
 
 
 def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:

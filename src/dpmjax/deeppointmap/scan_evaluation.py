@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import encode
+from dpmjax.deeppointmap.evaluation_pairs import ScanPair, draw_rows, scan_distances, true_poses
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, overlap_pairs
-from dpmjax.deeppointmap.scan_pairs import ScanPair, draw_rows, scan_distances, true_poses
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.geometry import se2

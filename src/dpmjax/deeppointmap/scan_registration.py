@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dpmjax.checks import require_pairs
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import encode, scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
@@ -26,7 +27,6 @@ from dpmjax.deeppointmap.prepared_scans import (
     ScanOrCloud,
     descriptors_of,
     prepare_scans,
-    require_pairs,
 )
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
@@ -123,13 +123,13 @@ def register_each(
             hypotheses = _in_metres(in_cloud_units, pair_scale)
             if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
-                motions = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
+                motion = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
             elif refine and all(cloud.normals is not None for cloud in clouds):
-                motions = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
+                motion = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
             else:
-                motions = pool.submit(_Motions, 0, np.asarray(hypotheses.T_target_source[0]))
-            started.append((hypotheses, motions))
-        return [_finished(model, hypotheses, motions.result()) for hypotheses, motions in started]
+                motion = pool.submit(_ChosenMotion, 0, np.asarray(hypotheses.T_target_source[0]))
+            started.append((hypotheses, motion))
+        return [_as_registration(model, hypotheses, motion.result()) for hypotheses, motion in started]
 
 
 def register_pairs(
@@ -191,8 +191,9 @@ def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
     return np.asarray(hypotheses.T_target_source[:num_motions], np.float64)
 
 
-class _Motions(NamedTuple):
-    # The chosen hypothesis and its final motion, metres. The confidence rests on the evidence before the refinement.
+class _ChosenMotion(NamedTuple):
+    """Chosen and refined motion of one pair, in metres; the confidence rests on the evidence before the refinement."""
+
     row: int | None
     T_target_source: Float[np.ndarray, "4 4"]
     evidence: Verification | None = None
@@ -201,6 +202,7 @@ class _Motions(NamedTuple):
 
 
 def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
+    """Returns the scale of all raw scans; "auto" chooses it from their extents."""
     if scale != "auto":
         return scale
     scans = [scan for pair in pairs for scan in pair if not isinstance(scan, PreparedScan)]
@@ -212,6 +214,7 @@ def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, mo
 def _shared_scale(
     source: DescriptorCloud | PreparedScan, target: DescriptorCloud | PreparedScan, scale: float
 ) -> float:
+    """Returns the scale that both sides of a pair have; raises a `ValueError` if they differ."""
     scales = [scan.scale if isinstance(scan, PreparedScan) else scale for scan in (source, target)]
     if scales[0] != scales[1]:
         raise ValueError(f"target: expected scale {scales[0]:g} as the source, got {scales[1]:g}")
@@ -219,6 +222,7 @@ def _shared_scale(
 
 
 def _in_metres(hypotheses: Registration, scale: float) -> Registration:
+    """Scales the hypotheses from the units of the descriptors to metres."""
     if scale == 1:
         return hypotheses
     T = np.array(hypotheses.T_target_source)
@@ -229,7 +233,7 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
 def _prepared(
     model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
 ) -> dict[int, DescriptorCloud | PreparedScan]:
-    # Each scan object once. Surfaces are measured only where both sides of a pair are scans.
+    """Prepares each scan object once; surfaces are measured only where both sides of a pair are scans."""
     raw: dict[int, RawScan] = {}
     ready: dict[int, DescriptorCloud | PreparedScan] = {}
     for pair in pairs:
@@ -246,15 +250,17 @@ def _prepared(
 
 def _verified(
     source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
-) -> _Motions:
+) -> _ChosenMotion:
+    """Chooses the motion of two scans by their surfaces and free space, and refines it on request."""
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
     weak = weak_direction_of(source, target, T, config)
-    return _Motions(chosen.row, T, chosen.verification, final.verification, weak)
+    return _ChosenMotion(chosen.row, T, chosen.verification, final.verification, weak)
 
 
-def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float) -> _Motions:
+def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float) -> _ChosenMotion:
+    """Refines the best motion of two descriptor clouds by their surface elements."""
     # The elements alone cannot choose among hypotheses: in a corridor, or after a half-turn, wrong ones meet the same
     # number of planes.
     T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
@@ -262,19 +268,20 @@ def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Regis
         aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
         T_target_source = np.array(aligned.T_target_source)
     T_target_source[:3, 3] /= scale
-    return _Motions(0, T_target_source)
+    return _ChosenMotion(0, T_target_source)
 
 
-def _finished(model: Model, hypotheses: Registration, motions: _Motions) -> Registration:
-    row, evidence = motions.row, gather_evidence(hypotheses, motions.row, motions.evidence)
+def _as_registration(model: Model, hypotheses: Registration, motion: _ChosenMotion) -> Registration:
+    """Joins the hypothesis that was chosen, its motion and its verification, and adds the confidence."""
+    row, evidence = motion.row, gather_evidence(hypotheses, motion.row, motion.evidence)
     match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row or 0]), hypotheses)
     if row is None:
         none = {name: jnp.zeros_like(getattr(match, name)) for name in OF_THE_INLIERS}
         match = replace(match, rmse=jnp.full_like(match.rmse, jnp.inf), **none)
-    T = jnp.asarray(motions.T_target_source, match.T_target_source.dtype)
-    match = replace(match, T_target_source=T, verification=motions.verification)
-    if motions.weak is not None:
-        direction, sigma_m = (jnp.asarray(value, T.dtype) for value in motions.weak)
+    T = jnp.asarray(motion.T_target_source, match.T_target_source.dtype)
+    match = replace(match, T_target_source=T, verification=motion.verification)
+    if motion.weak is not None:
+        direction, sigma_m = (jnp.asarray(value, T.dtype) for value in motion.weak)
         match = replace(match, weak_direction=direction, weak_sigma_m=sigma_m)
     return with_confidence(match, evidence, model.config.calibration)
 

@@ -5,12 +5,15 @@ Tangents are (translation, rotation), in that order. Lengths keep their unit, an
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
@@ -74,3 +77,47 @@ def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def turn_rad(T_a_b: Float[np.ndarray, "4 4"]) -> float:
+    """Returns the angle of a rotation.
+
+    Args:
+        T_a_b: a motion.
+
+    Returns:
+        Radians, from 0 to pi.
+    """
+    R = T_a_b[:3, :3]
+    sine = math.hypot(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    return math.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1)
+
+
+def are_near(T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"], most_m: float, most_rad: float) -> bool:
+    """Returns True if two poses differ by at most a distance and a rotation angle.
+
+    Args:
+        T_a: a pose.
+        T_b: the second pose, in the same frame.
+        most_m: distance.
+        most_rad: turn.
+
+    Returns:
+        True at the limits, too.
+    """
+    apart = rigid.inverse(T_a) @ T_b
+    return bool(np.linalg.norm(apart[:3, 3]) <= most_m) and turn_rad(apart) <= most_rad
+
+
+def orthonormal(T_a_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
+    """Removes the rounding errors of rotations, which would grow from scan to scan.
+
+    Args:
+        T_a_b: nearly rigid motions.
+
+    Returns:
+        The rigid motions.
+    """
+    T = np.array(T_a_b, np.float64)
+    T[..., :3, :3] = Rotation.from_matrix(T[..., :3, :3]).as_matrix()
+    return T

@@ -20,12 +20,11 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import PoseGraph, join_edges, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.incremental import incremental_icp
-from dpmjax.registration2d.map_assembly import PoseScorer, assemble, settle
+from dpmjax.registration2d.map_assembly import PoseScorer, agreeing_edges, assemble, settle
 from dpmjax.registration2d.pair_search import (
     Candidates,
     CorrelativeConfig,
     Hypotheses,
-    agreeing_edges,
     chance_level,
     join_candidates,
     noisy_share,

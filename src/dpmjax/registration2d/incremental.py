@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PosePrior, match_pairs
+from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.sequence_search import search_sequence
 from dpmjax.registration2d.step_prior import StepPrior, usual_motion
@@ -66,12 +66,12 @@ def incremental_icp(
         prior = prior or StepPrior.of_poses(odometry, unit)
         fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5, -1.5, 1.5], [0.0, 0.0, 1.0])
         guesses = se2.relative(odometry[:-1], odometry[1:])[:, None] + fan
-        loose = prior.as_pose_prior(_COARSE_RESIDUAL * unit)
+        loose = prior.as_pair_prior(_COARSE_RESIDUAL * unit)
         rough = match_pairs(source, target, guesses, COARSE, loose, metric=metric)
     # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
     num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
     is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
-    belief = prior.as_pose_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
+    belief = prior.as_pair_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
     predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
     steps = match_pairs(source, target, guesses, FINE, belief, metric=metric)
@@ -106,7 +106,7 @@ def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> Pair
 def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
     """Returns coarse matches from small motions, then from larger ones where the fitness is poor."""
     unit, rough = source.typical_range, match_near(source, target, metric)
-    prior = usual_motion(rough, unit).as_pose_prior(_COARSE_RESIDUAL * unit)
+    prior = usual_motion(rough, unit).as_pair_prior(_COARSE_RESIDUAL * unit)
     # Around the predicted translations, then far from zero.
     near, far = _fan(unit, (0.0, 0.15), 4), _fan(unit, (0.3, 0.525), 8, turn_share=0.5)
     centre = np.asarray(prior.mean) * [1.0, 1.0, 0.0]
@@ -114,7 +114,7 @@ def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> P
         rows = np.flatnonzero(rough.fitness < limit)
         if not len(rows):
             continue
-        belief = PosePrior(prior.mean[rows], prior.information[rows])
+        belief = PairPrior(prior.mean[rows], prior.information[rows])
         guesses = middle[rows][:, None] + fan
         wide = match_pairs(source.take(rows), target.take(rows), guesses, COARSE, belief, metric=metric)
         better = wide.fitness > rough.fitness[rows]

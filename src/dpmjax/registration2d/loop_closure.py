@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior, Schedule, match_pairs
+from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior, Schedule, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, batches
 from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles, weak_steps
 from dpmjax.registration2d.step_prior import BEAM_DEVIATION, pose_steps
@@ -146,9 +146,9 @@ def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, 
     # The prior has the standard deviation of the drift: it constrains the position along a corridor.
     sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
     belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
-    prior = PosePrior(predicted, (0.015 * unit) ** 2 * belief)
+    prior = PairPrior(predicted, (0.015 * unit) ** 2 * belief)
     rough = match_pairs(ones, submaps, _guesses(predicted, unit), _SEARCH, prior)
-    prior = PosePrior(predicted, (3.0 * scans.noise) ** 2 * belief)
+    prior = PairPrior(predicted, (3.0 * scans.noise) ** 2 * belief)
     return match_pairs(ones, submaps, rough.poses[:, None], _REFINE, prior)
 
 

@@ -20,19 +20,22 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import PoseGraph, label_parts
+from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.pair_search import (
-    AGREEMENT,
     Candidates,
     Hypotheses,
-    agreeing_edges,
     chance_level,
     noisy_share,
 )
 from dpmjax.registration2d.planar_scans import Floats, Indices
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs
 
+# A pair agrees with a map within this: translation in typical ranges, radians.
+_AGREEMENT = (0.06, 0.1)
+# Least score of an edge as a share of the beams; and the accuracy of a pair with all its beams matched: typical ranges,
+# radians.
+_MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
 # Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 4.0
 # Weight of the matched beams of neighbours in time, where there is an order.
@@ -154,6 +157,24 @@ def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: boo
     return np.asarray(se2.relative(poses[0], poses))
 
 
+def agreeing_edges(poses: Floats, candidates: Candidates, profiles: RangeProfiles) -> Edges:
+    """Returns edges of the pairs with a candidate that agrees with the map; of each pair the nearest candidate."""
+    typical_range, num_beams = profiles.scans.typical_range, np.asarray(profiles.scans.mask.sum(1), np.float64)
+    beams = num_beams[candidates.source] + num_beams[candidates.target]
+    shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
+    here = se2.relative(poses[candidates.target], poses[candidates.source])
+    off = se2.relative(here[:, None], candidates.poses)
+    distance = np.hypot(off[..., 0], off[..., 1]) / (_AGREEMENT[0] * typical_range)
+    turn = np.abs(se2.wrap_angle(off[..., 2])) / _AGREEMENT[1]
+    mismatch = np.where(shares > _MIN_SHARE, np.maximum(distance, turn), np.inf)
+    best = mismatch.argmin(axis=1)
+    row = np.arange(len(best))
+    keep = mismatch[row, best] < 1.0
+    sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
+    information = shares[row, best][keep][:, None, None] * np.diag(1.0 / sigma**2)
+    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
+
+
 def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
     """Selects the rows of the best disjoint pairs."""
     chosen: list[int] = []
@@ -212,7 +233,7 @@ def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[
         score = scorer.score(np.full(len(candidates), scan), candidates, everyone, poses)
         best = int(score.argmax())
         if is_firmly_more(score[best], score[0]):
-            far = AGREEMENT[0] * scorer.profiles.scans.typical_range
+            far = _AGREEMENT[0] * scorer.profiles.scans.typical_range
             num_moved += bool(np.hypot(*(candidates[best] - poses[scan])[:2]) > far)
             poses[scan] = candidates[best]
     return poses, num_moved

@@ -75,7 +75,7 @@ class PairMatches(NamedTuple):
         return np.asarray(np.linalg.eigvalsh(self.information[:, :2, :2])[:, 0], np.float64)
 
 
-class PosePrior(NamedTuple):
+class PairPrior(NamedTuple):
     """Prior of relative poses, which constrains the directions that the scans do not constrain.
 
     Attributes:
@@ -144,7 +144,7 @@ def _move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, "
     return pose + jnp.append(_matmul(se2.rotation(pose[2]), delta[:2]), delta[2])
 
 
-def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Float[Array, " 3"]:
+def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PairPrior) -> Float[Array, " 3"]:
     """Computes the Gauss-Newton step of the scans and the prior together."""
     offset = pose - prior.mean
     offset = offset.at[2].set(se2.wrap_angle(offset[2]))
@@ -159,11 +159,11 @@ def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PosePrior) -> Fl
 
 @partial(jax.jit, static_argnames="metric")
 def _align(
-    pairs: tuple[PlanarScans, PlanarScans, Array, PosePrior], scales: tuple[Array, Array], *, metric: Metric
+    pairs: tuple[PlanarScans, PlanarScans, Array, PairPrior], scales: tuple[Array, Array], *, metric: Metric
 ) -> tuple[Float[Array, "p 3"], PairSystem]:
     """Aligns pairs (source, target, guess, prior) by ICP; `scales` are gate and kernel of each iteration."""
 
-    def align(source: PlanarScans, target: PlanarScans, guess: Array, prior: PosePrior) -> tuple[Array, PairSystem]:
+    def align(source: PlanarScans, target: PlanarScans, guess: Array, prior: PairPrior) -> tuple[Array, PairSystem]:
         def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
             system = linearise_pair(source, target, pose, scale, metric=metric)
             return _move(pose, _solve(system, pose, prior)), None
@@ -175,7 +175,7 @@ def _align(
 
 
 def match_pairs(
-    source: PlanarScans, target: PlanarScans, guesses: Floats, schedule: Schedule, prior: PosePrior | None = None,
+    source: PlanarScans, target: PlanarScans, guesses: Floats, schedule: Schedule, prior: PairPrior | None = None,
     *, metric: Metric = "plane",
 ) -> PairMatches:  # fmt: skip
     """Aligns source scan p to target scan p from each of its guesses and keeps the best.
@@ -194,7 +194,7 @@ def match_pairs(
     num_pairs, num_guesses = guesses.shape[:2]
     if not num_pairs:
         return PairMatches(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 3)))
-    prior = prior or PosePrior(np.zeros((num_pairs, 3)), np.zeros((num_pairs, 3)))
+    prior = prior or PairPrior(np.zeros((num_pairs, 3)), np.zeros((num_pairs, 3)))
     scales = schedule.gates_and_kernels(source.typical_range, source.noise)
     source, target = source.thin(schedule.source_stride), target.thin(schedule.target_stride)
     distances = num_guesses * source.mask.shape[1] * target.mask.shape[1]
@@ -204,7 +204,7 @@ def match_pairs(
     information = np.zeros((num_pairs, num_guesses, 3, 3))
     for part, rows in batches(num_pairs, batch):
         repeated = np.repeat(rows, num_guesses)
-        belief = PosePrior(*(np.asarray(x, np.float32)[repeated] for x in prior))
+        belief = PairPrior(*(np.asarray(x, np.float32)[repeated] for x in prior))
         start = guesses[rows].reshape(-1, 3).astype(np.float32)
         pairs = source.take(repeated), target.take(repeated), start, belief
         aligned, system = _align(pairs, scales, metric=metric)

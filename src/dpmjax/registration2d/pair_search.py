@@ -18,7 +18,6 @@ from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d.planar_scans import Floats, Indices, Tolerances, batches, rounded_up
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
@@ -26,11 +25,6 @@ from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pair, co
 # of scans is rounded up to a multiple of this. Larger values are no quicker, because `lax.map` works piece by piece.
 _SMALLEST = 32
 _REFINE_BATCH = 32
-# A pair agrees with a map within this: translation in typical ranges, radians.
-AGREEMENT = (0.06, 0.1)
-# Least score of an edge as a share of the beams; and the accuracy of a pair with all its beams matched: typical ranges,
-# radians.
-_MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
 # Pairs that are searched at a time: their spectra and images take at most 250 MB at 128 cells.
 _SEARCH_BATCH = 512
 # Weight of a cell of free space relative to a cell of surface.
@@ -89,24 +83,6 @@ class Candidates(NamedTuple):
 def join_candidates(*candidates: Candidates) -> Candidates:
     """Joins candidates of different pairs, with the same number of poses in each pair."""
     return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
-
-
-def agreeing_edges(poses: Floats, candidates: Candidates, profiles: RangeProfiles) -> Edges:
-    """Returns edges of the pairs with a candidate that agrees with the map; of each pair the nearest candidate."""
-    typical_range, num_beams = profiles.scans.typical_range, np.asarray(profiles.scans.mask.sum(1), np.float64)
-    beams = num_beams[candidates.source] + num_beams[candidates.target]
-    shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
-    here = se2.relative(poses[candidates.target], poses[candidates.source])
-    off = se2.relative(here[:, None], candidates.poses)
-    distance = np.hypot(off[..., 0], off[..., 1]) / (AGREEMENT[0] * typical_range)
-    turn = np.abs(se2.wrap_angle(off[..., 2])) / AGREEMENT[1]
-    mismatch = np.where(shares > _MIN_SHARE, np.maximum(distance, turn), np.inf)
-    best = mismatch.argmin(axis=1)
-    row = np.arange(len(best))
-    keep = mismatch[row, best] < 1.0
-    sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
-    information = shares[row, best][keep][:, None, None] * np.diag(1.0 / sigma**2)
-    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
 
 
 def chance_level(candidates: Candidates) -> float:

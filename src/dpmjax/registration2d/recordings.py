@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import rigid, se2
-from dpmjax.registration2d.pair_alignment import FINE, PosePrior, match_pairs
+from dpmjax.registration2d.pair_alignment import FINE, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
 from dpmjax.types import ScanSet
@@ -228,7 +228,7 @@ def _align_with(
     source, target = pairs
     expected = np.asarray(se2.relative(poses[target], poses[source]))
     spread = np.array(sigma)[[0, 0, 1]] * [scans.typical_range, scans.typical_range, 1.0]
-    prior = PosePrior(expected, np.broadcast_to((3.0 * scans.noise / spread) ** 2, expected.shape))
+    prior = PairPrior(expected, np.broadcast_to((3.0 * scans.noise / spread) ** 2, expected.shape))
     guesses = expected[:, None] + np.outer(turns, [0.0, 0.0, 1.0])
     found = match_pairs(scans.take(source), scans.take(target), guesses, FINE, prior)
     profiles, rows = make_profiles(scans.take(np.concatenate([source, target]))), np.arange(len(source))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.registration2d.pair_alignment import PairMatches, PosePrior
+from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior
 from dpmjax.registration2d.planar_scans import Floats, Indices
 
 # Standard deviations of a step of poses of unknown accuracy: typical ranges, radians.
@@ -63,9 +63,9 @@ class StepPrior(NamedTuple):
         usual = StepPrior.of_poses(se2.chain(self.steps), typical_range).deviations
         return self._replace(deviations=np.maximum(self.deviations, usual))
 
-    def as_pose_prior(self, residual: float | Floats) -> PosePrior:
+    def as_pair_prior(self, residual: float | Floats) -> PairPrior:
         """Returns the prior of alignments whose beams have this standard deviation `residual`, unit of the points."""
-        return PosePrior(self.steps, (residual / self.deviations) ** 2)
+        return PairPrior(self.steps, (residual / self.deviations) ** 2)
 
     def through(self, rows: Indices) -> StepPrior:
         """Returns the prior of the steps between these rows (m,) of the n scans, in order."""

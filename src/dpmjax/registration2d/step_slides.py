@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PosePrior, match_pairs
+from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence, make_profiles
 from dpmjax.registration2d.step_prior import BEAM_DEVIATION, StepPrior, pose_steps
@@ -214,7 +214,7 @@ def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> 
     moved = slides.moved(matches.poses)[rows]
     information = (3.0 * scans.noise / slides.constrained_deviations()[rows, None] * [1.0, 1.0, 0.0]) ** 2
     source, target = scans.take(rows + 1), scans.take(rows)
-    found = match_pairs(source, target, moved[:, None], FINE, PosePrior(moved, information))
+    found = match_pairs(source, target, moved[:, None], FINE, PairPrior(moved, information))
     settled = PairMatches(*(x.copy() for x in matches))
     for kept, new in zip(settled, found, strict=True):
         kept[rows] = new

@@ -65,6 +65,20 @@ class DepthScans:
         return PixelSample(self.points.reshape(count, -1, 3), self.mask.reshape(count, -1))
 
 
+class SampledImages(NamedTuple):
+    """Depth images with some points of each.
+
+    Attributes:
+        scans: the images.
+        sample: points by which trajectories are compared and adjusted.
+        unit: typical range of the images, unit of the points.
+    """
+
+    scans: DepthScans
+    sample: PixelSample
+    unit: Float[Array, ""] | float
+
+
 def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthScans:
     """Checks depth images and fits the camera.
 

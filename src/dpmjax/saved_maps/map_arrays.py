@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int8
 from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
+from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.compact import MAX_COMPONENT, CompactElements, CompactImage
-from dpmjax.slam.config import MapOrigin
-from dpmjax.slam.keyframes import EdgeKind, Keyframe, KeyframeMap, MapEdge, orthonormal
+from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin
 
 Precision = Literal["float32", "int8"]
 KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)

@@ -19,8 +19,8 @@ from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import Arrays, Precision, pack_map, unpack_map
 from dpmjax.sequences import InputError, require
-from dpmjax.slam.config import MapOrigin, SlamConfig
-from dpmjax.slam.keyframes import KeyframeMap
+from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.keyframe_map import KeyframeMap, MapOrigin
 from dpmjax.slam.map_thinning import thin_map
 from dpmjax.weights.config_json import config_from_json
 

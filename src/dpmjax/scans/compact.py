@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Int16, UInt8
 
-from dpmjax.scans.surfaces import RangeImage
+from dpmjax.scans.range_images import RangeImage
 from dpmjax.types import SurfaceElements
 
 MAX_COORDINATE = np.iinfo(np.int16).max

@@ -18,7 +18,7 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.interfaces import SlamMethods
-from dpmjax.slam.keyframes import KeyframeMap, connected_parts, joined_maps, take_keyframes, with_origin
+from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts, joined_maps, take_keyframes, with_origin
 from dpmjax.slam.loop_candidates import similar_keyframes
 from dpmjax.slam.loop_closure import examine_candidates, is_resting
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted

@@ -6,7 +6,7 @@ The extent of a scan is the median range of its surface points: about 12 m in a 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 from dpmjax.checks import require_fields, require_one_of, require_positive_fields
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
@@ -113,23 +113,6 @@ class SlamConfig:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
     loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
-
-
-class MapOrigin(NamedTuple):
-    """Matcher and settings that made a map.
-
-    Attributes:
-        fingerprint: fingerprint of the matcher; keyframes of another matcher cannot be compared.
-        config: settings of SLAM.
-        weights: name of the weights, for messages; may be empty.
-    """
-
-    fingerprint: str
-    config: SlamConfig
-    weights: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.weights} ({self.fingerprint})" if self.weights else self.fingerprint
 
 
 SlamPreset = Literal["default", "paper"]

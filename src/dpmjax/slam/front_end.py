@@ -13,17 +13,15 @@ from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan
-from dpmjax.slam.keyframes import (
+from dpmjax.slam.keyframe_map import (
     Keyframe,
     KeyframeMap,
     MapEdge,
     Pose,
     add_keyframe,
-    are_near,
     diagonal_information,
-    orthonormal,
-    turn_rad,
     with_origin,
 )
 from dpmjax.slam.local_map import (

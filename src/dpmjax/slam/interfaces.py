@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.deeppointmap.verification import MeasuredScan
-from dpmjax.slam.config import MapOrigin, SlamConfig
-from dpmjax.slam.keyframes import Pose, Submap
+from dpmjax.slam.config import SlamConfig
+from dpmjax.slam.keyframe_map import MapOrigin, Pose, Submap
 from dpmjax.slam.local_map import LocalMap
 from dpmjax.types import PointCloud, Verification
 

@@ -16,8 +16,9 @@ from jaxtyping import Float
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.geometry.se3 import are_near, orthonormal
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframes import KeyframeMap, Pose, Submap, are_near, orthonormal, submap_around, with_origin
+from dpmjax.slam.keyframe_map import KeyframeMap, Pose, Submap, submap_around, with_origin
 from dpmjax.slam.loop_candidates import most_similar
 from dpmjax.slam.system import make_methods
 from dpmjax.types import AnyArray

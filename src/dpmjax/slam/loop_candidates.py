@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.slam.config import LoopClosureConfig
-from dpmjax.slam.keyframes import KeyframeMap
+from dpmjax.slam.keyframe_map import KeyframeMap
 from dpmjax.slam.loops import Loop
+from dpmjax.types import DescriptorCloud
 
 # Upper bound of the radius (DeepPointMap: 100 m).
 MAX_RADIUS_M = 100.0
@@ -93,6 +94,26 @@ def similar_keyframes(
     spacing_m = slam_map.keyframes[row].extent_m / 2
     similar = _spread(rows[cosines >= MIN_COSINE], slam_map, spacing_m, config.num_similar)
     return [Loop(row, int(other), "retrieval") for other in similar]
+
+
+def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
+    """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
+
+    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
+    where the scan turns about the vertical.
+
+    Args:
+        cloud: descriptors of a scan.
+
+    Returns:
+        (2 c,) float32; zero for an empty cloud.
+    """
+    features = np.asarray(cloud.features, np.float32)[np.asarray(cloud.mask)]
+    if len(features) == 0:
+        return np.zeros(2 * cloud.features.shape[-1], np.float32)
+    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
+    pooled = np.concatenate([features.mean(axis=0), features.std(axis=0)])
+    return np.asarray(pooled / max(float(np.linalg.norm(pooled)), 1e-12), np.float32)
 
 
 def most_similar(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from dpmjax.scans.weak_directions import with_least_covariance
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframes import KeyframeMap, submap_around
+from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
 from dpmjax.slam.loop_candidates import find_loop_candidates, nearest_pairs
 from dpmjax.slam.loops import (
     DESCRIPTOR_INFORMATION,

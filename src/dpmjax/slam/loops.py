@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import are_near
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, are_near, diagonal_information
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, Pose, diagonal_information
 
 # Standard deviations of a registration by descriptors alone: translation and rotation.
 DESCRIPTOR_SIGMA_M, DESCRIPTOR_SIGMA_RAD = 0.2, 0.02

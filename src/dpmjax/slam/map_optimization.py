@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from dpmjax.deepmapping.mapping import register_clouds
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
-from dpmjax.slam.keyframes import KeyframeMap, MapEdge, Pose, as_pose_graph, connected_parts
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, Pose, as_pose_graph, connected_parts
 from dpmjax.slam.loops import LoopState
 from dpmjax.types import AnyArray
 

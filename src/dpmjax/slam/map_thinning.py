@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import rigid
-from dpmjax.slam.keyframes import KeyframeMap, MapEdge, connected_parts, take_keyframes
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, connected_parts, take_keyframes
 
 
 def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:

@@ -23,9 +23,10 @@ from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_
 from dpmjax.scans.surfaces import Surface
 from dpmjax.scans.weak_directions import plane_information
 from dpmjax.slam.interfaces import Match, Proposal, ThinnedScan
-from dpmjax.slam.keyframes import Submap
+from dpmjax.slam.keyframe_map import Submap
 from dpmjax.slam.local_map import joined_surface, placed_keyframe
-from dpmjax.types import DescriptorCloud, Registration
+from dpmjax.slam.loop_candidates import pooled_vector
+from dpmjax.types import Registration
 
 # Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart.
 ELEMENT_RADIUS_M = 2.0
@@ -137,23 +138,3 @@ def _merged(submap: Submap) -> PreparedScan:
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *clouds)
     merged = merge_clouds(stacked, jnp.asarray(T_submap_scan, jnp.float32))
     return PreparedScan(thin_merged(merged, len(clouds[0].mask)), first.measured)
-
-
-def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
-    """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
-
-    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
-    where the scan turns about the vertical.
-
-    Args:
-        cloud: descriptors of a scan.
-
-    Returns:
-        (2 c,) float32; zero for an empty cloud.
-    """
-    features = np.asarray(cloud.features, np.float32)[np.asarray(cloud.mask)]
-    if len(features) == 0:
-        return np.zeros(2 * cloud.features.shape[-1], np.float32)
-    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
-    pooled = np.concatenate([features.mean(axis=0), features.std(axis=0)])
-    return np.asarray(pooled / max(float(np.linalg.norm(pooled)), 1e-12), np.float32)

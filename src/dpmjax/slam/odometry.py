@@ -11,13 +11,15 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap.encoding import thin_scan
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.verification import MIN_COSINE, PLANE_DISTANCE_M, MeasuredScan
+from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.scans.range_images import range_image, view_points
 from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces_from, nearest_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.interfaces import Alignment, ThinnedScan, best_of
-from dpmjax.slam.keyframes import Pose, orthonormal
+from dpmjax.slam.keyframe_map import Pose
 from dpmjax.slam.local_map import LocalMap
 
 # Turns about the x and y axes among the further starts.

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.scans.corrections import deskew
 from dpmjax.slam.interfaces import SlamMethods, ThinnedScan
-from dpmjax.slam.keyframes import Pose
+from dpmjax.slam.keyframe_map import Pose
 from dpmjax.types import AnyArray
 
 Item = TypeVar("Item")

@@ -16,7 +16,7 @@ from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import SlamMethods
-from dpmjax.slam.keyframes import KeyframeMap, as_pose_graph
+from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map

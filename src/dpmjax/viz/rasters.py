@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
-from dpmjax.viz.maps import time_colormap
+from dpmjax.viz.registered_scans import time_colormap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -47,7 +47,7 @@ def _mean(model: Model, other: Model) -> Model:
     """Returns the model with the mean of both parameters."""
     if jax.tree.map(jnp.shape, model.params) != jax.tree.map(jnp.shape, other.params):
         raise ValueError("--mean-with: expected a network of the same shapes")
-    return model.replace(params=jax.tree.map(lambda one, two: (one + two) / 2, model.params, other.params))
+    return Model(jax.tree.map(lambda one, two: (one + two) / 2, model.params, other.params), model.config)
 
 
 if __name__ == "__main__":

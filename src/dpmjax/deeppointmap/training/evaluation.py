@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from dpmjax.deeppointmap.evaluation_pairs import draw_rows_apart, scan_distances, true_poses
 from dpmjax.deeppointmap.matching import merge_clouds, thinned_mask
 from dpmjax.deeppointmap.model import Model, correlate, predict_offsets
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.scan_pairs import draw_rows_apart, scan_distances, true_poses
 from dpmjax.deeppointmap.scan_registration import trace_match
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig, training_pairs

@@ -87,6 +87,7 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
 
 
 def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
+    """Makes initial parameters for planar scans (`Problem.init`); without initial poses the start is zero."""
     net_key, map_key = jax.random.split(key)
     scans, phase = data.scans, phases_of(config, data)[0]
     poses = start = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
@@ -114,13 +115,13 @@ def _choose_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array,
 
 
 def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
-    """Starts the next phase from L-Net's poses, and re-centres the map frame."""
+    """Starts the next phase for planar scans (`Problem.next_phase`): poses as estimated, the map frame re-centred."""
     poses = _poses(config, phase, params, data)
     return replace(params, poses=poses, frame=_choose_frame(config, data.scans, poses))
 
 
 def _poses(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Float[Array, "n 3"]:
-    """Computes the poses of all scans, from the same number of beams as in training."""
+    """Computes the poses of all planar scans (`Problem.poses`), from the same number of beams as in training."""
     scans, count = data.scans, data.scans.mask.shape[0]
     rows = np.arange(count) if phase.scans_per_window is None else window_rows(count, phase.scans_per_window)
     poses = params.poses
@@ -145,7 +146,7 @@ def _localize(
     return se2.compose(params.start[rows], outputs)
 
 
-def _loss(
+def _planar_loss(
     config: DeepMappingConfig,
     phase: PhaseConfig,
     params: Params,
@@ -153,7 +154,7 @@ def _loss(
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """Computes DeepMapping eq. 6 of a batch of scans and beams."""
+    """Computes eq. 6 of DeepMapping for planar scans (`Problem.loss`): a batch of scans and beams."""
     scans, progress = data.scans, step / phase.num_steps
     batch_key, loss_key = jax.random.split(key)
     beam_key, row_key = jax.random.split(batch_key)
@@ -172,12 +173,14 @@ def _loss(
 
 
 def _scaled_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
+    """Checks initial poses x, y, heading and scales them from the unit of the points to typical ranges."""
     return jnp.asarray(se2.as_poses("start", start, num_scans) / [unit, unit, 1.0], jnp.float32)
 
 
 def _unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
+    """Scales poses x, y, heading from typical ranges to the unit of the points."""
     return np.asarray(poses, np.float64) * [unit, unit, 1.0]
 
 
 # DeepMapping of planar scans; poses are (n, 3) x, y, heading.
-PLANAR = Sensor(_scaled_start, _unscaled, _init, _loss, _poses, _next_phase)
+PLANAR = Sensor(_scaled_start, _unscaled, _init, _planar_loss, _poses, _next_phase)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -10,12 +9,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.slam.config import MapOrigin
+from dpmjax.scans.compact import expand_elements
+from dpmjax.slam.config import SlamConfig
 
 # Largest distance of the keyframes of a submap (DeepPointMap's published configuration).
 SUBMAP_RADIUS_M = 20.0
@@ -60,6 +59,23 @@ class MapEdge(NamedTuple):
     T_target_source: Pose
     information: Float[np.ndarray, "6 6"]
     kind: EdgeKind
+
+
+class MapOrigin(NamedTuple):
+    """Matcher and settings that made a keyframe map.
+
+    Attributes:
+        fingerprint: fingerprint of the matcher; keyframes of another matcher cannot be compared.
+        config: settings of SLAM.
+        weights: name of the weights, for messages; may be empty.
+    """
+
+    fingerprint: str
+    config: SlamConfig
+    weights: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.weights} ({self.fingerprint})" if self.weights else self.fingerprint
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,6 +259,20 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap
     return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
 
 
+def keyframe_points(slam_map: KeyframeMap, row: int) -> Float[np.ndarray, "n 3"]:
+    """Returns the surface elements of a keyframe.
+
+    Args:
+        slam_map: the map.
+        row: row of the keyframe.
+
+    Returns:
+        (n, 3) metres, in the frame of the keyframe's lidar.
+    """
+    elements = expand_elements(slam_map.keyframes[row].compact.elements)
+    return np.asarray(elements.positions)[np.asarray(elements.mask)]
+
+
 def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     """Makes the pose graph of a map; the ids of its nodes are numbers of scans.
 
@@ -257,50 +287,6 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     information = np.array([edge.information for edge in slam_map.edges]).reshape(-1, 6, 6)
     edges = Edges(ends[0], ends[1], T_target_source, information)
     return PoseGraph.create(slam_map.T_world_keyframe, edges, ids=slam_map.column("scan"))
-
-
-def turn_rad(T_a_b: Pose) -> float:
-    """Returns the angle of a rotation.
-
-    Args:
-        T_a_b: a motion.
-
-    Returns:
-        Radians, from 0 to pi.
-    """
-    R = T_a_b[:3, :3]
-    sine = math.hypot(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
-    return math.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1)
-
-
-def are_near(T_a: Pose, T_b: Pose, most_m: float, most_rad: float) -> bool:
-    """Returns True if two poses differ by at most a distance and a rotation angle.
-
-    Args:
-        T_a: a pose.
-        T_b: the second pose, in the same frame.
-        most_m: distance.
-        most_rad: turn.
-
-    Returns:
-        True at the limits, too.
-    """
-    apart = rigid.inverse(T_a) @ T_b
-    return bool(np.linalg.norm(apart[:3, 3]) <= most_m) and turn_rad(apart) <= most_rad
-
-
-def orthonormal(T_a_b: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
-    """Removes the rounding errors of rotations, which would grow from scan to scan.
-
-    Args:
-        T_a_b: nearly rigid motions.
-
-    Returns:
-        The rigid motions.
-    """
-    T = np.array(T_a_b, np.float64)
-    T[..., :3, :3] = Rotation.from_matrix(T[..., :3, :3]).as_matrix()
-    return T
 
 
 def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, "6 6"]:

@@ -108,7 +108,7 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Param
 
 
 def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
-    """Starts the next phase from the estimated poses, resets the motions to zero, and re-centres the map frame."""
+    """Starts the next phase (`Problem.next_phase`): poses as estimated, motions zero, the map frame re-centred."""
     T = _poses(config, phase, params, data)
     return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))
 
@@ -133,7 +133,7 @@ def _depth_loss(
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """Computes DeepMapping eq. 6 of a batch of pixels, compared by the Chamfer distance or by projection."""
+    """Computes eq. 6 of DeepMapping for depth images (`Problem.loss`): pixels by the Chamfer distance or projection."""
     batch_key, loss_key = jax.random.split(key)
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]
@@ -176,7 +176,7 @@ def _cloud_loss(
     step: Int[Array, ""],
     key: jax.Array,
 ) -> tuple[Float[Array, ""], Terms]:
-    """Computes DeepMapping eq. 6 of a batch of scans and points, compared by planes or by the Chamfer distance."""
+    """Computes eq. 6 of DeepMapping for lidar clouds (`Problem.loss`): points by planes or the Chamfer distance."""
     row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]

@@ -18,12 +18,11 @@ from dpmjax.registration_rgbd import (
     DepthSearchConfig,
     as_depth_scans,
     depth_search,
-    initialization,
     initialize_depth,
     projective_consistency,
+    trajectory_search,
 )
-from dpmjax.registration_rgbd.depth_images import PixelSample
-from dpmjax.registration_rgbd.initialization import SampledImages, _best_that_differ, _explained, _window, adjust_poses
+from dpmjax.registration_rgbd.depth_images import PixelSample, SampledImages
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     SearchCamera,
@@ -31,6 +30,8 @@ from dpmjax.registration_rgbd.motion_search import (
     propose_motions,
     surface_directions,
 )
+from dpmjax.registration_rgbd.pose_adjustment import adjust_poses
+from dpmjax.registration_rgbd.trajectory_search import _best_that_differ, _explained, _window
 from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)
@@ -115,12 +116,12 @@ def test_of_alike_trajectories_the_best_goes_on(walk, scans, monkeypatch) -> Non
     near[1:, 0, 3] += 0.02
     candidates = np.stack([near, far, turned, truth])[None]
     images, config = SampledImages(scans, scans.pixels, 1.0), depth_search("planar")
-    monkeypatch.setattr(initialization, "_MARGIN", 100.0)
+    monkeypatch.setattr(trajectory_search, "_MARGIN", 100.0)
     kept = _best_that_differ(candidates, images, config)
     np.testing.assert_array_equal(kept[0], truth)
     assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}
     assert len(_best_that_differ(candidates, images, replace(config, num_trajectories=2))) == 2
-    monkeypatch.setattr(initialization, "_MARGIN", 1e-6)
+    monkeypatch.setattr(trajectory_search, "_MARGIN", 1e-6)
     assert len(_best_that_differ(candidates, images, config)) == 1
 
 

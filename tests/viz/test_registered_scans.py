@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dpmjax.types import ScanSet
 from dpmjax.viz import Panel, registered_scans_figure, save_figure
-from dpmjax.viz.maps import MAX_POINTS_PER_PANEL, time_colormap
+from dpmjax.viz.registered_scans import MAX_POINTS_PER_PANEL, time_colormap
 
 
 def pixels(figure):

@@ -7,20 +7,16 @@ of each trajectory are adjusted. At the end they are adjusted at a finer toleran
 
 from __future__ import annotations
 
-from functools import partial
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry import rigid
 from dpmjax.geometry.sampling import typical_range
-from dpmjax.geometry.se3 import Motion, motion_matrices
-from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, surface_gap
+from dpmjax.geometry.se3 import Motion
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, SampledImages
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     MAX_TURN_DEG,
@@ -32,13 +28,8 @@ from dpmjax.registration_rgbd.motion_search import (
     propose_motions,
     surface_directions,
 )
-from dpmjax.registration_rgbd.projective_consistency import (
-    consistency_of_pairs,
-    explained_share,
-    gap_equations,
-    improve_motions,
-    motion_scales,
-)
+from dpmjax.registration_rgbd.pose_adjustment import adjust_poses
+from dpmjax.registration_rgbd.projective_consistency import explained_share
 
 # Least root mean square difference of two trajectories, as shares of the largest translation and of the largest turn.
 _APART = (0.085, 0.075)
@@ -57,20 +48,6 @@ _NUM_WINDOW = 24
 _NUM_ITERATIONS = 6
 # Number of trajectories in the last adjustment, and of its tolerances.
 _NUM_LAST, _NUM_TOLERANCES = 4, 3
-
-
-class SampledImages(NamedTuple):
-    """Depth images with some points of each.
-
-    Attributes:
-        scans: the images.
-        sample: points by which trajectories are compared and adjusted.
-        unit: typical range of the images, unit of the points.
-    """
-
-    scans: DepthScans
-    sample: PixelSample
-    unit: Float[Array, ""] | float
 
 
 def initialize_depth(
@@ -184,78 +161,3 @@ def _adjusted(
         motions = adjust_poses(before, window, tolerance, num_iterations=_NUM_ITERATIONS, motion=motion)
         one[rows[:num_placed]] @= np.asarray(motions, np.float64)[:num_placed]
     return T
-
-
-@partial(jax.jit, static_argnames=("num_iterations", "motion"))
-def adjust_poses(
-    T_world_camera: Float[Array, "n 4 4"],
-    images: SampledImages,
-    tolerance: Float[Array, ""] | float,
-    *,
-    num_iterations: int,
-    motion: Motion,
-) -> Float[Array, "n 4 4"]:
-    """Adjusts poses to the surfaces of all other images, as long as the projective consistency grows.
-
-    Args:
-        T_world_camera: initial poses, with errors of few tolerances.
-        images: depth images, unit of the poses.
-        tolerance: share of the depth; unit of the residuals in `gap_equations`.
-        num_iterations: number of steps.
-        motion: degrees of freedom of the camera.
-
-    Returns:
-        Motions to right-multiply to the poses, T_world_camera @ motion; that of the first image is the identity.
-    """
-    scans, sample, unit = images
-    tolerance, count = jnp.asarray(tolerance), T_world_camera.shape[0]
-    scales, offsets = motion_scales(motion, unit, tolerance), jnp.arange(1, count // 2 + 1)
-    # The first image is fixed.
-    free = slice(len(scales), None)
-
-    def with_first(motions: Float[Array, "m 4 4"]) -> Float[Array, "n 4 4"]:
-        return jnp.concatenate([jnp.eye(4)[None], motions])
-
-    def equations(motions: Float[Array, "m 4 4"]) -> tuple[Float[Array, "mk mk"], Float[Array, " mk"]]:
-        T = rigid.compose(T_world_camera, with_first(motions))
-        matrix, gradient = _normal_equations(T, scans, sample, scales, tolerance)
-        return matrix[free, free], gradient[free]
-
-    def score(motions: Float[Array, "m 4 4"]) -> Float[Array, ""]:
-        T = rigid.compose(T_world_camera, with_first(motions))
-        return consistency_of_pairs(T, sample, scans, offsets, tolerance)
-
-    return with_first(improve_motions(equations, score, scales, count=count - 1, num_iterations=num_iterations))
-
-
-def _normal_equations(
-    T: Float[Array, "n 4 4"],
-    scans: DepthScans,
-    sample: PixelSample,
-    scales: Float[Array, " k"],
-    tolerance: Float[Array, ""],
-) -> tuple[Float[Array, "nk nk"], Float[Array, " nk"]]:
-    """Computes the normal equations of the residuals of all pairs of images, in both directions."""
-    count, freedom, surfaces = T.shape[0], len(scales), scans.surfaces
-
-    def gaps(values: Float[Array, "2 k"], pair: Int[Array, "2"]) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-        camera, other = rigid.compose(T[pair], motion_matrices(scales * values))
-        points = PixelSample(sample.points[pair[0]], sample.mask[pair[0]])
-        T_other_camera = rigid.compose(rigid.inverse(other), camera)
-        gap, is_visible = surface_gap(T_other_camera, points, surfaces[pair[1]], scans.pinhole)
-        return gap / tolerance, is_visible
-
-    def of_pair(pair: Int[Array, "2"]) -> tuple[Float[Array, "2 k 2 k"], Float[Array, "2 k"]]:
-        here = jnp.zeros((2, freedom))
-        gap, is_visible = gaps(here, pair)
-        slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, pair)
-        return gap_equations(gap, is_visible, slopes)
-
-    camera, other = jnp.nonzero(~jnp.eye(count, dtype=bool), size=count * (count - 1))
-    pairs = jnp.stack([camera, other], axis=-1)
-    blocks, slopes = jax.lax.map(of_pair, pairs, batch_size=count)
-    matrix = jnp.zeros((count, freedom, count, freedom))
-    rows, columns = pairs[:, :, None], pairs[:, None, :]
-    matrix = matrix.at[rows, :, columns].add(blocks.transpose(0, 1, 3, 2, 4))
-    gradient = jnp.zeros((count, freedom)).at[pairs].add(slopes)
-    return matrix.reshape(count * freedom, -1), gradient.reshape(-1)
