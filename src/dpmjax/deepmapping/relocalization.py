@@ -81,7 +81,7 @@ def map_fields(raster: MapRaster) -> MapFields:
 
 
 def largest_nearby(values: Float[Array, "r r"], radius: Float[Array, ""]) -> Float[Array, "r r"]:
-    """Computes the largest value in the square around each node, by doubling; the raster is periodic.
+    """Computes the largest value of the map's raster around each node, by doubling; the raster is periodic.
 
     Args:
         values: values at the nodes.

@@ -156,7 +156,7 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
     """
     a, b = a.described, b.described
     for name, cloud in (("a", a), ("b", b)):
-        _require_cloud(name, cloud, model.config.decoder.input_channels)
+        _require_descriptor_cloud(name, cloud, model.config.decoder.input_channels)
     return _decode(model, a, b, part="correlate")
 
 
@@ -278,7 +278,7 @@ def _decode(model: Model, *arguments: Any, part: str) -> Any:
     )
 
 
-def _require_cloud(name: str, cloud: DescriptorCloud, num_channels: int) -> None:
+def _require_descriptor_cloud(name: str, cloud: DescriptorCloud, num_channels: int) -> None:
     num = cloud.positions.shape[0]
     for part, shape in (("positions", (num, 3)), ("features", (num, num_channels)), ("mask", (num,))):
         require_shape(f"{name}.{part}", getattr(cloud, part), shape)

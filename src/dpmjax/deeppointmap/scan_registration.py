@@ -127,7 +127,7 @@ def register_each(
             elif refine and all(cloud.normals is not None for cloud in clouds):
                 motion = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
             else:
-                motion = pool.submit(_ChosenMotion, 0, np.asarray(hypotheses.T_target_source[0]))
+                motion = pool.submit(_RegisteredMotion, 0, np.asarray(hypotheses.T_target_source[0]))
             started.append((hypotheses, motion))
         return [_as_registration(model, hypotheses, motion.result()) for hypotheses, motion in started]
 
@@ -191,7 +191,7 @@ def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
     return np.asarray(hypotheses.T_target_source[:num_motions], np.float64)
 
 
-class _ChosenMotion(NamedTuple):
+class _RegisteredMotion(NamedTuple):
     """Chosen and refined motion of one pair, in metres; the confidence rests on the evidence before the refinement."""
 
     row: int | None
@@ -250,16 +250,18 @@ def _prepared(
 
 def _verified(
     source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
-) -> _ChosenMotion:
+) -> _RegisteredMotion:
     """Chooses the motion of two scans by their surfaces and free space, and refines it on request."""
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
     weak = weak_direction_of(source, target, T, config)
-    return _ChosenMotion(chosen.row, T, chosen.verification, final.verification, weak)
+    return _RegisteredMotion(chosen.row, T, chosen.verification, final.verification, weak)
 
 
-def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float) -> _ChosenMotion:
+def _refined(
+    source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float
+) -> _RegisteredMotion:
     """Refines the best motion of two descriptor clouds by their surface elements."""
     # The elements alone cannot choose among hypotheses: in a corridor, or after a half-turn, wrong ones meet the same
     # number of planes.
@@ -268,10 +270,10 @@ def _refined(source: DescriptorCloud, target: DescriptorCloud, hypotheses: Regis
         aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
         T_target_source = np.array(aligned.T_target_source)
     T_target_source[:3, 3] /= scale
-    return _ChosenMotion(0, T_target_source)
+    return _RegisteredMotion(0, T_target_source)
 
 
-def _as_registration(model: Model, hypotheses: Registration, motion: _ChosenMotion) -> Registration:
+def _as_registration(model: Model, hypotheses: Registration, motion: _RegisteredMotion) -> Registration:
     """Joins the hypothesis that was chosen, its motion and its verification, and adds the confidence."""
     row, evidence = motion.row, gather_evidence(hypotheses, motion.row, motion.evidence)
     match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row or 0]), hypotheses)

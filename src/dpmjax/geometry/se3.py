@@ -63,7 +63,7 @@ def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
 
 
 def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
-    """Makes the motions of a camera.
+    """Makes motions in space from the numbers that a fit adjusts.
 
     Args:
         values: (n, 3) x, z and the angle about y of a level camera, or (n, 6) twists.

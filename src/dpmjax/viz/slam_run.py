@@ -120,7 +120,7 @@ def height_map_figure(
     figures.set_title(axes, title, 11, loc="left", fontweight="bold")
     bar_in = min(height_in, 3.0)
     bar = figures.add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
-    shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _colormap()), cax=bar, extend="both")
+    shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _height_colormap()), cax=bar, extend="both")
     shown.set_label("height above the lidar, m", fontsize=8, color=MUTED)
     bar.tick_params(labelsize=7, colors=MUTED)
     return figure
@@ -136,10 +136,10 @@ def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"
         Red, green, blue from 0 to 255.
     """
     share = (np.asarray(heights_m, np.float64) - HEIGHTS_M[0]) / (HEIGHTS_M[1] - HEIGHTS_M[0])
-    return np.asarray(_colormap()(np.clip(share, 0, 1), bytes=True))[:, :3]
+    return np.asarray(_height_colormap()(np.clip(share, 0, 1), bytes=True))[:, :3]
 
 
-def _colormap() -> Colormap:
+def _height_colormap() -> Colormap:
     import matplotlib
     from matplotlib.colors import LinearSegmentedColormap
 

@@ -41,9 +41,9 @@ def load_model(path_or_name: str | Path) -> Model:
 
     path = Path(path_or_name)
     if path.suffix in TORCH_SUFFIXES:
-        return import_torch_checkpoint(_existing(path))
+        return import_torch_checkpoint(_existing_model_file(path))
     if path.suffix == SUFFIX:
-        return _load_safetensors(_existing(path))
+        return _load_safetensors(_existing_model_file(path))
     if path.name in shipped_models() and path == Path(path.name):
         return _load_safetensors(SHIPPED / (path.name + SUFFIX))
     shipped = ", ".join(shipped_models()) or "none yet"
@@ -98,7 +98,7 @@ def read_card(path_or_name: str | Path) -> str:
         The description that was given to `save_model`.
     """
     path = SHIPPED / f"{path_or_name}{SUFFIX}" if str(path_or_name) in shipped_models() else Path(path_or_name)
-    return _read(_existing(path))[0].get("card", "")
+    return _read(_existing_model_file(path))[0].get("card", "")
 
 
 def _load_safetensors(path: Path) -> Model:
@@ -148,7 +148,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
     return header, arrays
 
 
-def _existing(path: Path) -> Path:
+def _existing_model_file(path: Path) -> Path:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     return path

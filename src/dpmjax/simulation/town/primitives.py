@@ -121,7 +121,7 @@ def capacity_for(count: int, *, least: int = 64) -> int:
 
 
 def padded(rows: FloatArray, capacity: int) -> jax.Array:
-    """Pads the rows with zeros up to the capacity, as float32.
+    """Pads a list of primitives with zeros up to the capacity, as float32.
 
     Args:
         rows: (n, ...) values.
