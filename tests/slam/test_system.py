@@ -398,27 +398,39 @@ class LookAlikeGeometry(TruthGeometry):
     """A scan fits everywhere, and best at the pose that looks alike; from one scan on, it does not fit at the truth."""
 
     first_low: int = 99
+    alike_score: float = 0.8
 
     def search(self, local_map, scan, T_map_scan):
         found = super().search(local_map, scan, T_map_scan)
         off = rigid.inverse(found.T_map_scan) @ T_map_scan[0]
         is_other = bool(np.linalg.norm(off[:3, 3]) > 2.0 or off[0, 0] < 0.0)
         score = 0.6 if number_of_scan(scan) < self.first_low else 0.1
-        return found._replace(T_map_scan=T_map_scan[0], score=0.8) if is_other else found._replace(score=score)
+        return (
+            found._replace(T_map_scan=T_map_scan[0], score=self.alike_score)
+            if is_other
+            else found._replace(score=score)
+        )
 
 
-@pytest.mark.parametrize("T_true_found", [pose(0.0, 0.0, np.pi), pose(3.0, 2.0, 0.0)], ids=["turned", "elsewhere"])
+TURNED, ELSEWHERE = pose(0.0, 0.0, np.pi), pose(3.0, 2.0, 0.0)
+
+
 @pytest.mark.parametrize(
-    ("probability", "first_low", "is_moved"),
-    [(0.3, 99, False), (0.9, 99, True), (0.3, 5, True)],
-    ids=["unsure", "sure", "unsure, but the prediction fails"],
+    ("T_true_found", "probability", "score", "first_low", "is_moved"),
+    [
+        pytest.param(TURNED, 0.9, 0.65, 99, False, id="no lead"),
+        pytest.param(TURNED, 0.3, 0.8, 99, True, id="turned on the spot"),
+        pytest.param(ELSEWHERE, 0.3, 0.8, 99, False, id="unsure"),
+        pytest.param(ELSEWHERE, 0.9, 0.8, 99, True, id="sure"),
+        pytest.param(ELSEWHERE, 0.3, 0.8, 5, True, id="the prediction fails"),
+    ],
 )
-def test_a_scan_that_is_tracked_is_moved_by_a_sure_decoder_alone(
-    T_true_found, probability, first_low, is_moved
+def test_a_scan_that_is_tracked_moves_to_another_place_by_a_lead_in_score(
+    T_true_found, probability, score, first_low, is_moved
 ) -> None:
     truth = np.array([pose(0.5 * number, 0.0, 0.0) for number in range(8)])
     matcher = LookAlikeMatcher(truth, T_true_found=T_true_found, probability=probability)
-    geometry = LookAlikeGeometry(truth, first_low=first_low)
+    geometry = LookAlikeGeometry(truth, first_low=first_low, alike_score=score)
     result = run(truth, matcher=matcher, geometry=geometry, config=without_loops())
     off = np.linalg.norm(result.T_world_scan - truth, axis=(1, 2)).max()
     assert (off > 1.5) == is_moved

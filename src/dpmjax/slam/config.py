@@ -1,6 +1,7 @@
 """Settings of `run_slam`, one record for each stage; localization has its own.
 
-Lengths that depend on the place are shares of the scans' extent. The extent of a scan is the median range of its surface points: about 12 m in a street, 4 m in a room.
+Lengths that depend on the place are shares of the scans' extent. The extent of a scan is the median range of its
+surface points: about 12 m in a street, 4 m in a room.
 """
 
 from __future__ import annotations

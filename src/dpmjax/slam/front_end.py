@@ -60,8 +60,8 @@ CONFIRMED_RAD = 0.087
 # Smallest P(correct) of a decoder's motion that is accepted at any score: few elements of sparse scans meet planes.
 SURE_PROBABILITY = 0.9
 
-# Least lead in score with which a pose replaces the tracked one of another place; for the pose of an unsure decoder it
-# is this share of the usual score.
+# Least lead in score with which a pose replaces the tracked one of another place; for a pose far off by an unsure
+# decoder it is this share of the usual score.
 MIN_LEAD, UNSURE_LEAD_SHARE = 0.1, 0.5
 
 # Number of scans whose median is the usual score, and of those before which the decoder proposes every pose: a wrong
@@ -282,11 +282,12 @@ def _attempt(
     if tracked is None and (is_predicted or matched.score < good_score):
         tracked = geometry.align(local_map, scan, predicted)
     if tracked is not None:
-        if matched.score < good_score:
+        if matched.score < good_score or not are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
             others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
             tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
         # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
-        is_sure = proposal.probability >= methods.config.front_end.min_probability
+        is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, np.inf)
+        is_sure = is_near or proposal.probability >= methods.config.front_end.min_probability
         lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
         best = _better_of(tracked, matched, lead if state.scores else 0.0)
     return _Attempt(best, tracked, starts[0], proposal.probability, compact)
