@@ -59,14 +59,14 @@ class LocalizationConfig:
         num_registered: largest number of these keyframes that are registered, in order of their overlap.
         min_support: number of registrations that must end at the same place; the scans of at least one must agree. One
             registration suffices where no other keyframe is near.
-        min_best: smallest P(correct) of the best registration of a place. Streets look alike, so
-            several registrations may agree on a wrong place.
+        min_best: smallest P(correct) of the best registration of a place. It is the best of the places that look most
+            alike, and several registrations may agree on a wrong one: streets look alike.
     """
 
     num_similar: int = 16
     num_registered: int = 8
     min_support: int = 2
-    min_best: float = 0.9
+    min_best: float = 0.95
 
     def __post_init__(self) -> None:
         require_fields(self, "num_similar", "num_registered", "min_support", low=1)
