@@ -436,6 +436,22 @@ def test_a_scan_that_is_tracked_moves_to_another_place_by_a_lead_in_score(
     assert (off > 1.5) == is_moved
 
 
+class StuckGeometry(LookAlikeGeometry):
+    """From one scan on, the alignment from the prediction ends at a low score, and a search finds the truth."""
+
+    def align(self, local_map, scan, T_map_scan):
+        found = super().align(local_map, scan, T_map_scan)
+        return found if number_of_scan(scan) < 5 else found._replace(score=0.1)
+
+
+def test_a_pose_elsewhere_competes_with_those_of_other_motions() -> None:
+    truth = np.array([pose(0.5 * number, 0.0, 0.0) for number in range(8)])
+    matcher = LookAlikeMatcher(truth, T_true_found=ELSEWHERE, probability=0.9)
+    geometry = StuckGeometry(truth, alike_score=0.55)
+    result = run(truth, matcher=matcher, geometry=geometry, config=without_loops())
+    np.testing.assert_allclose(result.T_world_scan, truth, atol=0.2)
+
+
 class HollowGeometry(TruthGeometry):
     """Scans of so few walls that a right pose meets no plane."""
 

@@ -294,7 +294,7 @@ def _attempt(
 
 
 def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
-    """Returns the other alignment where it scores higher than the tracked one, at another place higher by a lead."""
+    """Returns `other` where its score is higher than that of `tracked`, at another place higher by the lead."""
     is_same = are_near(tracked.T_map_scan, other.T_map_scan, PLACE_M, PLACE_RAD)
     return other if other.score > tracked.score + (0.0 if is_same else lead) else tracked
 

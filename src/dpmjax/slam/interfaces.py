@@ -100,18 +100,6 @@ class Geometry(Protocol):
         """
 
 
-def best_of(alignments: Sequence[Alignment]) -> Alignment:
-    """Returns the alignment of the highest score.
-
-    Args:
-        alignments: at least one.
-
-    Returns:
-        The alignment; the first of equal ones.
-    """
-    return max(alignments, key=lambda found: found.score)
-
-
 class Match(NamedTuple):
     """A registration without a first guess.
 

@@ -18,7 +18,7 @@ from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig
-from dpmjax.slam.interfaces import Alignment, ThinnedScan, best_of
+from dpmjax.slam.interfaces import Alignment, ThinnedScan
 from dpmjax.slam.keyframe_map import Pose
 from dpmjax.slam.local_map import LocalMap
 
@@ -129,7 +129,7 @@ class SurfaceGeometry:
             for found in align_surfaces_from(surface, local_map.surface, T_map_scan, self.config.wide)
         ]
         coarse.sort(key=lambda T: -_matched_share(surface, self._planes(local_map, surface, T, NUM_SAMPLES // 3)))
-        return best_of(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])))
+        return max(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])), key=lambda found: found.score)
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
