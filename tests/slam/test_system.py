@@ -385,12 +385,13 @@ class LookAlikeMatcher(TruthMatcher):
 
     T_true_found: np.ndarray = field(default_factory=lambda: np.eye(4))
     probability: float = 0.3
+    is_calibrated: bool = True
 
     def propose(self, source, target, num_motions):
         T = rigid.inverse(self.T_world_scan[number_of(target)]) @ self.T_world_scan[number_of(source)]
         # The second scan has nothing but the decoder.
         T = T if number_of(source) == 1 else T @ self.T_true_found
-        return Proposal(T[None], self.probability)
+        return Proposal(T[None], self.probability, self.is_calibrated)
 
 
 @dataclass(frozen=True)
@@ -459,10 +460,12 @@ class HollowGeometry(TruthGeometry):
         return super().search(local_map, scan, T_map_scan)._replace(score=-0.1)
 
 
-@pytest.mark.parametrize(("probability", "is_placed"), [(0.95, True), (0.85, False)])
-def test_only_a_sure_decoder_places_scans_that_meet_no_plane(probability, is_placed) -> None:
+@pytest.mark.parametrize(
+    ("probability", "is_calibrated", "is_placed"), [(0.95, True, True), (0.85, True, False), (0.95, False, False)]
+)
+def test_only_a_sure_decoder_places_scans_that_meet_no_plane(probability, is_calibrated, is_placed) -> None:
     truth = laps(1, side_m=20.0)
-    matcher = LookAlikeMatcher(truth, probability=probability)
+    matcher = LookAlikeMatcher(truth, probability=probability, is_calibrated=is_calibrated)
     result = run(truth, range(30), matcher=matcher, geometry=HollowGeometry(truth), config=without_loops())
     assert ("predicted" not in {report.status for report in result.reports}) == is_placed
 

@@ -214,6 +214,7 @@ class _Attempt(NamedTuple):
     T_map_scan: Pose | None = None
     probability: float | None = None
     compact: CompactScan | None = None
+    is_calibrated: bool = True
 
 
 def _locate(
@@ -290,7 +291,7 @@ def _attempt(
         is_sure = is_near or proposal.probability >= methods.config.front_end.min_probability
         lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
         best = _better_of(tracked, matched, lead if state.scores else 0.0)
-    return _Attempt(best, tracked, starts[0], proposal.probability, compact)
+    return _Attempt(best, tracked, starts[0], proposal.probability, compact, proposal.is_calibrated)
 
 
 def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
@@ -304,7 +305,7 @@ def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
     best, probability = tried.best, tried.probability or 0.0
     if tried.T_map_scan is None or not are_near(tried.T_map_scan, best.T_map_scan, PLACE_M, CONFIRMED_RAD):
         return False
-    if probability >= SURE_PROBABILITY:
+    if tried.is_calibrated and probability >= SURE_PROBABILITY:
         return True
     if tried.tracked is None or probability < min_probability or best.score < MIN_SCORE:
         return False

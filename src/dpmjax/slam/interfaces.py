@@ -124,11 +124,13 @@ class Proposal(NamedTuple):
 
     Attributes:
         T_target_source: (h, 4, 4) float64, the most likely first.
-        probability: P(correct) of the first motion.
+        probability: P(correct) of the first motion; of a model without calibration a score.
+        is_calibrated: True for a probability.
     """
 
     T_target_source: Float[np.ndarray, "h 4 4"]
     probability: float
+    is_calibrated: bool = True
 
 
 class Matcher(Protocol):

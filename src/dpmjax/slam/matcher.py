@@ -85,8 +85,9 @@ class NetworkMatcher:
             matching = replace(matching, consensus=replace(matching.consensus, num_motions=num_motions))
         hypotheses = match_clouds(self._model, source.cloud, target.cloud, config=matching)
         best = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), hypotheses)
-        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), self._model.config.calibration)
-        return Proposal(distinct_motions(hypotheses), float(confident.confidence))
+        calibration = self._model.config.calibration
+        confident = with_confidence(best, gather_evidence(hypotheses, 0, None), calibration)
+        return Proposal(distinct_motions(hypotheses), float(confident.confidence), calibration is not None)
 
     def register(self, pairs: Sequence[tuple[Submap, Submap]]) -> list[Match]:
         """Registers merged descriptors, verifies by the central scans, aligns with the whole target; see `Matcher`.
