@@ -94,6 +94,18 @@ def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_sc
     assert len(truth) == metrics["num_scans"]
 
 
+def test_a_reference_in_millimetres_is_doubted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    drive, out = tmp_path / "drive", tmp_path / "out"
+    truth = write_room(drive, 6)
+    write_tum(drive / "poses_lidar.txt", truth)
+    assert run(drive, "-o", out) == EXIT_OK
+    assert load_json(out / "metrics.json")["reference_doubt"] is None
+    truth[:, :3, 3] *= 1000
+    write_tum(drive / "poses_lidar.txt", truth)
+    assert run(drive, "-o", tmp_path / "other") == EXIT_OK
+    assert "2e+03 m long, the trajectory 2 m: is the reference in metres?" in capsys.readouterr().out
+
+
 def test_millimetres_and_a_map_are_named_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     write_room(tmp_path / "drive", 3)
     far = np.random.default_rng(0).normal([5e5, 5.4e6, 300], 1, (500, 3))

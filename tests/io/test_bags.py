@@ -111,6 +111,13 @@ def test_a_folder_of_parts_is_one_drive(tmp_path: Path, clouds) -> None:
         np.testing.assert_array_equal(drive.read_scan(index), clouds[index])
 
 
+def test_a_missing_part_of_a_bag_is_named(tmp_path: Path) -> None:
+    files = "rosbag2_bagfile_information: {version: 5, relative_file_paths: [drive_0.db3]}"
+    (tmp_path / "metadata.yaml").write_text(files)
+    with pytest.raises(InputError, match="drive_0.db3"):
+        open_lidar_sequence(tmp_path)
+
+
 def test_a_pose_file_is_matched_by_time(tmp_path: Path, clouds) -> None:
     path = write_clouds(tmp_path / "a", "db3", clouds)
     T = np.tile(np.eye(4), (30, 1, 1))

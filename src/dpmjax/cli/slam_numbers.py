@@ -15,6 +15,9 @@ from dpmjax.sequences import LidarSequence
 MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
 """Largest errors of a right localisation."""
 
+MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
+"""Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres."""
+
 
 class SlamRun(NamedTuple):
     """A run until its end or its stop.
@@ -122,6 +125,22 @@ def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, su
     }
 
 
+def length_doubt(T_world_scan: np.ndarray, reference: np.ndarray | None) -> str | None:
+    """Returns a doubt where the reference is far longer or shorter than the trajectory, as in another unit; or None."""
+    if reference is None:
+        return None
+    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
+    way_m, reference_m = (_path(T[has_reference]) for T in (T_world_scan, reference))
+    if min(way_m, reference_m) < MIN_WAY_M or 1 / MAX_LENGTH_RATIO < reference_m / way_m < MAX_LENGTH_RATIO:
+        return None
+    return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
+
+
+def _path(T: np.ndarray) -> float:
+    """Returns the length of a trajectory."""
+    return float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
+
+
 def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | None) -> np.ndarray | None:
     """Returns the distance of each scan to the reference after the best rigid alignment; NaN for scans without one."""
     if reference is None:
@@ -142,7 +161,8 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
     return {
         "sequence": sequence.name,
         "num_scans": len(T),
-        "path_m": float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()),
+        "path_m": _path(T),
+        "reference_doubt": length_doubt(T, reference),
         "num_keyframes": len(result.keyframes),
         "num_parts": count_parts(result.map),
         "num_loops": loops["accepted"],
@@ -216,6 +236,8 @@ def summary(numbers: Mapping[str, Any]) -> str:
         lines[-1] += " (scans.csv has the reason for each)"
     if numbers["num_parts"] > 1:
         lines.append(f"the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess")
+    if numbers["reference_doubt"] is not None:
+        lines.append(f"warning: {numbers['reference_doubt']}")
     if "ate_m" in numbers:
         lines.append("errors against the reference poses (ATE of the whole drive, RPE from scan to scan):")
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):

@@ -66,10 +66,15 @@ def _bag_files(path: Path) -> list[Path]:
     """Lists the files of a bag; the folder itself where it has ROS 2's metadata.yaml."""
     if not path.is_dir():
         return [path]
-    if (path / "metadata.yaml").is_file() and any(path.glob("*.mcap*")) | any(path.glob("*.db3*")):
+    if _names_ros2_files(path / "metadata.yaml"):
         return [path]
     parts = (sorted(path.glob(f"*{suffix}"), key=lambda file: natural_key(file.name)) for suffix in _SUFFIXES)
     return next((found for found in parts if found), [])
+
+
+def _names_ros2_files(metadata: Path) -> bool:
+    """Returns True for the list of files of a ROS 2 bag; another program's metadata.yaml lies beside its scans."""
+    return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()
 
 
 class Bag:
