@@ -6,6 +6,7 @@ Matcher and geometry know the truth; a scan is one point, whose x is the number 
 from __future__ import annotations
 
 import csv
+import errno
 import os
 import shutil
 import signal
@@ -207,6 +208,18 @@ def test_a_bad_scan_on_the_way_keeps_what_was_found(whole, drive, with_truth, tm
     path.write_bytes(good)
     assert run("--resume", "-o", out) == EXIT_OK
     assert_same_results(out, whole)
+
+
+def test_a_full_disk_is_one_line(drive, with_truth, tmp_path, monkeypatch, capsys) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("dpmjax.viz.save_figure", fail)
+    assert run(drive, "-n", 5, "-o", tmp_path / "out") == EXIT_FAILED
+    errors = capsys.readouterr().err
+    assert "Traceback" not in errors
+    assert "No space left on device" in errors.strip().splitlines()[-1]
+    assert "Traceback" in (tmp_path / "out" / "log.txt").read_text()
 
 
 def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:

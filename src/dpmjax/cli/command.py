@@ -159,7 +159,8 @@ def run_command(
     except ValueError as error:
         return _say(f"error: {error}", EXIT_BAD_INPUT)
     except RunFailedError as error:
-        if not isinstance(error.__cause__, InputError):
+        # A full disk is no fault of the program; log.txt has the traceback.
+        if not isinstance(error.__cause__, InputError | OSError):
             traceback.print_exception(error.__cause__)
         return _say(f"error: {error}; what was finished is in {error.path}", EXIT_FAILED)
     except Exception as error:
