@@ -284,9 +284,9 @@ def summary(numbers: dict[str, Any]) -> str:
         lines.append(line)
     for component in numbers["components"]:
         members = ", ".join(map(str, component["agents"]))
-        text = "one frame" if len(component["agents"]) > 1 else "met nobody, a frame of its own"
-        ate = component["ate_m"]
-        lines.append(f"agents {members}: {text}" + ("" if ate is None else f", ATE together {ate:.3f} m"))
+        is_alone, ate = len(component["agents"]) == 1, component["ate_m"]
+        line = f"agent {members}: met nobody, a frame of its own" if is_alone else f"agents {members}: one frame"
+        lines.append(line + ("" if ate is None else f", ATE {'' if is_alone else 'together '}{ate:.3f} m"))
     return "\n".join([*lines, f"{numbers['num_loops_between']} loops between agents"])
 
 
