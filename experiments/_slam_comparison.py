@@ -38,7 +38,7 @@ COLORS = {
     "KISS-SLAM": "#b5432e",
     "small_gicp": "#7a5aa6",
     ODOMETRY: "#6fa3d8",
-    NETWORK: "#e0a030",
+    NETWORK: "#2a9d5c",
     OURS: "#1f4e8c",
 }
 SIZES = {

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 _COLUMNS = 4
-_CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c")
+_CURVE_COLORS = ("#8a929b", "#e08a1e", "#1f4e8c", "#4f8fcf", "#2a9d5c", "#7a5aa6")
 _MARGIN = 0.12
 # Inches: side of a panel; width of a character of the legend, height of a line.
 _PANEL_IN, _CHARACTER_IN, _LINE_IN = 3.1, 0.065, 0.18
