@@ -82,11 +82,10 @@ def main(config: Config) -> dict[str, Any]:
     start = slam.init_slam(None if config.map is None else files.open_map(config.map, methods))
     sequence = open_drive(config.data, config, config.sequence)
     reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
-    earlier = RunFolder(find_run(NAME, config.output) if config.resume else Path(), is_resumed=config.resume)
-    beginning = find_beginning(earlier, methods, start)
+    beginning = find_beginning(find_run(NAME, config.output) if config.resume else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{numbers.counted(num_done, 'scan')} done, {len(sequence)} wanted"
-    require(num_done <= len(sequence), earlier.path, found, f"give -n {num_done} or more, or another folder with -o")
+    require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
     folder = open_run_folder(config, NAME)
     with recording(folder), StopFlag() as stop:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""

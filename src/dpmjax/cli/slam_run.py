@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -86,10 +87,10 @@ class Timed:
         return partial(self._watch.timed, _STAGES[name] + self._suffix, found) if name in _STAGES else found
 
 
-def find_beginning(folder: RunFolder, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
-    """Reads the state of a resumed run; raises a `ValueError` for a run with other weights."""
-    path = folder / STATE
-    if not folder.is_resumed or not path.is_file():
+def find_beginning(earlier: Path | None, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
+    """Reads the state of an earlier run, if there is one; raises a `ValueError` for a run with other weights."""
+    path = None if earlier is None else earlier / STATE
+    if path is None or not path.is_file():
         return RunState(start, ())
     found = load_state(path)
     made_by, given = found.state.slam_map.origin, methods.origin
@@ -115,7 +116,7 @@ def map_drive(
     Raises:
         InputError: a scan on the way that cannot be read.
     """
-    beginning = find_beginning(folder, methods, slam.init_slam())
+    beginning = find_beginning(folder.path if folder.is_resumed else None, methods, slam.init_slam())
     run = run_scans(folder, ScanReader(sequence), methods, beginning, is_stopped)
     if run.failure is not None:
         raise run.failure
