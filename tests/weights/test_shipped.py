@@ -5,12 +5,14 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import Model, encode, register
 from dpmjax.geometry import rigid
-from dpmjax.metrics import registration_recall
+from dpmjax.metrics import absolute_trajectory_error, registration_recall
 from dpmjax.simulation import SceneMixture, draw_scene, simulate_scene
 from dpmjax.simulation.town.scan import OS1_64
+from dpmjax.slam import run_slam
 from dpmjax.weights import load_model, read_card, shipped_models
 from dpmjax.weights.model_file import SHIPPED
 
@@ -52,3 +54,15 @@ def test_scans_of_an_unseen_suburb_are_registered_by_the_network_alone(model):
         found.append(np.asarray(register(model, source, target).T_target_source))
         true.append(rigid.inverse(drive.T_world_lidar[b]) @ drive.T_world_lidar[a] @ turn)
     assert registration_recall(np.stack(found), np.stack(true)).recall >= 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("axis", "degrees"), [("z", 180.0), ("x", 180.0), ("y", 30.0)], ids=["back", "down", "tilted"])
+def test_a_lidar_may_be_mounted_in_any_way(model: Model, axis: str, degrees: float) -> None:
+    mixture = SceneMixture(kinds=(("suburb", 1.0),), sensors=((OS1_64, 1.0),), length_m=60.0, moving_rate=0.0)
+    drive, T_lidar_mounted = simulate_scene(draw_scene(6_000_000, mixture)), np.eye(4)
+    T_lidar_mounted[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    scans = [drive.read_scan(row) @ T_lidar_mounted[:3, :3] for row in range(len(drive))]
+    found, true = run_slam(model, scans), drive.T_world_lidar @ T_lidar_mounted
+    assert {report.status for report in found.reports} <= {"first", "tracked", "network"}
+    assert absolute_trajectory_error(found.T_world_scan[:, :3, 3], true[:, :3, 3]) < 0.1
