@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dpmjax.geometry import rigid
+from dpmjax.geometry import rigid, se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import (
     Alignment,
@@ -466,6 +466,15 @@ class HollowGeometry(TruthGeometry):
 def test_only_a_sure_decoder_places_scans_that_meet_no_plane(probability, is_calibrated, is_placed) -> None:
     truth = laps(1, side_m=20.0)
     matcher = LookAlikeMatcher(truth, probability=probability, is_calibrated=is_calibrated)
+    result = run(truth, range(30), matcher=matcher, geometry=HollowGeometry(truth), config=without_loops())
+    assert ("predicted" not in {report.status for report in result.reports}) == is_placed
+
+
+@pytest.mark.parametrize(("turn_rad", "is_placed"), [(0.05, True), (0.2, False)])
+def test_a_sure_decoder_whose_pose_is_turned_confirms_nothing(turn_rad: float, is_placed: bool) -> None:
+    truth, T_true_found = laps(1, side_m=20.0), np.eye(4)
+    T_true_found[:2, :2] = se2.rotation(turn_rad)
+    matcher = LookAlikeMatcher(truth, T_true_found=T_true_found, probability=0.95)
     result = run(truth, range(30), matcher=matcher, geometry=HollowGeometry(truth), config=without_loops())
     assert ("predicted" not in {report.status for report in result.reports}) == is_placed
 
