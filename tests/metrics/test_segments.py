@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dpmjax.metrics import segment_error
+from dpmjax.metrics import path_lengths, segment_error
 
 
 def path(rng: np.random.Generator, num: int = 300, step_m: float = 1.3) -> np.ndarray:
@@ -73,3 +73,10 @@ def test_other_shapes_are_refused(as_user) -> None:
         segment_error(np.tile(np.eye(4), (4, 1, 1)), np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(ValueError, match="stride"):
         segment_error(np.tile(np.eye(4), (4, 1, 1)), np.tile(np.eye(4), (4, 1, 1)), stride=0)
+
+
+@pytest.mark.parametrize("num", [0, 1, 4])
+def test_the_length_of_a_straight_path_is_that_of_its_steps(num: int) -> None:
+    T = np.tile(np.eye(4), (num, 1, 1))
+    T[:, 0, 3], T[:, 1, 3] = 3.0 * np.arange(num), 4.0 * np.arange(num)
+    np.testing.assert_allclose(path_lengths(T), 5.0 * np.arange(num))

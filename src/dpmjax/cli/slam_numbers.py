@@ -130,7 +130,7 @@ def length_doubt(T_world_scan: np.ndarray, reference: np.ndarray | None) -> str 
     if reference is None:
         return None
     has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
-    way_m, reference_m = (metrics.path_lengths(T[has_reference])[-1] for T in (T_world_scan, reference))
+    way_m, reference_m = (metrics.path_lengths(T[has_reference]).max(initial=0.0) for T in (T_world_scan, reference))
     if min(way_m, reference_m) < MIN_WAY_M or 1 / MAX_LENGTH_RATIO < reference_m / way_m < MAX_LENGTH_RATIO:
         return None
     return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
@@ -156,7 +156,7 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
     return {
         "sequence": sequence.name,
         "num_scans": len(T),
-        "path_m": float(metrics.path_lengths(T)[-1]),
+        "path_m": float(metrics.path_lengths(T).max(initial=0.0)),
         "reference_doubt": length_doubt(T, reference),
         "num_keyframes": len(result.keyframes),
         "num_parts": count_parts(result.map),

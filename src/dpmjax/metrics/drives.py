@@ -223,4 +223,4 @@ def loop_recall(
 def path_lengths(T_world_scan: Float[AnyArray, "n 4 4"]) -> Float[np.ndarray, " n"]:
     """Returns the length of the path until each scan, metres."""
     steps = np.linalg.norm(np.diff(T_world_scan[:, :3, 3], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return np.concatenate([[0.0], np.cumsum(steps)])[: len(T_world_scan)]
