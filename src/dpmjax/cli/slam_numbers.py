@@ -125,12 +125,12 @@ def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, su
     }
 
 
-def length_doubt(T_world_scan: np.ndarray, reference: np.ndarray | None) -> str | None:
+def reference_doubt(T_world_scan: np.ndarray, sequence: LidarSequence) -> str | None:
     """Returns a doubt where the reference is far longer or shorter than the trajectory, as in another unit; or None."""
+    reference, known = sequence.T_world_lidar, sequence.has_reference
     if reference is None:
         return None
-    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
-    way_m, reference_m = (metrics.path_lengths(T[has_reference]).max(initial=0.0) for T in (T_world_scan, reference))
+    way_m, reference_m = (metrics.path_lengths(T[known]).max(initial=0.0) for T in (T_world_scan, reference))
     if min(way_m, reference_m) < MIN_WAY_M or 1 / MAX_LENGTH_RATIO < reference_m / way_m < MAX_LENGTH_RATIO:
         return None
     return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
@@ -157,7 +157,7 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
         "sequence": sequence.name,
         "num_scans": len(T),
         "path_m": float(metrics.path_lengths(T).max(initial=0.0)),
-        "reference_doubt": length_doubt(T, reference),
+        "reference_doubt": reference_doubt(T, sequence),
         "num_keyframes": len(result.keyframes),
         "num_parts": count_parts(result.map),
         "num_loops": loops["accepted"],
