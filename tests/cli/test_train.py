@@ -28,6 +28,7 @@ from dpmjax.deeppointmap import (
     init_training,
     training_preset,
 )
+from dpmjax.deeppointmap.training.curriculum import stage_layouts
 from dpmjax.deeppointmap.training.loop import after_evaluation
 from dpmjax.weights import load_model
 from tests.deeppointmap import toy
@@ -147,6 +148,14 @@ def test_options_out_of_range_are_refused(options, message: str) -> None:
 def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:
     settings = training_settings(Config(groups=(8, 16, 8), steps=60))
     assert [(stage.max_group, stage.num_steps) for stage in settings.curriculum] == [(8, 20), (16, 20), (8, 20)]
+
+
+def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_groups() -> None:
+    settings = training_settings(Config(scans=96, groups=(32,)))
+    assert settings.sampling.num_scans == 96
+    assert sum(map(sum, stage_layouts(32, settings.sampling)[0])) == 96
+    with pytest.raises(ValueError, match="num_scans: expected at least the largest group, 4, got 3"):
+        training_settings(Config(scans=3))
 
 
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
     dpmjax train --preset small --num-towns 20 --hours 8          two cores, over night
     dpmjax train --data kitti town --preset paper                 drives from files, and towns
     dpmjax train --data kitti --preset small --weights dpm_small  tune trained weights
+    dpmjax train --preset small --scans 96 --num-towns 200        one GPU
     dpmjax train --resume                                         continue the latest run
     dpmjax train --resume --finish                                end it now: the learning rate falls
     dpmjax train --coordinator host0:8476 --num-processes 2 --process-id 0
@@ -81,6 +82,9 @@ class Config(ProcessOptions):
     groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
     """Largest group of scans of each stage of the curriculum, stages of equal length, such as 8 16 8 16 for weights
     that register pairs already; without it, the preset decides."""
+    scans: Annotated[int | None, arg(metavar="N")] = None
+    """How many scans a step takes; more keep a GPU busy, which computes all of them at once. Without it, the preset
+    decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M")] = 600.0
@@ -102,7 +106,7 @@ class Config(ProcessOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2)
+        check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2, scans=2)
         check_least(self, town_length_m=100, num_processes=1, process_id=0)
         if self.hours is not None and not 0 < self.hours < float("inf"):
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
@@ -170,6 +174,8 @@ def plateau_seconds(config: Config) -> float | None:
 
 def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
     """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
+    import jax
+
     settings = deeppointmap.training_preset(config.preset)
     if first is not None:
         model = replace(first.config, calibration=None, overlap=None)
@@ -177,10 +183,14 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
+    stages = settings.curriculum
     if config.groups:
         num_steps = max(1, settings.num_steps // len(config.groups))
         stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in config.groups)
-        settings = replace(settings, curriculum=stages)
+    num_scans = config.scans or settings.sampling.num_scans
+    settings = replace(settings, curriculum=stages, sampling=replace(settings.sampling, num_scans=num_scans))
+    if jax.default_backend() != "cpu":
+        settings = replace(settings, scans_at_once=num_scans)
     for part in config.without:
         settings = deeppointmap.without(settings, part)
     if config.bfloat16:

@@ -24,11 +24,14 @@ def placed(T_world_scan: np.ndarray) -> PlacedScans:
     return PlacedScans(T_world_scan, positions_world, np.ones((len(T_world_scan), 4), bool))
 
 
+@pytest.mark.parametrize(("num_scans", "max_num"), [(32, 4), (96, 1), (512, 1)])
 @pytest.mark.parametrize("max_group", [2, 4, 8, 16, 32])
-def test_layouts_hold_the_sizes_of_the_published_draw_and_leave_no_room(max_group: int) -> None:
-    config = SamplingConfig()
+def test_layouts_hold_the_sizes_of_the_published_draw_and_leave_no_room(
+    max_group: int, num_scans: int, max_num: int
+) -> None:
+    config = SamplingConfig(num_scans)
     layouts = stage_layouts(max_group, config)
-    assert 1 <= len(layouts) <= 4
+    assert 1 <= len(layouts) <= max_num
     shapes = [shape for layout in layouts for shape in layout]
     assert all(config.num_scans - 2 <= sum(map(sum, layout)) <= config.num_scans for layout in layouts)
     assert all(1 <= a <= b <= config.max_side and a + b <= max_group for a, b in shapes)

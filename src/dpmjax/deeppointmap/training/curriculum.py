@@ -35,7 +35,8 @@ GroupShape = tuple[int, int]
 # The groups of one sample, small ones first.
 Layout = tuple[GroupShape, ...]
 
-NUM_LAYOUTS = 4
+# Largest number of layouts of a stage, and of their scans together: a large sample has room for all sizes of groups.
+NUM_LAYOUTS, LAYOUT_SCANS = 4, 128
 # Golden ratio: any number of its multiples modulo 1 are spread evenly.
 GOLDEN = 0.6180339887498949
 
@@ -193,7 +194,7 @@ def training_preset(name: Preset) -> TrainingConfig:
     """Returns the training configuration of a preset.
 
     Args:
-        name: "tiny" (minutes on two cores), "small" (hours on two cores) or "paper" (days on several GPUs).
+        name: "tiny" (minutes on two cores), "small" (hours on two cores) or "paper" (hours on a GPU).
 
     Returns:
         The configuration.
@@ -254,13 +255,14 @@ def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
     Returns:
         From 1 to `NUM_LAYOUTS` different layouts of at most `config.num_scans` scans each.
     """
+    num_layouts = max(1, min(NUM_LAYOUTS, LAYOUT_SCANS // config.num_scans))
     sizes = np.arange(2, max_group + 1)
     shares = np.full(len(sizes), (1 - PAIR_PROBABILITY) / len(sizes))
     shares[0] += PAIR_PROBABILITY
-    num_groups = max(1, round(NUM_LAYOUTS * config.num_scans / float(sizes @ shares)))
+    num_groups = max(1, round(num_layouts * config.num_scans / float(sizes @ shares)))
     drawn = np.searchsorted(np.cumsum(shares) / shares.sum(), (np.arange(num_groups) + 0.5) / num_groups)
-    layouts: list[list[GroupShape]] = [[] for _ in range(NUM_LAYOUTS)]
-    room = [config.num_scans] * NUM_LAYOUTS
+    layouts: list[list[GroupShape]] = [[] for _ in range(num_layouts)]
+    room = [config.num_scans] * num_layouts
     for number, size in enumerate(sorted(sizes[drawn].tolist(), reverse=True)):
         emptiest = int(np.argmax(room))
         # Where the last large group does not fit, a smaller one takes its place.

@@ -48,7 +48,7 @@ from dpmjax.geometry.pyramid_storage import moved_pyramid
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
-# Groups of about this many scans are decoded at the same time.
+# Groups of about this many scans are decoded at the same time, or of as many scans as are encoded at the same time.
 GROUP_SCANS_AT_ONCE = 16
 
 # Largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans, and attention over all
@@ -189,13 +189,14 @@ def batch_loss(
 
     def of_sample(sample: RegistrationSample) -> list[tuple[Array, ObjectiveTerms]]:
         clouds = _in_parts(functools.partial(encode_sample, model), sample.scans, config.scans_at_once)
+        in_groups = max(GROUP_SCANS_AT_ONCE, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
             maps = _merged(clouds, group.source), _merged(clouds, group.target)
             return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
 
         return [
-            _in_parts(of_group, group, GROUP_SCANS_AT_ONCE // (group.source.rows.shape[1] + group.target.rows.shape[1]))
+            _in_parts(of_group, group, in_groups // (group.source.rows.shape[1] + group.target.rows.shape[1]))
             for group in sample.groups
         ]
 
