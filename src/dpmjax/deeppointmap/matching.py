@@ -347,7 +347,7 @@ def thinned_mask(
     """
     mask = np.array(mask)
     first = positions[:num_a_cloud][mask[:num_a_cloud]]
-    if len(first) < 2:
+    if len(first) < 2 or len(positions) == num_a_cloud:
         return mask
     spacing_m = np.median(np.asarray(cKDTree(first).query(first, 2)[0])[:, 1])
     for start in range(num_a_cloud, len(positions), num_a_cloud):
