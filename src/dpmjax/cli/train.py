@@ -101,8 +101,6 @@ class Config(ProcessOptions):
     """Folders of real scans with poses: their recall is drawn beside that of the towns, and chooses nothing."""
     recall_every: Annotated[int, arg(metavar="N")] = 200
     """Measure recall every N steps, and at the end."""
-    bfloat16: FlagCreatePairsOff[bool] = False
-    """Multiply matrices of the networks in bfloat16; geometry stays in float32."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -193,8 +191,6 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
         settings = replace(settings, scans_at_once=num_scans)
     for part in config.without:
         settings = deeppointmap.without(settings, part)
-    if config.bfloat16:
-        settings = replace(settings, model=settings.model.with_compute_dtype("bfloat16"))
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 
