@@ -158,6 +158,12 @@ def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_gr
         training_settings(Config(scans=3))
 
 
+def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert training_settings(Config(scans=96)).scans_at_once == training_preset("tiny").scans_at_once
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert training_settings(Config(scans=96)).scans_at_once == 96
+
+
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
     weights = load_model("dpm_small")
     settings = training_settings(Config(weights="dpm_small"), weights)

@@ -194,7 +194,7 @@ def training_preset(name: Preset) -> TrainingConfig:
     """Returns the training configuration of a preset.
 
     Args:
-        name: "tiny" (minutes on two cores), "small" (hours on two cores) or "paper" (hours on a GPU).
+        name: "tiny" (minutes on two cores), "small" (hours on two cores) or "paper" (a GPU).
 
     Returns:
         The configuration.
