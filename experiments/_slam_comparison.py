@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import cli, io, load_map, load_model, save_map, viz
+from dpmjax import cli, io, load_map, load_model, metrics, save_map, slam, viz
 from dpmjax.io import LidarSequence
-from dpmjax.metrics import align_rigid, path_lengths
 from dpmjax.saved_maps import Precision
-from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, LidarSensor, Scene, TownConfig, simulate_scene
-from dpmjax.slam import SlamMethods, localize_each, make_methods
+from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, Scene, TownConfig, simulate_scene
 from experiments import _slam_evaluation as evaluation
 from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive, first_keyframes, map_path
 from experiments._slam_peers import PEERS, why_missing
 
 TOWN = "town"
 # Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
-TOWNS: tuple[tuple[str, str, LidarSensor], ...] = (
+TOWNS = (
     ("suburb", "there_and_back", HDL64E),
     ("canyon", "wander", OS1_64),
     ("campus", "there_and_back", OS1_64),
@@ -52,15 +50,13 @@ SIZES = {
 LOCALIZATION = "localization, "
 
 
-def open_drives(
-    paths: Sequence[str], options: cli.DriveOptions, towns: Mapping[int, float] | None = None
-) -> list[LidarSequence]:
+def open_drives(paths: Sequence[str], options: cli.DriveOptions, towns_m: Sequence[float] = ()) -> list[LidarSequence]:
     """Opens the drives that are compared.
 
     Args:
         paths: folders of scans, files of poses along which towns are simulated, or `TOWN` for towns of the seeds.
         options: selection of the scans of each folder and of each town.
-        towns: length of the route of each town, metres, by its seed.
+        towns_m: length of the route of each town, metres.
 
     Returns:
         The drives.
@@ -71,9 +67,8 @@ def open_drives(
     drives: list[LidarSequence] = []
     for entry in paths:
         if entry == TOWN and not Path(entry).exists():
-            routes = enumerate((towns or {}).items())
-            simulated = [cli.keep_scans(town_drive(seed, number, length_m)) for number, (seed, length_m) in routes]
-            drives += [drive.take(options.selection) for drive in simulated]
+            simulated = (town_drive(number, length_m) for number, length_m in enumerate(towns_m))
+            drives += [cli.keep_scans(drive).take(options.selection) for drive in simulated]
         else:
             names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [cli.open_drive(Path(entry), options, name) for name in names]
@@ -81,9 +76,10 @@ def open_drives(
     return drives
 
 
-def town_drive(seed: int, number: int, length_m: float) -> LidarSequence:
+def town_drive(number: int, length_m: float) -> LidarSequence:
     """Returns the drive through a town, once along its route; scans are cast when they are read."""
     kind, route, sensor = TOWNS[number % len(TOWNS)]
+    seed = cli.FIRST_TOWN + number
     driving = DriveConfig(rate_hz=TOWN_RATE_HZ, sensor_height_m=sensor.height_m, max_turn_deg_s=TOWN_TURN_DEG_S)
     return simulate_scene(Scene(seed, TownConfig(kind, route, length_m, TOWN_BLOCK_M), driving, sensor))
 
@@ -92,12 +88,12 @@ def compare(
     config: cli.DriveOptions, experiment: str, sequences: Sequence[LidarSequence], num_localized: int
 ) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
-    methods = make_methods(load_model(config.weights), weights=config.weights)
+    methods = slam.make_methods(load_model(config.weights), weights=config.weights)
     missing = {name: reason for name in PEERS if (reason := why_missing(name)) is not None}
     by_name = {sequence.name: sequence for sequence in sequences}
 
     def work(run: cli.TableRun, sequence: str, method: str) -> cli.Row:
-        drive = evaluation.open_folder(run.folder, by_name[sequence], run.is_stopped)
+        drive = evaluation.open_folder(run, by_name[sequence])
         if method in PEERS:
             return evaluation.evaluate_peer(drive, method)
         if method.startswith(LOCALIZATION):
@@ -128,13 +124,14 @@ def compare(
     return cli.run_table(config, experiment, cases, work, report)
 
 
-def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precision, num: int, seed: int) -> cli.Row:
+def evaluate_localization(
+    drive: Drive, methods: slam.SlamMethods, precision: Precision, num: int, seed: int
+) -> cli.Row:
     """Looks for random scans of the drive in the map of its first half, saved and loaded at a precision.
 
     The map is that of the SLAM run. No scan is one of its keyframes. A scan is in the map where a keyframe of the whole
     first half is near; elsewhere the right answer is that it is not.
     """
-    assert drive.reference is not None
     if not map_path(drive.folder.path, "float32").exists():  # no scan had points enough
         return {"num_scans": 0}
     whole = load_map(map_path(drive.folder.path, "float32"))
@@ -146,8 +143,10 @@ def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precisi
     chosen = np.sort(np.random.default_rng(seed).choice(others, min(num, len(others)), replace=False))
     part = drive.sequence.take(chosen)
     known = drive.reference[[keyframe.scan for keyframe in slam_map.keyframes]]
+    bar = tqdm(range(len(part)), desc=f"{part.name}, {precision}", unit=" scans", dynamic_ncols=True)
+    points = (part.read_points(number) for number in drive.run.until_stopped(bar))
     found, clocks = [], [time.perf_counter()]
-    for one in localize_each(methods, slam_map, _points_of(part, drive, precision)):
+    for one in slam.localize_each(methods, slam_map, points):
         found.append(one)
         clocks.append(time.perf_counter())
     errors = cli.localization_errors(found, slam_map, known, drive.reference[chosen])
@@ -166,13 +165,6 @@ def evaluate_localization(drive: Drive, methods: SlamMethods, precision: Precisi
         "median_error_m": float(np.median(errors.translation_m[is_right])) if is_right.any() else None,
         "scan_s": float(np.median(np.diff(clocks))),
     }
-
-
-def _points_of(part: LidarSequence, drive: Drive, precision: str) -> Iterator[np.ndarray]:
-    for number in tqdm(range(len(part)), desc=f"{part.name}, {precision}", unit=" scans", dynamic_ncols=True):
-        if drive.is_stopped():
-            raise cli.RowStopped
-        yield part.read_points(number)
 
 
 def tables(rows: Sequence[cli.Row]) -> str:
@@ -197,16 +189,14 @@ def _track_cells(row: cli.Row) -> list[object]:
     loops = f"{row['num_loops']}" + (f" ({row['num_wrong_loops']})" if "num_wrong_loops" in row else "")
     shares = [row.get(f"loop_recall{suffix}") for suffix in ("", "_same_way", "_opposite")]
     recall = "; ".join(map(cli.cell_text, shares)) if row.get("num_revisits") else "no scan comes back"
-    if "num_known_pairs" in row:
-        loops += f", {row['num_known_pairs_found']} of {row['num_known_pairs']} known pairs"
     if row["method"] not in (OURS, NETWORK, "KISS-SLAM"):
         loops = recall = ""
-    tenths = row.get("scan_s_tenths")
-    seconds = [row["scan_s"], *([tenths[0], tenths[-1]] if tenths else [])]
-    first, *others = (cli.cell_text(value, 3) for value in seconds)
+    seconds = cli.cell_text(row["scan_s"], 3)
+    if tenths := row.get("scan_s_tenths"):
+        seconds += f"; {cli.cell_text(tenths[0], 3)}, {cli.cell_text(tenths[-1], 3)}"
     case = [row["sequence"], f"{row['num_scans']}, {row['path_m']:.0f} m", row["method"]]
     errors = [cli.cell_text(row.get("ate_m"), 3), row.get("t_rel_percent")]
-    return [*case, *errors, loops, recall, first + (f"; {', '.join(others)}" if others else "")]
+    return [*case, *errors, loops, recall, seconds]
 
 
 def _size_cells(rows: Sequence[cli.Row], sequence: str) -> list[object]:
@@ -217,25 +207,23 @@ def _size_cells(rows: Sequence[cli.Row], sequence: str) -> list[object]:
 
 
 def _place_cells(row: cli.Row) -> list[object]:
-    inside, outside = ([row[f"num_{name}{kind}"] for kind in ("right", "wrong")] for name in ("", "outside_"))
-    counts = [
-        f"{asked}: {', '.join(map(str, order))}"
-        for asked, order in (
-            (row["num_inside"], (inside[0], row["num_inside"] - sum(inside), inside[1])),
-            (row["num_outside"], (row["num_outside"] - sum(outside), *outside)),
-        )
-    ]
+    right, wrong, outside_right, outside_wrong = (
+        row[f"num_{name}"] for name in ("right", "wrong", "outside_right", "outside_wrong")
+    )
+    inside = (right, row["num_inside"] - right - wrong, wrong)
+    outside = (row["num_outside"] - outside_right - outside_wrong, outside_right, outside_wrong)
+    counts = [f"{sum(numbers)}: {', '.join(map(str, numbers))}" for numbers in (inside, outside)]
     size = f"{row['method'].removeprefix(LOCALIZATION)}, {row['map_bytes'] / 1e6:.2f} MB"
     return [row["sequence"], size, *counts, cli.cell_text(row["median_error_m"], 3), row["scan_s"]]
 
 
-def draw(folder: cli.RunFolder, *, sequences: Sequence[LidarSequence], rows: Sequence[dict[str, Any]]) -> None:
+def draw(folder: cli.RunFolder, *, sequences: Sequence[LidarSequence], rows: Sequence[cli.Row]) -> None:
     """Draws trajectories.png, a panel a drive with all methods, and map_sizes.png, bytes against metres (figure 4)."""
     tracks, sizes = {}, {}
     for sequence in sequences:
         of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence.name and "path_m" in row}
         if of_drive:
-            drive = evaluation.open_folder(folder, sequence, lambda: False)
+            drive = evaluation.open_folder(cli.TableRun(folder, lambda: False), sequence)
             tracks[sequence.name], sizes[sequence.name] = _panel(drive, of_drive), _growth(drive, of_drive)
     if tracks:
         viz.save_figure(viz.trajectories_figure(tracks, COLORS), folder / "trajectories.png")
@@ -244,25 +232,25 @@ def draw(folder: cli.RunFolder, *, sequences: Sequence[LidarSequence], rows: Seq
         viz.save_figure(viz.growth_figure(sizes), folder / "map_sizes.png")
 
 
-def _panel(drive: Drive, rows: dict[str, dict[str, Any]]) -> viz.TrackPanel:
+def _panel(drive: Drive, rows: dict[str, cli.Row]) -> viz.TrackPanel:
     """Returns all trajectories in the frame of the reference; without one, in that of the first scan."""
     reference = None if drive.reference is None else drive.reference[:, :3, 3]
     shown = {}
     for method in [name for name in COLORS if name in rows]:
         positions = drive.trajectory(method)[:, :3, 3]
         if reference is not None:
-            T = align_rigid(positions, reference)
+            T = metrics.align_rigid(positions, reference)
             positions = positions @ T[:3, :3].T + T[:3, 3]
         shown[method] = positions
     return viz.TrackPanel(shown, reference)
 
 
-def _growth(drive: Drive, rows: dict[str, dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _growth(drive: Drive, rows: dict[str, cli.Row]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Returns metres driven, and bytes, of each form of a map."""
     curves = {}
-    for row in rows.values():
-        poses = drive.trajectory(row["method"]) if drive.reference is None else drive.reference
-        for name in [name for name in SIZES if row.get(name)]:
-            driven = path_lengths(poses)[np.array(row["map_scans"]) - 1]
-            curves[SIZES[name]] = (driven, np.array(row[name], float))
-    return {name: curves[name] for name in SIZES.values() if name in curves}
+    for (name, title), row in itertools.product(SIZES.items(), rows.values()):
+        if row.get(name):
+            poses = drive.trajectory(row["method"]) if drive.reference is None else drive.reference
+            driven = metrics.path_lengths(poses)[np.array(row["map_scans"]) - 1]
+            curves[title] = (driven, np.array(row[name], float))
+    return curves

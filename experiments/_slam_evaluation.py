@@ -10,20 +10,19 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import cli, save_map
+from dpmjax import cli, metrics, save_map
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from dpmjax.metrics import find_revisits, loop_recall, path_lengths, registration_recall
 from dpmjax.saved_maps import Precision
-from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult
+from dpmjax.slam import KeyframeMap, SlamMethods, SlamResult, take_keyframes
 from experiments._slam_peers import PEERS, POINT_BYTES, FoundLoop, Peer, is_indoors, peer_version
 
 # Both align with the map of surface elements; the first guess is the motion of before, or the decoder's for every scan.
@@ -53,15 +52,18 @@ class Drive(NamedTuple):
 
     Attributes:
         sequence: the scans.
-        folder: of this drive.
+        run: the open table, in the folder of this drive.
         is_indoors: True if its first scan is one of a room.
-        is_stopped: True to end.
     """
 
     sequence: LidarSequence
-    folder: cli.RunFolder
+    run: cli.TableRun
     is_indoors: bool
-    is_stopped: Callable[[], bool]
+
+    @property
+    def folder(self) -> cli.RunFolder:
+        """Returns the folder of this drive."""
+        return self.run.folder
 
     @property
     def reference(self) -> np.ndarray | None:
@@ -82,10 +84,10 @@ class Drive(NamedTuple):
         return np.load(self.folder / f"{file_name(method)}.npy")
 
 
-def open_folder(folder: cli.RunFolder, sequence: LidarSequence, is_stopped: Callable[[], bool]) -> Drive:
+def open_folder(run: cli.TableRun, sequence: LidarSequence) -> Drive:
     """Makes the folder of a drive."""
-    part = folder.part("drives", sequence.name.replace("/", "-"))
-    return Drive(sequence, part, is_indoors(sequence.read_points(0)), is_stopped)
+    folder = run.folder.part("drives", sequence.name.replace("/", "-"))
+    return Drive(sequence, run._replace(folder=folder), is_indoors(sequence.read_points(0)))
 
 
 def file_name(method: str) -> str:
@@ -93,7 +95,7 @@ def file_name(method: str) -> str:
     return method.lower().replace(",", "").replace(" ", "_").replace("-", "_")
 
 
-def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
+def evaluate_ours(drive: Drive, methods: SlamMethods) -> cli.Row:
     """Runs the whole system, and writes its files."""
     result, row = map_row(drive, drive.folder, OURS, methods)
     cli.write_loops(drive.folder / "loops.csv", result.loops, result.keyframes)
@@ -102,7 +104,7 @@ def evaluate_ours(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
     return {**row, **map_sizes(drive.folder.path, result)}
 
 
-def evaluate_network(drive: Drive, methods: SlamMethods) -> dict[str, Any]:
+def evaluate_network(drive: Drive, methods: SlamMethods) -> cli.Row:
     """Runs the whole system with the decoder as the source of every first guess (DeepPointMap section 4)."""
     return map_row(drive, drive.folder.part("methods", "network"), NETWORK, with_network(methods))[1]
 
@@ -113,11 +115,9 @@ def with_network(methods: SlamMethods) -> SlamMethods:
     return methods._replace(config=replace(methods.config, odometry=odometry))
 
 
-def map_row(
-    drive: Drive, folder: cli.RunFolder, method: str, methods: SlamMethods
-) -> tuple[SlamResult, dict[str, Any]]:
+def map_row(drive: Drive, folder: cli.RunFolder, method: str, methods: SlamMethods) -> tuple[SlamResult, cli.Row]:
     """Maps a drive, or goes on from the state in the folder, and measures trajectory, loops and seconds."""
-    run, result = cli.map_drive(folder, drive.sequence, methods, drive.is_stopped)
+    run, result = cli.map_drive(folder, drive.sequence, methods, drive.run.is_stopped)
     if len(run.reports) < len(drive.sequence):
         raise cli.RowStopped
     ends = result.keyframes
@@ -146,22 +146,21 @@ def tenths(scan_s: Sequence[float]) -> list[float]:
     return [float(part.mean()) for part in np.array_split(np.asarray(scan_s), 10) if len(part)]
 
 
-def odometry_row(drive: Drive, ours: dict[str, Any]) -> dict[str, Any]:
+def odometry_row(drive: Drive, ours: cli.Row) -> cli.Row:
     """Measures our odometry in the same run, before loops: its time is that of its stages."""
     return common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), []) | {"scan_s": ours["scan_odometry_s"]}
 
 
-def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
+def evaluate_peer(drive: Drive, name: str) -> cli.Row:
     """Runs another program; reading is not timed. A scan without points stays where the last one was."""
     peer: Peer = PEERS[name][1](is_indoors=drive.is_indoors)
     taken: list[int] = []
     seconds: list[float] = []
     num_scans = len(drive.sequence)
-    sizes: dict[str, list[int]] = {"map_scans": [], f"map_bytes_{peer.map_name}": []}
+    sizes: dict[int, int] = {}
     at = set(size_marks(num_scans))
-    for number in tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True):
-        if drive.is_stopped():
-            raise cli.RowStopped
+    bar = tqdm(range(num_scans), desc=f"{drive.sequence.name}, {name}", unit=" scans", dynamic_ncols=True)
+    for number in drive.run.until_stopped(bar):
         points = drive.sequence.read_points(number).astype(np.float64)
         clock = time.perf_counter()
         if len(points):
@@ -171,8 +170,7 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
         if len(points):
             peer.grow_map(points)
         if number + 1 in at:
-            sizes["map_scans"].append(number + 1)
-            sizes[f"map_bytes_{peer.map_name}"].append(peer.map_bytes())
+            sizes[number + 1] = peer.map_bytes()
     clock = time.perf_counter()
     T, loops = peer.finish()
     finish_s = time.perf_counter() - clock
@@ -182,35 +180,39 @@ def evaluate_peer(drive: Drive, name: str) -> dict[str, Any]:
         FoundLoop(tuple(numbers[list(loop.newer)]), tuple(numbers[list(loop.older)]), loop.T_older_newer)
         for loop in loops
     ]
-    row = common_numbers(drive, name, T[rows], loops)
-    row |= {"scan_s": (sum(seconds) + finish_s) / num_scans, "scan_s_tenths": tenths(seconds)}
-    return {**row, "peer_version": peer_version(name), **sizes}
+    return {
+        **common_numbers(drive, name, T[rows], loops),
+        "scan_s": (sum(seconds) + finish_s) / num_scans,
+        "scan_s_tenths": tenths(seconds),
+        "peer_version": peer_version(name),
+        "map_scans": list(sizes),
+        f"map_bytes_{peer.map_name}": list(sizes.values()),
+    }
 
 
-def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> dict[str, Any]:
+def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> cli.Row:
     """Writes the trajectory of a method, and returns its errors and those of its loops."""
     drive.save_trajectory(method, T_world_scan)
     known = T_world_scan if drive.reference is None else drive.reference
     return {
         "num_scans": len(T_world_scan),
-        "path_m": float(path_lengths(known)[-1]),
+        "path_m": float(metrics.path_lengths(known)[-1]),
         **cli.trajectory_errors(T_world_scan, drive.reference),
         "num_loops": len(loops),
         **(loop_numbers(drive, loops) if drive.reference is not None else {}),
     }
 
 
-def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:
+def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> cli.Row:
     """Returns how many loops are wrong, and the recall of the right ones."""
     poses, scale = drive.reference, drive.scale
-    assert poses is not None
-    newer, older = (np.array([getattr(loop, end)[0] for loop in loops], int) for end in ("newer", "older"))
+    newer, older = (
+        np.reshape([getattr(loop, end) for loop in loops], (-1, 2)).astype(int) for end in ("newer", "older")
+    )
     found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
-    is_right = registration_recall(found, rigid.inverse(poses[older]) @ poses[newer]).is_right
-    revisits = find_revisits(poses, distance_m=scale.distance_m, min_path_m=scale.min_path_m)
-    right = [loop for loop, good in zip(loops, is_right, strict=True) if good]
-    ends = np.reshape([loop.newer for loop in right], (-1, 2)).astype(int)
-    recall = loop_recall(poses, ends, revisits, reach_m=scale.reach_m)
+    is_right = metrics.registration_recall(found, rigid.inverse(poses[older[:, 0]]) @ poses[newer[:, 0]]).is_right
+    revisits = metrics.find_revisits(poses, distance_m=scale.distance_m, min_path_m=scale.min_path_m)
+    recall = metrics.loop_recall(poses, newer[is_right], revisits, reach_m=scale.reach_m)
     return {
         "num_wrong_loops": int((~is_right).sum()),
         "loop_recall": recall.recall,
@@ -218,32 +220,7 @@ def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> dict[str, Any]:
         "loop_recall_opposite": recall.opposite,
         "num_revisits": recall.num_revisits,
         "num_revisits_opposite": recall.num_opposite,
-        **pair_numbers(drive, right),
     }
-
-
-def pair_numbers(drive: Drive, right: Sequence[FoundLoop]) -> dict[str, Any]:
-    """Returns how many pairs of `loops.txt`, beside the scans' folder, have a right loop near both ends."""
-    pairs = read_pairs(drive.sequence)
-    if not len(pairs):
-        return {}
-    assert drive.reference is not None
-    path, reach_m = path_lengths(drive.reference), drive.scale.reach_m
-
-    def is_near(scan: int, ends: tuple[int, int]) -> bool:
-        return bool(path[ends[0]] - reach_m <= path[scan] <= path[ends[1]] + reach_m)
-
-    found = [any(is_near(max(pair), loop.newer) and is_near(min(pair), loop.older) for loop in right) for pair in pairs]
-    return {"num_known_pairs": len(pairs), "num_known_pairs_found": sum(found)}
-
-
-def read_pairs(sequence: LidarSequence) -> np.ndarray:
-    """Reads (m, 2) pairs of scans that see the same place; none where no file lists them, or scans were left out."""
-    first, last = Path(sequence.sources[0]), Path(sequence.sources[-1])
-    path = next((folder / "loops.txt" for folder in first.parents[:2] if (folder / "loops.txt").is_file()), None)
-    if path is None or len(list(last.parent.iterdir())) != len(sequence):
-        return np.zeros((0, 2), int)
-    return np.loadtxt(path, int, ndmin=2)
 
 
 def size_marks(num: int) -> np.ndarray:
@@ -251,22 +228,22 @@ def size_marks(num: int) -> np.ndarray:
     return np.unique(np.linspace(0, num, NUM_SIZES + 1).round().astype(int)[1:])
 
 
-def map_sizes(folder: Path, result: SlamResult) -> dict[str, Any]:
+def map_sizes(folder: Path, result: SlamResult) -> cli.Row:
     """Returns the bytes of all points and of map files at each precision, on the way; the whole maps stay as files."""
     whole = result.map
     points = np.cumsum([report.num_points for report in result.reports])
     marks = [int(mark) for mark in size_marks(len(whole)) if mark]
     scans = [int(whole.keyframes[mark - 1].scan) + 1 for mark in marks[:-1]] + ([len(points)] if marks else [])
-    sizes: dict[str, list[int]] = {
-        "map_scans": scans,
-        "map_bytes_points": [POINT_BYTES * int(points[s - 1]) for s in scans],
-    }
+    sizes = {"map_scans": scans, "map_bytes_points": [POINT_BYTES * int(points[s - 1]) for s in scans]}
     for precision in PRECISIONS:
-        path = map_path(folder, precision)
-        sizes[f"map_bytes_{precision}"] = [
-            save_map(path, first_keyframes(whole, mark), precision).stat().st_size for mark in marks
-        ]
+        parts = (first_keyframes(whole, mark) for mark in marks)
+        sizes[f"map_bytes_{precision}"] = [map_bytes(folder, part, precision) for part in parts]
     return sizes
+
+
+def map_bytes(folder: Path, slam_map: KeyframeMap, precision: Precision) -> int:
+    """Writes the map at a precision, and returns the size of its file."""
+    return save_map(map_path(folder, precision), slam_map, precision).stat().st_size
 
 
 def map_path(folder: Path, precision: Precision) -> Path:
@@ -276,11 +253,5 @@ def map_path(folder: Path, precision: Precision) -> Path:
 
 def first_keyframes(slam_map: KeyframeMap, num: int) -> KeyframeMap:
     """Returns the map as it was: the first keyframes, and the edges between them."""
-    edges = tuple(edge for edge in slam_map.edges if max(edge.source, edge.target) < num)
-    return replace(
-        slam_map,
-        keyframes=slam_map.keyframes[:num],
-        T_world_keyframe=slam_map.T_world_keyframe[:num],
-        vectors=slam_map.vectors[:num],
-        edges=edges,
-    )
+    edges = [edge for edge in slam_map.edges if max(edge.source, edge.target) < num]
+    return take_keyframes(slam_map, range(min(num, len(slam_map))), edges)

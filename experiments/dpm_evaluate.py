@@ -108,9 +108,8 @@ def evaluate_slam(config: Config) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
     from experiments import _slam_comparison as comparison
 
-    seeds = range(cli.FIRST_TOWN, cli.FIRST_TOWN + config.num_towns)
     lengths_m = np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist()
-    drives = comparison.open_drives(config.paths, config, dict(zip(seeds, lengths_m, strict=True)))
+    drives = comparison.open_drives(config.paths, config, lengths_m)
     return comparison.compare(config, EXPERIMENT, drives, config.localize)
 
 

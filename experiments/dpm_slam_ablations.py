@@ -17,10 +17,10 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import Model, cli, load_model, save_map, slam
+from dpmjax import Model, cli, load_model, slam
 from dpmjax.scans import surface_at
 from experiments._slam_comparison import open_drives
-from experiments._slam_evaluation import PRECISIONS, Drive, file_name, map_path, map_row, open_folder, with_network
+from experiments._slam_evaluation import PRECISIONS, Drive, file_name, map_bytes, map_row, open_folder, with_network
 
 EXPERIMENT = "dpm_slam_ablations"
 NUM_ELEMENTS = (64, 128, 256, 512, 1024)
@@ -48,7 +48,7 @@ def main(config: Config) -> list[cli.Row]:
     sequences = {sequence.name: sequence for sequence in open_drives(config.paths, config)}
 
     def work(run: cli.TableRun, sequence: str, setting: str) -> cli.Row:
-        return evaluate(open_folder(run.folder, sequences[sequence], run.is_stopped), model, setting)
+        return evaluate(open_folder(run, sequences[sequence]), model, setting)
 
     cases = [{"sequence": name, "setting": setting} for name in sequences for setting in SETTINGS]
     numbers = {"weights": config.weights}
@@ -59,8 +59,7 @@ def evaluate(drive: Drive, model: Model, setting: str) -> cli.Row:
     """Maps a drive with a setting, and measures trajectory, loops and map."""
     part = drive.folder.part("methods", file_name(setting))
     result, row = map_row(drive, part, setting, ablated(model, setting))
-    sizes = {name: save_map(map_path(part.path, name), result.map, name).stat().st_size for name in PRECISIONS}
-    return {**row, **{f"map_bytes_{name}": size for name, size in sizes.items()}}
+    return {**row, **{f"map_bytes_{name}": map_bytes(part.path, result.map, name) for name in PRECISIONS}}
 
 
 def ablated(model: Model, setting: str) -> slam.SlamMethods:

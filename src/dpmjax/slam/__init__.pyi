@@ -23,6 +23,7 @@ from .keyframe_map import KeyframeMap as KeyframeMap
 from .keyframe_map import Submap as Submap
 from .keyframe_map import as_pose_graph as as_pose_graph
 from .keyframe_map import keyframe_points as keyframe_points
+from .keyframe_map import take_keyframes as take_keyframes
 from .local_map import LocalMap as LocalMap
 from .local_map import local_map_of as local_map_of
 from .localization import Localization as Localization
