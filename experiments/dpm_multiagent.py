@@ -24,10 +24,10 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, load_model, metrics, viz, write_g2o
+from dpmjax import cli, load_model, metrics, slam, viz, write_g2o
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from dpmjax.slam import AgentsResult, SlamMethods, as_pose_graph, join_agents, make_methods, take_component
+from dpmjax.slam import AgentsResult
 
 EXPERIMENT = "dpm_multiagent"
 
@@ -61,14 +61,15 @@ class Config(cli.DriveOptions):
 def main(config: Config) -> Any:
     """Lets the agents of each run map, joins their maps, writes; returns the numbers, or a row for each drive."""
     started = time.perf_counter()
-    methods, runs = make_methods(load_model(config.weights)), open_runs(config)
+    methods, runs = slam.make_methods(load_model(config.weights)), open_runs(config)
     if not config.cut:
         folder = cli.open_run_folder(config, EXPERIMENT)
         with cli.recording(folder), cli.StopFlag() as stop:
             numbers = map_agents(cli.TableRun(folder, lambda: stop.is_requested), config, methods, runs[0])
             numbers |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
             cli.write_metrics(folder, numbers, seed=config.seed)
-            print(f"{summary(numbers)}\nresults in {folder.path}")
+            drives = ", ".join(dict.fromkeys(agent["sequence"] for agent in numbers["agents"]))
+            print(table([{"sequence": drives, **numbers}]), f"results in {folder.path}", sep="\n")
         return numbers
     by_name = {sequences[0].name: sequences for sequences in runs}
 
@@ -82,7 +83,7 @@ def main(config: Config) -> Any:
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: cli.Summary(weights, table(rows)))
 
 
-def map_agents(run: cli.TableRun, config: Config, methods: SlamMethods, sequences: list[LidarSequence]) -> cli.Row:
+def map_agents(run: cli.TableRun, config: Config, methods: slam.SlamMethods, sequences: list[LidarSequence]) -> cli.Row:
     """Lets the agents of one run map, joins their maps, writes their files; returns the numbers."""
     agents, folder = [], run.folder
     for number, sequence in enumerate(sequences, start=1):
@@ -91,7 +92,7 @@ def map_agents(run: cli.TableRun, config: Config, methods: SlamMethods, sequence
             agents.append(cli.map_drive(part, sequence, methods, run.is_stopped)[1])
     mapped = [sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)]
     with cli.progress_bar("loops between agents", " keyframes") as on_keyframe:
-        result = join_agents(methods, agents, on_keyframe=on_keyframe)
+        result = slam.join_agents(methods, agents, on_keyframe=on_keyframe)
     numbers = {"weights": config.weights, "overlap": config.overlap, **agents_numbers(result, mapped)}
     for agent, size in zip(numbers["agents"], write_agents(folder, result, mapped), strict=True):
         agent |= size
@@ -138,11 +139,11 @@ def write_agents(
         path = folder.part("agents", f"agent_{number}") / "map.npz"
         sizes.append(cli.write_map_file(path, agent.map) if len(agent.map) else {})
     for component in range(max(result.component) + 1):
-        slam_map = take_component(result.joined, component)
+        slam_map = slam.take_component(result.joined, component)
         if len(slam_map):
             cli.write_map_file(folder / f"map_{component + 1}.npz", slam_map)
     if len(result.joined.slam_map):
-        write_g2o(folder / "graph.g2o", as_pose_graph(result.joined.slam_map))
+        write_g2o(folder / "graph.g2o", slam.as_pose_graph(result.joined.slam_map))
     columns = ("kind", "agent", "scan", "other_agent", "other_scan", *cli.LOOP_CELLS)
     cli.write_table(folder / "loops.csv", columns, loop_rows(result))
     return sizes
@@ -162,7 +163,6 @@ def loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
 
 def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> dict[str, Any]:
     """Returns what `metrics.json` says: errors of each component in its one frame, of each agent, and bytes."""
-    references = [sequence.T_world_lidar for sequence in sequences]
     agents = [
         {
             "agent": number,
@@ -171,19 +171,19 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
             "num_scans": len(T_world_scan),
             "num_keyframes": len(agent.keyframes),
             "num_loops": len(cli.accepted_ends(agent.loops)),
-            **cli.trajectory_errors(T_world_scan, reference),
-            **cli.trajectory_errors(agent.T_world_scan, reference, "_alone"),
+            **cli.trajectory_errors(T_world_scan, sequence.T_world_lidar),
+            **cli.trajectory_errors(agent.T_world_scan, sequence.T_world_lidar, "_alone"),
             **traffic._asdict(),
         }
-        for number, (T_world_scan, agent, traffic, sequence, reference) in enumerate(
-            zip(result.T_world_scan, result.agents, result.traffic, sequences, references, strict=True), start=1
+        for number, (T_world_scan, agent, traffic, sequence) in enumerate(
+            zip(result.T_world_scan, result.agents, result.traffic, sequences, strict=True), start=1
         )
     ]
     components = [
         {
             "component": component + 1,
             "agents": [number + 1 for number in members],
-            "ate_m": joint_ate_m(result, references, members),
+            "ate_m": joint_ate_m(result, sequences, members),
         }
         for component, members in enumerate(members_of(result))
     ]
@@ -191,7 +191,7 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
         "num_agents": len(agents),
         "num_components": len(components),
         "num_loops_between": len(cli.accepted_ends(result.joined.loops)),
-        "num_wrong_loops_between": num_wrong(result, references),
+        "num_wrong_loops_between": num_wrong(result, sequences),
         "meetings": [{"agents": pair, "num_loops": num} for pair, num in cli.count_meetings(result.joined)],
         "ate_m": components[0]["ate_m"] if len(components) == 1 else None,
         "components": components,
@@ -199,16 +199,20 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
     }
 
 
-def num_wrong(result: AgentsResult, references: Sequence[np.ndarray | None]) -> int | None:
+def num_wrong(result: AgentsResult, sequences: Sequence[LidarSequence]) -> int | None:
     """Returns how many loops between agents are wrong beyond 2 m or 5 degrees; None without a reference for each."""
-    known = [reference for reference in references if reference is not None]
-    if len(known) < len(references):
+    known = [sequence.T_world_lidar for sequence in sequences if sequence.T_world_lidar is not None]
+    if len(known) < len(sequences):
         return None
-    T = np.concatenate([reference[agent.keyframes] for reference, agent in zip(known, result.agents, strict=True)])
-    source, target = cli.accepted_ends(result.joined.loops).T
+    T, (source, target) = keyframe_poses(result, known), cli.accepted_ends(result.joined.loops).T
     accepted = [loop.T_target_source for loop in result.joined.loops if loop.status == "accepted"]
     found = np.reshape(accepted, (-1, 4, 4))
     return int((~metrics.registration_recall(found, rigid.inverse(T[target]) @ T[source]).is_right).sum())
+
+
+def keyframe_poses(result: AgentsResult, T_world_scan: Sequence[np.ndarray]) -> np.ndarray:
+    """Returns the poses of all keyframes, agent by agent, out of those of all scans."""
+    return np.concatenate([T[agent.keyframes] for T, agent in zip(T_world_scan, result.agents, strict=True)])
 
 
 def members_of(result: AgentsResult) -> list[list[int]]:
@@ -219,17 +223,17 @@ def members_of(result: AgentsResult) -> list[list[int]]:
     ]
 
 
-def joint_ate_m(result: AgentsResult, references: Sequence[np.ndarray | None], members: Sequence[int]) -> float | None:
+def joint_ate_m(result: AgentsResult, sequences: Sequence[LidarSequence], members: Sequence[int]) -> float | None:
     """Returns the ATE of agents in their one frame; None without a reference for each, or from different drives."""
-    pairs = _positions(result, references, members)
+    pairs = _positions(result, sequences, members)
     return None if pairs is None or len(pairs[0]) < 2 else metrics.absolute_trajectory_error(*pairs)
 
 
 def _positions(
-    result: AgentsResult, references: Sequence[np.ndarray | None], members: Sequence[int]
+    result: AgentsResult, sequences: Sequence[LidarSequence], members: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Returns (n, 3) positions of agents and of their references, metres; None without a reference for each."""
-    known = [reference[:, :3, 3] for number in members if (reference := references[number]) is not None]
+    known = [T[:, :3, 3] for number in members if (T := sequences[number].T_world_lidar) is not None]
     if len(known) < len(members):
         return None
     return np.concatenate([result.T_world_scan[number][:, :3, 3] for number in members]), np.concatenate(known)
@@ -237,10 +241,9 @@ def _positions(
 
 def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> list[viz.AgentPanel]:
     """Gathers the data of the picture: clouds, tracks and loops of each component."""
-    panels = []
-    map_of_row, T_keyframe = result.joined.map_of_keyframe, result.joined.slam_map.T_world_keyframe
+    panels, T_shown_keyframe = [], keyframe_poses(result, result.T_world_scan)
     for members in members_of(result):
-        pairs = _positions(result, [sequence.T_world_lidar for sequence in sequences], members)
+        pairs = _positions(result, sequences, members)
         T_shown_reference = None if pairs is None else metrics.align_rigid(*reversed(pairs))
         tracks = []
         for number in members:
@@ -251,47 +254,16 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
                 R, t = T_shown_reference[:3, :3], T_shown_reference[:3, 3]
                 track = track._replace(reference=sequence.T_world_lidar[:, :3, 3] @ R.T + t)
             tracks.append(track)
-        # Rows lie in the frame of the map, trajectories begin at their own origin.
-        T_shown_map = _shown_frame(result, members)
         ends = cli.accepted_ends(result.joined.loops)
-        ends = ends[np.isin(map_of_row[ends[:, 0]], members)]
-        loops = T_keyframe[ends][..., :3, 3] @ T_shown_map[:3, :3].T + T_shown_map[:3, 3]
+        ends = ends[np.isin(result.joined.map_of_keyframe[ends[:, 0]], members)]
         drives = ", ".join(dict.fromkeys(sequences[number].name for number in members))
         title = drives + (", in one frame" if len(members) > 1 else ", in a frame of its own")
-        panels.append(viz.AgentPanel(title, tracks, loops))
+        panels.append(viz.AgentPanel(title, tracks, T_shown_keyframe[ends, :3, 3]))
     return panels
 
 
-def _shown_frame(result: AgentsResult, members: Sequence[int]) -> np.ndarray:
-    for number in members:
-        rows = np.flatnonzero(result.joined.map_of_keyframe == number)
-        if len(rows):
-            first = result.agents[number].reports[0]
-            T_map_scan = result.joined.slam_map.T_world_keyframe[rows[first.keyframe]] @ first.T_keyframe_scan
-            return np.asarray(result.T_world_scan[number][0] @ rigid.inverse(T_map_scan))
-    return np.eye(4)
-
-
-def summary(numbers: dict[str, Any]) -> str:
-    """Returns the lines on the console."""
-    lines = []
-    for agent in numbers["agents"]:
-        sent, scans = agent.get("map_bytes_int8", agent["keyframe_bytes"]) / 1e6, agent["scan_bytes"] / 1e6
-        line = f"agent {agent['agent']}: {agent['num_scans']} scans, {agent['num_keyframes']} keyframes, "
-        line += f"{sent:.1f} MB sent instead of {scans:.1f} MB of points"
-        if "ate_m" in agent:
-            line += f"; ATE {agent['ate_m']:.3f} m, alone {agent['ate_alone_m']:.3f} m"
-        lines.append(line)
-    for component in numbers["components"]:
-        members = ", ".join(map(str, component["agents"]))
-        is_alone, ate = len(component["agents"]) == 1, component["ate_m"]
-        line = f"agent {members}: met nobody, a frame of its own" if is_alone else f"agents {members}: one frame"
-        lines.append(line + ("" if ate is None else f", ATE {'' if is_alone else 'together '}{ate:.3f} m"))
-    return "\n".join([*lines, f"{numbers['num_loops_between']} loops between agents"])
-
-
 def table(rows: Sequence[cli.Row]) -> str:
-    """Returns a table as Markdown, one line for each drive that was cut."""
+    """Returns a table as Markdown, one line for each run of agents."""
     columns = ("drive", "scans", "ATE of each agent (alone), m", "loops between (wrong)", "in one frame: ATE, m")
     return cli.markdown((*columns, "sent by each, MB", "points of all scans, MB"), map(_drive_cells, rows))
 

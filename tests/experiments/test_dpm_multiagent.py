@@ -44,7 +44,7 @@ def truth_methods(model) -> SlamMethods:
 def with_truth(monkeypatch) -> None:
     """Truth in place of the networks."""
     monkeypatch.setattr(dpm_multiagent, "load_model", lambda weights: None)
-    monkeypatch.setattr(dpm_multiagent, "make_methods", truth_methods)
+    monkeypatch.setattr(dpm_multiagent.slam, "make_methods", truth_methods)
 
 
 def write_drive(folder: Path, numbers) -> Path:
