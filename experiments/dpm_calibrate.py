@@ -16,29 +16,29 @@ out of the fits. `python -m experiments.dpm_confidence` checks the confidence on
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import DescriptorCloud, cli, encode, load_model, register, save_model, simulation, viz
+from dpmjax import DescriptorCloud, cli, encode, load_model, metrics, register, save_model, simulation, slam, viz
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
-from dpmjax.metrics import area_under_curve, brier_score, registration_recall
-from dpmjax.simulation import HDL32E, OS1_64, VLP16, SceneMixture, draw_scene, simulate_scene
-from dpmjax.slam import most_similar, pooled_vector
 from dpmjax.weights import read_card
 
 # Smallest and largest distance of the pairs of each kind, metres.
 Bands = tuple[tuple[float, float], ...]
+# Probabilities of examples by fits without their place, and the labels of these examples.
+HeldOut = tuple[np.ndarray, np.ndarray]
 
 EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
-BEAMS = {len(lidar.elevations_deg): lidar for lidar in (VLP16, HDL32E, OS1_64)}
+BEAMS = {16: simulation.VLP16, 32: simulation.HDL32E, 64: simulation.OS1_64}
 KINDS = ("of_clouds", "of_scans", "of_weak_scans")
 # Elements of a scan in the map of SLAM, and in `register(..., refine=True)` with a cloud.
 NUM_ELEMENTS = 1024
@@ -96,8 +96,8 @@ def main(config: Config) -> list[cli.Row]:
 
 def list_cases(config: Config) -> list[cli.Row]:
     """Returns the places of the confidence, then the towns of the overlap."""
-    kinds = [kind for kind, _ in SceneMixture().kinds]
-    towns = [{"town": FIRST_TOWN + number, "kind": kinds[number % len(kinds)]} for number in range(config.towns)]
+    kinds = itertools.cycle(kind for kind, _ in simulation.SceneMixture().kinds)
+    towns = [{"town": FIRST_TOWN + number, "kind": next(kinds)} for number in range(config.towns)]
     places = [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(config.ambiguous)]
     return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(config.overlap_towns)]
 
@@ -106,7 +106,7 @@ def open_place(*, kind: str, town: int | None = None, place: int = 0, beams: int
     """Simulates a town or an ambiguous place; returns its drive, and the distances of its pairs, metres."""
     if town is not None:
         return simulation.simulate_drive(town, length_m=TOWN_LENGTH_M, kind=kind), TOWN_BANDS_M
-    return ambiguous_drive(place, kind, beams, TOWN_LENGTH_M), AMBIGUOUS_BANDS_M
+    return ambiguous_drive(place, kind, beams), AMBIGUOUS_BANDS_M
 
 
 def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int) -> cli.Summary:
@@ -120,7 +120,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
     note += f"{numbers['num_pairs']} pairs"
     title = "places left out of the fit"
     figures = {
-        name: viz.reliability_figure(held_out[kind]["confidence"], held_out[kind]["is_right"], title=title)
+        name: viz.reliability_figure(*held_out[kind], title=title)
         for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png"))
     }
     if overlap_rows:
@@ -128,9 +128,8 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
         numbers |= overlap_numbers
         calibrated = replace(calibrated, overlap=fitted)
         note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
-        figures["reliability_overlap.png"] = viz.reliability_figure(
-            found["probability"], found["is_overlap"], title=f"overlap, {title}", labels=OVERLAP_LABELS
-        )
+        figure = viz.reliability_figure(*found, title=f"overlap, {title}", labels=OVERLAP_LABELS)
+        figures["reliability_overlap.png"] = figure
 
     def write(folder: cli.RunFolder) -> None:
         card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model
@@ -142,7 +141,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
     return cli.Summary({"model": config.model, **numbers}, text, write, rows=())
 
 
-def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, dict[str, np.ndarray]]]:
+def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, HeldOut]]:
     """Returns the calibration of all places, its numbers, and the confidence of each place when it is left out.
 
     Each model is fitted on the pairs that it rates: scans on those whose walls hold all directions.
@@ -159,30 +158,27 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, dict[s
         if kind == "of_weak_scans" and len({is_right for _, _, is_right in pairs}) < 2:
             continue
         place, features, is_right = (np.array(column) for column in zip(*pairs, strict=True))
-        models[kind] = dpm.fit_logistic(names, features, is_right)
-        confidence = held_out_probability(names, features, is_right, place)
-        held_out[kind] = {"confidence": confidence, "is_right": is_right}
+        models[kind], held_out[kind] = fit_held_out(names, features, is_right, place)
         numbers |= {
             f"num_pairs_{kind}": len(pairs),
             f"share_right_{kind}": float(is_right.mean()),
-            f"brier_{kind}": brier_score(confidence, is_right),
+            f"brier_{kind}": metrics.brier_score(*held_out[kind]),
             f"brier_of_a_constant_{kind}": float(is_right.var()),
         }
     return dpm.Calibration(**models), numbers, held_out
 
 
-def ambiguous_case(number: int, first_seed: int) -> dict[str, Any]:
+def ambiguous_case(number: int, first_seed: int) -> cli.Row:
     """Returns the case of one of the ambiguous places: kinds of place take turns, then lidars do."""
     beams = list(BEAMS)[number // len(AMBIGUOUS) % len(BEAMS)]
     return {"place": first_seed + number, "kind": AMBIGUOUS[number % len(AMBIGUOUS)], "beams": beams}
 
 
-def ambiguous_drive(place: int, kind: str, beams: int, length_m: float) -> LidarSequence:
+def ambiguous_drive(place: int, kind: str, beams: int) -> LidarSequence:
     """Simulates an ambiguous place in its true size."""
-    mixture = SceneMixture(
-        kinds=((kind, 1.0),), sensors=((BEAMS[beams], 1.0),), indoor_scale=(1.0, 1.0), length_m=length_m
-    )
-    return simulate_scene(draw_scene(place, mixture))
+    true_size = simulation.SceneMixture(indoor_scale=(1.0, 1.0))
+    lidar, length_m = BEAMS[beams], TOWN_LENGTH_M
+    return simulation.simulate_drive(place, length_m=length_m, kind=kind, sensor=lidar, mixture=true_size)
 
 
 def draw_pairs(drive: LidarSequence, bands_m: Bands, num_pairs: int, seed: int) -> Iterator[dpm.ScanPair]:
@@ -211,7 +207,7 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
         clouds = [encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
         of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
         motions = np.stack([of_clouds, result.verified])
-        is_right = registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
+        is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
         for name, features in result.evidence._asdict().items():
             found[name].append(None if features is None else features.tolist())
         found["is_right_of_clouds"].append(bool(is_right[0]))
@@ -242,7 +238,10 @@ def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int
         seed: seed of the run.
     """
     rng = np.random.default_rng([TOWN_STREAM, seed])
-    rows = [_spread(len(drive), num) for drive, num in zip(drives, (NUM_SCANS, NUM_OTHER_SCANS), strict=True)]
+    rows = [
+        np.unique(np.linspace(0, len(drive) - 1, num).astype(int))
+        for drive, num in zip(drives, (NUM_SCANS, NUM_OTHER_SCANS), strict=True)
+    ]
     own, other = (dpm.encode_turned(model, drive, some, rng=rng) for drive, some in zip(drives, rows, strict=True))
     clouds = [cloud.described for cloud in (*own, *other)]
     distances = dpm.scan_distances(drives[0])[np.ix_(rows[0], rows[0])]
@@ -255,11 +254,11 @@ def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int
     )
     shares = (2, 4, 8, 8)
     drawn = [dpm.draw_rows(np.argwhere(kind), num_pairs // n, rng) for kind, n in zip(kinds, shares, strict=True)]
-    vectors = np.stack([pooled_vector(cloud) for cloud in clouds])
+    vectors = np.stack([slam.pooled_vector(cloud) for cloud in clouds])
     hard = [
         (row, int(similar[0]))
         for row in range(len(own))
-        if len(similar := most_similar(vectors, vectors[row], 1, is_allowed=distances[row] >= dpm.OVERLAP_M)[0])
+        if len(similar := slam.most_similar(vectors, vectors[row], 1, is_allowed=distances[row] >= dpm.OVERLAP_M)[0])
     ]
     drawn.append(dpm.draw_rows(np.array(hard, int).reshape(-1, 2), num_pairs // 4, rng))
     pairs = np.concatenate(drawn)
@@ -268,7 +267,7 @@ def town_pairs(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int
     return LabelledPairs(sources, targets, distances[tuple(pairs.T)] < dpm.OVERLAP_M, is_hard)
 
 
-def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> dict[str, Any]:
+def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> cli.Row:
     """Returns evidence and labels of the pairs of a town, without the hard ones; see `town_pairs`."""
     pairs = town_pairs(model, drives, num_pairs, seed)
     num = int(np.sum(~pairs.is_hard))
@@ -276,35 +275,30 @@ def measure_town(model: dpm.Model, drives: Sequence[LidarSequence], num_pairs: i
     return {"evidence": evidence.tolist(), "is_overlap": pairs.is_overlap[:num].tolist()}
 
 
-def fit_overlap(rows: Sequence[dict[str, Any]]) -> tuple[dpm.LogisticModel, dict[str, Any], dict[str, np.ndarray]]:
+def fit_overlap(rows: Sequence[cli.Row]) -> tuple[dpm.LogisticModel, cli.Row, HeldOut]:
     """Returns the model of overlap, its numbers, and the probability of the pairs of each town when it is left out."""
     towns = np.concatenate([np.full(len(row["is_overlap"]), row["overlap_town"]) for row in rows])
     features = np.concatenate([np.asarray(row["evidence"], float) for row in rows])
     is_overlap = np.concatenate([np.asarray(row["is_overlap"], bool) for row in rows])
-    found = held_out_probability(dpm.OVERLAP_FEATURES, features, is_overlap, towns)
+    fitted, found = fit_held_out(dpm.OVERLAP_FEATURES, features, is_overlap, towns)
     numbers = {
         "num_overlap_pairs": len(towns),
-        "auc_overlap": area_under_curve(found, is_overlap),
-        "brier_overlap": brier_score(found, is_overlap),
+        "auc_overlap": metrics.area_under_curve(*found),
+        "brier_overlap": metrics.brier_score(*found),
         "brier_of_a_constant_overlap": float(is_overlap.var()),
     }
-    fitted = dpm.fit_logistic(dpm.OVERLAP_FEATURES, features, is_overlap)
-    return fitted, numbers, {"probability": found, "is_overlap": is_overlap}
+    return fitted, numbers, found
 
 
-def held_out_probability(
-    names: tuple[str, ...], features: np.ndarray, labels: np.ndarray, towns: np.ndarray
-) -> np.ndarray:
-    """Returns the probability of each example by a fit on all towns but its own."""
-    found = np.empty(len(towns))
-    for town in np.unique(towns):
-        part = towns == town
+def fit_held_out(
+    names: tuple[str, ...], features: np.ndarray, labels: np.ndarray, places: np.ndarray
+) -> tuple[dpm.LogisticModel, HeldOut]:
+    """Returns the regression on all places, and the probability of each example by a fit on all places but its own."""
+    found = np.empty(len(places))
+    for place in np.unique(places):
+        part = places == place
         found[part] = dpm.logistic_probability(dpm.fit_logistic(names, features[~part], labels[~part]), features[part])
-    return found
-
-
-def _spread(num: int, num_kept: int) -> np.ndarray:
-    return np.unique(np.linspace(0, num - 1, num_kept).astype(int))
+    return dpm.fit_logistic(names, features, labels), (found, labels)
 
 
 if __name__ == "__main__":

@@ -31,8 +31,6 @@ FIRST_PLACE = 3_200_000
 BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (60.0, np.inf))
 SURE = 0.9
 NEAR_M = 5.0
-# Length of the way through each place out of doors; inside a quarter of it.
-LENGTH_M = 400.0
 RATED = {"scans": "is_right", "clouds": "is_right_of_clouds"}
 COLUMNS = (
     "match of", "calibration of", "place", "pairs", "right", "sure", "sure and wrong", "1-5 m, right and sure",
@@ -72,7 +70,7 @@ def main(config: Config) -> list[cli.Row]:
             raise ValueError(f"{name}: expected the network of {config.models[0]} with another calibration")
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
-        drive = ambiguous_drive(place, kind, beams, LENGTH_M)
+        drive = ambiguous_drive(place, kind, beams)
         return measure_pairs(first, run.until_stopped(draw_pairs(drive, BANDS_M, config.pairs, config.seed)))
 
     def report(rows: list[cli.Row]) -> cli.Summary:

@@ -31,8 +31,7 @@ from dpmjax.nets import DescriptorDecoder
 from experiments import dpm_calibrate as calibrate
 
 EXPERIMENT = "dpm_overlap"
-FIRST_TOWN, FIRST_OTHER_TOWN = 3_500_000, 3_600_000
-TOWN_LENGTH_M, NUM_PAIRS = 400.0, 96
+FIRST_OTHER_TOWN = 3_600_000
 # Every such town stops the training of the head and scales its logit.
 HELD_OUT_STRIDE = 5
 NUM_EPOCHS, BATCH, LEARNING_RATE, WEIGHT_DECAY = 30, 32, 1e-3, 1e-2
@@ -80,7 +79,7 @@ def main(config: Config) -> list[cli.Row]:
     drives = cli.open_evaluation_drives(config.paths, [])
 
     def work(run: cli.TableRun) -> cli.Row:
-        fitted = measure_towns(model, FIRST_TOWN, config.towns, config.seed, run)
+        fitted = measure_towns(model, calibrate.FIRST_OVERLAP_TOWN, config.towns, config.seed, run)
         other = measure_towns(model, FIRST_OTHER_TOWN, config.other_towns, config.seed, run)
         places = {"towns": joined([town.at(~town.is_hard) for town in other]), "towns, hard pairs too": joined(other)}
         for drive, following in run.until_stopped(zip(drives, drives[1:] + drives[:1], strict=True)):
@@ -96,8 +95,11 @@ def main(config: Config) -> list[cli.Row]:
 
 def measure_towns(model: dpm.Model, first: int, num_towns: int, seed: int, run: cli.TableRun) -> list[Examples]:
     """Returns the pairs of each town; the next town gives scans of another place."""
-    drives = [simulation.simulate_drive(first + number, length_m=TOWN_LENGTH_M) for number in range(num_towns + 1)]
-    pairs = (calibrate.town_pairs(model, both, NUM_PAIRS, seed) for both in itertools.pairwise(drives))
+    seeds = range(first, first + num_towns + 1)
+    drives = (simulation.simulate_drive(town, length_m=calibrate.TOWN_LENGTH_M) for town in seeds)
+    pairs = (
+        calibrate.town_pairs(model, both, calibrate.NUM_OVERLAP_PAIRS, seed) for both in itertools.pairwise(drives)
+    )
     return [measure(model, of_town) for of_town in run.until_stopped(pairs)]
 
 

@@ -77,12 +77,11 @@ def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: st
 def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeypatch) -> None:
     kinds = []
 
-    def simulate_drive(seed, *, length_m, kind=None):
+    def simulate_drive(seed, *, length_m, kind=None, sensor=None, mixture=None):
         kinds.append(kind)
         return toy.drive(seed)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(dpm_calibrate, "simulate_scene", lambda scene: toy.drive(scene.seed))
     monkeypatch.setattr(dpm_calibrate, "encode", lambda model, points, num_elements: points)
     rng = np.random.default_rng(0)
 
@@ -117,7 +116,8 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     sizes = ["--towns", 3, "--ambiguous", 2, "--overlap-towns", 2]
     assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
     assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
-    assert set(kinds[3:]) == {None}
+    assert kinds[3:5] == ["corridor", "tunnel"]
+    assert set(kinds[5:]) == {None}
     model = dpmjax.load_model(tmp_path / "out" / "model.safetensors")
     assert model.config.calibration is not None
     assert max(model.config.calibration.of_scans.weights[4:]) > 0

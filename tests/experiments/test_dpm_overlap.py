@@ -56,7 +56,7 @@ def test_all_methods_are_compared_on_all_places(tmp_path, monkeypatch) -> None:
     weights = tmp_path / "model.safetensors"
     dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), weights)
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
-    monkeypatch.setattr(dpm_overlap, "NUM_PAIRS", 16)
+    monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
     arguments = [str(weights), "--towns", "2", "--other-towns", "2", "-o", str(tmp_path / "out")]
     names = {"name": dpm_overlap.EXPERIMENT, "description": dpm_overlap.__doc__}
     assert run_command(dpm_overlap.main, dpm_overlap.Config, args=arguments, **names) == EXIT_OK
