@@ -17,19 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from numpy.typing import NDArray
 
 from dpmjax import ScanSet
 from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem
 from dpmjax.geometry import rigid, se2, typical_range
 from dpmjax.losses import chamfer_distance
 
-Floats = NDArray[np.float64]
 
-
-def optimize_directly(
-    scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array
-) -> NDArray[np.float64]:
+def optimize_directly(scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array) -> np.ndarray:
     """Returns poses from zero by L-BFGS on the loss at the end of the last warm phase, its random samples held.
 
     Args:
@@ -82,7 +77,7 @@ class Swarms(NamedTuple):
 SWARMS = Swarms()
 
 
-def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> NDArray[np.float64]:
+def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> np.ndarray:
     """Returns poses of planar scans, each onto the one before by a swarm on their Chamfer distance (eq. 5).
 
     A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
@@ -158,7 +153,7 @@ _RADIUS = 0.3
 _PRUNE = 0.25
 
 
-def multiway(scans: ScanSet) -> Floats:
+def multiway(scans: ScanSet) -> np.ndarray:
     """Returns poses of planar scans by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
@@ -176,9 +171,7 @@ def multiway(scans: ScanSet) -> Floats:
     return se2.relative(planar[0], planar)
 
 
-def multiway_images(
-    points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"]
-) -> Float[NDArray[np.float64], "n 4 4"]:
+def multiway_images(points: Float[np.ndarray, "n h w 3"], mask: Bool[np.ndarray, "n h w"]) -> np.ndarray:
     """Returns poses of depth images by Open3D's multiway registration; a ModuleNotFoundError without Open3D.
 
     Args:
@@ -186,7 +179,7 @@ def multiway_images(
         mask: True where something was measured.
 
     Returns:
-        T_world_camera, the first one the identity.
+        (n, 4, 4) T_world_camera, the first one the identity.
     """
     unit = typical_range(points, mask)
     clouds = [_cloud(p[m]) for p, m in zip(np.asarray(points), np.asarray(mask), strict=True)]
@@ -195,7 +188,7 @@ def multiway_images(
     return _registered(clouds, unit, is_planar=False)
 
 
-def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> Floats:
+def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> np.ndarray:
     """Returns the poses of clouds, (n, 4, 4), the first one the identity; flat ones by points, others by planes.
 
     Each cloud is matched from where the one before is.
@@ -208,18 +201,26 @@ def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> Floats:
     if is_planar:  # planes of flat clouds leave three directions open
         estimation = registration.TransformationEstimationPointToPoint()
     graph = registration.PoseGraph()
+
+    def add_edge(source: int, target: int, T: np.ndarray, *, is_doubtful: bool) -> np.ndarray:
+        """Adds the motion of a pair with its information, matched from a first guess; returns the motion."""
+        pair = clouds[source], clouds[target]
+        for distance in (coarse, fine):
+            T = registration.registration_icp(*pair, distance, T, estimation).transformation
+        information = registration.get_information_matrix_from_point_clouds(*pair, fine, T)
+        graph.edges.append(registration.PoseGraphEdge(source, target, T, information, uncertain=is_doubtful))
+        return T
+
     T_world = [np.eye(4)]
-    graph.nodes.append(_node(T_world[0]))
     for scan in range(1, len(clouds)):
-        graph.edges.append(_edge(clouds, (scan - 1, scan), np.eye(4), (coarse, fine), estimation, is_doubtful=False))
         # An edge maps its source, the earlier scan, into the later one.
-        T_world.append(T_world[-1] @ np.linalg.inv(graph.edges[-1].transformation))
-        graph.nodes.append(_node(T_world[-1]))
+        T_world.append(T_world[-1] @ np.linalg.inv(add_edge(scan - 1, scan, np.eye(4), is_doubtful=False)))
+    for T_world_scan in T_world:
+        graph.nodes.append(registration.PoseGraphNode(T_world_scan))
     placed = np.stack(T_world)
     apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
     for source, target in np.argwhere(np.triu(apart < _RADIUS * unit, k=2)).tolist():
-        guess = rigid.inverse(placed[target]) @ placed[source]
-        graph.edges.append(_edge(clouds, (source, target), guess, (coarse, fine), estimation, is_doubtful=True))
+        add_edge(source, target, rigid.inverse(placed[target]) @ placed[source], is_doubtful=True)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         registration.global_optimization(
             graph,
@@ -232,34 +233,7 @@ def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> Floats:
     return np.stack([node.pose for node in graph.nodes])
 
 
-def _cloud(points: NDArray[np.floating]) -> Any:
+def _cloud(points: np.ndarray) -> Any:
     import open3d
 
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
-
-
-def _node(T_world_scan: Floats) -> Any:
-    import open3d
-
-    return open3d.pipelines.registration.PoseGraphNode(T_world_scan)
-
-
-def _edge(
-    clouds: list[Any],
-    pair: tuple[int, int],
-    T_guess: Floats,
-    distances: tuple[float, float],
-    estimation: Any,
-    *,
-    is_doubtful: bool,
-) -> Any:
-    """Returns the motion of a pair of source and target, with its information."""
-    import open3d
-
-    registration = open3d.pipelines.registration
-    source, target = (clouds[row] for row in pair)
-    T = T_guess
-    for distance in distances:
-        T = registration.registration_icp(source, target, distance, T, estimation).transformation
-    information = registration.get_information_matrix_from_point_clouds(source, target, distances[-1], T)
-    return registration.PoseGraphEdge(*pair, T, information, uncertain=is_doubtful)

@@ -7,14 +7,13 @@ A search, an ICP or a refinement has its own name.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax import ScanSet, cli, registration2d
 from dpmjax import deepmapping as dm
@@ -22,8 +21,7 @@ from dpmjax.io import ScanSequence
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
 from experiments._baselines import multiway, optimize_directly, swarm_chain
 
-Floats = NDArray[np.float64]
-Candidates = dict[str, Floats]
+Candidates = dict[str, np.ndarray]
 
 # ATE below which the paper calls a run a success (section 4.1).
 SUCCESS_PX = 20.0
@@ -69,22 +67,22 @@ def make_task(sequence: ScanSequence, *, is_ordered: bool = True, steps: int | N
     return Task(sequence, planar, is_ordered, steps, seed)
 
 
-def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> Floats:
+def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> np.ndarray:
     """Returns poses by incremental ICP."""
     return registration2d.incremental_icp(task.planar, metric).poses
 
 
-def search(task: Task) -> Floats:
+def search(task: Task) -> np.ndarray:
     """Returns poses by global registration, from nothing but the scans: no odometry, no first guess, no refinement."""
     return registration2d.register_globally(task.planar).poses
 
 
-def refined(task: Task, poses: Floats) -> Floats:
+def refined(task: Task, poses: np.ndarray) -> np.ndarray:
     """Returns the poses after the alignment of all scans together."""
     return registration2d.refine(task.planar, poses).poses
 
 
-def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str, dict[str, float]]]:
+def choose(task: Task, candidates: Mapping[str, np.ndarray]) -> tuple[str, dict[str, dict[str, float]]]:
     """Returns the name of the best candidate, chosen by the scans alone, and the errors and scores of all."""
     kept, scores = registration2d.choose_trajectory(task.planar, candidates)
     return kept, {
@@ -92,12 +90,12 @@ def choose(task: Task, candidates: Mapping[str, Floats]) -> tuple[str, dict[str,
     }
 
 
-def assess(task: Task, poses: Floats) -> dict[str, Any]:
+def assess(task: Task, poses: np.ndarray) -> dict[str, Any]:
     """Returns the assessment of poses, from the scans alone, under the names of the result files."""
     return registration2d.assess_trajectory(task.planar, poses)._asdict()
 
 
-def _fit(task: Task, start: Floats | None, config: dm.DeepMappingConfig | None = None) -> Floats:
+def _fit(task: Task, start: np.ndarray | None, config: dm.DeepMappingConfig | None = None) -> np.ndarray:
     """Returns poses by DeepMapping from a start, or from zero poses."""
     settings = config or dm.preset("fast")
     settings = settings if task.steps is None else dm.with_steps(settings, task.steps)
@@ -109,7 +107,7 @@ def _refined_icp(task: Task) -> Candidates:
     return {f"{START_NAMES['icp-plane']}, refined": refined(task, incremental(task))}
 
 
-def _direct_lbfgs(task: Task) -> Floats:
+def _direct_lbfgs(task: Task) -> np.ndarray:
     """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
     num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
     return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=task.key)
@@ -122,7 +120,7 @@ def _lnet_from_icp(task: Task) -> Candidates:
     return {START_NAMES["icp-plane"]: start, DEEPMAPPING: fitted}
 
 
-def _direct(task: Task, *, has_windows: bool) -> Floats:
+def _direct(task: Task, *, has_windows: bool) -> np.ndarray:
     """Returns poses by DeepMapping's loss without L-Net, from zero by Adam; windows, or the whole set in each phase."""
     config = dm.as_direct(dm.preset("fast"))
     if not has_windows:
@@ -147,15 +145,14 @@ def _refined_deepmapping(task: Task) -> Candidates:
 def _all_candidates(task: Task) -> Candidates:
     """Returns ICP (of ordered scans), global registration and DeepMapping from it, and each of them refined."""
     found = {START_NAMES["icp-plane"]: incremental(task)} if task.is_ordered else {}
-    start = search(task)
-    found |= {START_NAMES["global"]: start, DEEPMAPPING: _fit(task, start)}
+    found |= _global_deepmapping(task)
     return found | {f"{name}, refined": refined(task, x) for name, x in found.items()}
 
 
-def _best_start(task: Task) -> tuple[str, Floats]:
+def _best_start(task: Task) -> tuple[str, np.ndarray]:
     """Returns refined ICP if trusted; else of it and refined global registration the more strongly connected one."""
 
-    def assessed(name: str, poses: Floats) -> tuple[dict[str, Any], str, Floats]:
+    def assessed(name: str, poses: np.ndarray) -> tuple[dict[str, Any], str, np.ndarray]:
         return assess(task, poses), f"{name}, refined", poses
 
     starts = []
@@ -177,7 +174,7 @@ class Method(NamedTuple):
     """
 
     title: str
-    run: Callable[[Task], Candidates | Floats]
+    run: Callable[[Task], Candidates | np.ndarray]
     package: str | None = None
 
 
@@ -247,13 +244,13 @@ def run_method(name: str, task: Task) -> cli.Row:
     }
 
 
-def success_of_trusted(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def success_of_trusted(rows: list[cli.Row]) -> cli.Row:
     """Returns how many maps were trusted, and the share of these that are right."""
     trusted = [row["success"] for row in rows if row["is_trusted"]]
     return {"num_trusted": len(trusted), "success_of_trusted": float(np.mean(trusted)) if trusted else None}
 
 
-def best_kept(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def best_kept(rows: list[cli.Row]) -> cli.Row:
     """Returns how many rows have several candidates, and of how many the best one was kept, or one nearly as good."""
     regrets = [
         row["ate_px"] - min(numbers["ate_px"] for numbers in row["candidates"].values())
@@ -266,7 +263,7 @@ def best_kept(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def run_methods(
     config: TableOptions,
     experiment: str,
-    cells: Sequence[cli.Row],
+    cells: list[cli.Row],
     prepare: Callable[[cli.Row], tuple[Task, cli.Row]],
     report: Callable[[list[cli.Row], dict[str, str]], cli.Summary],
 ) -> list[cli.Row]:
@@ -286,8 +283,7 @@ def run_methods(
         ValueError: the package of a chosen method cannot be imported.
     """
     packages = {name: package for name in config.methods if (package := METHODS[name].package) is not None}
-    reasons = {name: cli.why_not_importable(package) for name, package in packages.items()}
-    unusable = {name: reason for name, reason in reasons.items() if reason is not None}
+    unusable = {name: reason for name, package in packages.items() if (reason := cli.why_not_importable(package))}
     if unusable and set(config.methods) != set(METHODS):
         name, reason = next(iter(unusable.items()))
         raise ValueError(f"--methods {name}: {reason}")

@@ -14,13 +14,11 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import arg
 
 from dpmjax import cli, simulation, viz
@@ -66,7 +64,7 @@ class Config(shared.TableOptions):
             raise ValueError(f"--strides: expected at most {NUM_SCANS // 4}, got {max(self.strides)}")
 
 
-def main(config: Config) -> list[dict[str, Any]]:
+def main(config: Config) -> list[cli.Row]:
     """Runs the missing cases, cell by cell."""
     axes = {
         "world": config.worlds,
@@ -79,7 +77,7 @@ def main(config: Config) -> list[dict[str, Any]]:
     return shared.run_methods(config, EXPERIMENT, cells, partial(_prepare, config), partial(report, config))
 
 
-def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
+def _prepare(config: Config, cell: cli.Row) -> tuple[Task, cli.Row]:
     walk, kind = cell["walk"], cell["world"]
     world = walk % NUM_ROOMS if kind == "rooms" else f"{kind}-{walk}"
     sequence = simulation.simulate_sequence(world, NUM_SCANS, seed=200 + walk, range_noise_px=cell["noise_px"])
@@ -87,12 +85,13 @@ def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]
     return shared.make_task(scans, is_ordered=cell["order"] == "ordered", steps=config.steps, seed=config.seed), {}
 
 
-def success_grids(rows: Sequence[dict[str, Any]], config: Config) -> dict[str, NDArray[np.float64]]:
+def success_grids(rows: list[cli.Row], config: Config) -> dict[str, np.ndarray]:
     """Returns (strides, noises) success rates of every method and candidate, smallest stride first; NaN: not run."""
-    cells: dict[str, dict[tuple[Any, ...], list[bool]]] = defaultdict(lambda: defaultdict(list))
+    cells: dict[str, dict[tuple[int, float], list[bool]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        for column, is_right in _successes(row).items():
-            cells[column][row["stride"], row["noise_px"]].append(is_right)
+        found = {name: numbers["ate_px"] < shared.SUCCESS_PX for name, numbers in row["candidates"].items()}
+        for name, is_right in (found if len(found) == 1 else found | {"kept": row["success"]}).items():
+            cells[_column(row, name)][row["stride"], row["noise_px"]].append(is_right)
     strides, empty = sorted(config.strides), [np.nan]
     return {
         column: np.array([[np.mean(found.get((i, j), empty)) for j in config.noises_px] for i in strides])
@@ -100,13 +99,7 @@ def success_grids(rows: Sequence[dict[str, Any]], config: Config) -> dict[str, N
     }
 
 
-def _successes(row: dict[str, Any]) -> dict[str, bool]:
-    """Returns which candidates of a row are right, and whether the kept one is."""
-    found = {_column(row, name): numbers["ate_px"] < shared.SUCCESS_PX for name, numbers in row["candidates"].items()}
-    return found if len(found) == 1 else found | {_column(row, "kept"): row["success"]}
-
-
-def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
+def summary(rows: list[cli.Row]) -> list[str]:
     """Returns a line for each world, order and method: mean success of all cells run, and at every 8th scan."""
     lines = []
     for (world, order, method), mine in cli.group_rows(rows, "world", "order", "method").items():
@@ -117,7 +110,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: list[cli.Row]) -> str:
     """Returns the median ATE of every method and candidate in every cell, as Markdown."""
     columns = dict.fromkeys(_column(row, name) for row in rows for name in row["candidates"])
     lines = []
@@ -132,12 +125,12 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return cli.markdown(("world", "order", "every", "noise, px", *columns, "best kept"), lines)
 
 
-def _column(row: dict[str, Any], candidate: str) -> str:
+def _column(row: cli.Row, candidate: str) -> str:
     """Returns the heading of a candidate: that of its method where it is the only one."""
     return row["method"] if len(row["candidates"]) == 1 else f"{row['method']}: {candidate}"
 
 
-def report(config: Config, rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Summary:
+def report(config: Config, rows: list[cli.Row], not_run: dict[str, str]) -> cli.Summary:
     """Returns the successes, the table and a picture for each world and order."""
     lines = summary(rows)
 

@@ -15,21 +15,17 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import cli
 from dpmjax.geometry import se2
 from dpmjax.registration2d import DEEPMAPPING
 from dpmjax.simulation import scan_world, simulate_odometry
-
-Floats = NDArray[np.float64]
 
 EXPERIMENT = "deepmapping_logs"
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
@@ -130,7 +126,7 @@ def is_right(row: cli.Row) -> bool | None:
     return row["worst_scan_m"] < _RIGHT_M if "worst_scan_m" in row else None
 
 
-def trust_lines(rows: Sequence[cli.Row]) -> list[str]:
+def trust_lines(rows: list[cli.Row]) -> list[str]:
     """Returns the shares of trusted maps that are right, and of right maps that are trusted."""
     known = [(is_right(row), row["assessment"]["is_trusted"]) for row in rows if is_right(row) is not None]
     both = sum(bool(right and trusted) for right, trusted in known)
@@ -187,7 +183,7 @@ def write_corridor_log(path: Path, seed: int) -> Path:
     return path
 
 
-def _make_corridor(rng: np.random.Generator) -> NDArray[np.bool_]:
+def _make_corridor(rng: np.random.Generator) -> np.ndarray:
     solid = np.ones((_HEIGHT_PX, _LENGTH_PX), bool)
     low, high = _HEIGHT_PX // 2, _HEIGHT_PX // 2 + _WIDTH_PX
     solid[low:high, 20 : _LENGTH_PX - 20] = False
@@ -201,7 +197,7 @@ def _make_corridor(rng: np.random.Generator) -> NDArray[np.bool_]:
     return solid
 
 
-def _drive(rng: np.random.Generator) -> Floats:
+def _drive(rng: np.random.Generator) -> np.ndarray:
     """Returns poses along the middle of the corridor, px and radians."""
     x = np.linspace(60.0, _LENGTH_PX - 80.0, _NUM_SCANS) + rng.normal(0.0, 3.0, _NUM_SCANS)
     middle = _HEIGHT_PX / 2 + _WIDTH_PX / 2

@@ -14,17 +14,15 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import ScanSet, cli, metrics, simulation, viz
 from dpmjax import deepmapping as dm
+from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
-
-Floats = NDArray[np.float64]
 
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
@@ -50,7 +48,7 @@ class Config:
         cli.check_least(self, stride_px=1)
 
 
-def main(config: Config) -> dict[str, Any]:
+def main(config: Config) -> cli.Row:
     """Loads the run, trains L-Net on its poses, re-localises scans everywhere, draws, writes."""
     import jax
 
@@ -97,14 +95,14 @@ class Queries(NamedTuple):
         nats: cost of a beam by the map.
     """
 
-    errors: Floats
-    turns: Floats
-    is_known: NDArray[np.bool_]
-    is_mapped: NDArray[np.bool_]
-    nats: Floats
+    errors: np.ndarray
+    turns: np.ndarray
+    is_known: np.ndarray
+    is_mapped: np.ndarray
+    nats: np.ndarray
 
 
-def draw(config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: Floats, queries: Queries) -> None:
+def draw(config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: np.ndarray, queries: Queries) -> None:
     """Draws relocalization.png: maps of the errors, of all scans and of those that are known."""
     panels = []
     for name, rows in (("all scans", np.ones(len(truth), bool)), ("scans that are known", queries.is_known)):
@@ -113,13 +111,12 @@ def draw(config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: 
         share = float((queries.errors[rows] < _RIGHT_PX).mean()) if rows.any() else 0.0
         panels.append(viz.ErrorMap(name, f"{share:.0%} of {rows.sum()} below {_RIGHT_PX:.0f} px", image))
     side = config.stride_px * np.array(panels[0].error.shape)
-    assert sequence.reference_poses is not None
     extent = (0.0, side[1], 0.0, side[0])
     figure = viz.error_maps_figure(panels, extent, sequence.reference_poses[:, :2], "px", worst=200.0)
     viz.save_figure(figure, config.run / "relocalization.png")
 
 
-def free_poses(grid: NDArray[np.bool_], config: Config) -> Floats:
+def free_poses(grid: np.ndarray, config: Config) -> np.ndarray:
     """Returns (m, 3) poses of random headings at the centres of the free squares."""
     half = config.stride_px // 2
     rows, columns = np.nonzero(~grid[half :: config.stride_px, half :: config.stride_px])
@@ -128,7 +125,7 @@ def free_poses(grid: NDArray[np.bool_], config: Config) -> Floats:
     return np.column_stack([places, headings])
 
 
-def is_mapped(truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> NDArray[np.bool_]:
+def is_mapped(truth: np.ndarray, fitted: dm.Fitted, sequence: ScanSequence) -> np.ndarray:
     """Returns True for places of true poses that some beam of the fit's scans has passed."""
     picture = dm.map_picture(fitted, sequence.points, sequence.mask)
     T_fit_world = metrics.align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
@@ -141,17 +138,17 @@ def is_mapped(truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> NDArr
     return is_inside & picture.explored[row, column]
 
 
-def errors_at(poses: Floats, truth: Floats, fitted: dm.Fitted, sequence: ScanSequence) -> tuple[Floats, Floats]:
+def errors_at(
+    poses: np.ndarray, truth: np.ndarray, fitted: dm.Fitted, sequence: ScanSequence
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns distance (px) and angle (degrees) to the truth, after the run's trajectory is aligned with it."""
-    from dpmjax.geometry import se2
-
     T = metrics.align_rigid(fitted.poses[:, :2], sequence.reference_poses[:, :2])
     moved = poses[:, :2] @ T[:2, :2].T + T[:2, 2]
     turn = se2.wrap_angle(poses[:, 2] + np.arctan2(T[1, 0], T[0, 0]) - truth[:, 2])
     return np.linalg.norm(moved - truth[:, :2], axis=1), np.degrees(np.abs(turn))
 
 
-def summarise(queries: Queries, truth: Floats, sequence: ScanSequence) -> dict[str, Any]:
+def summarise(queries: Queries, truth: np.ndarray, sequence: ScanSequence) -> cli.Row:
     """Returns the numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
     from scipy.spatial import KDTree
 
@@ -170,7 +167,7 @@ def summarise(queries: Queries, truth: Floats, sequence: ScanSequence) -> dict[s
     }
 
 
-def _numbers(queries: Queries, rows: NDArray[np.bool_]) -> dict[str, Any]:
+def _numbers(queries: Queries, rows: np.ndarray) -> cli.Row:
     return {
         "num_poses": int(rows.sum()),
         "median_px": float(np.median(queries.errors[rows])),
@@ -180,7 +177,7 @@ def _numbers(queries: Queries, rows: NDArray[np.bool_]) -> dict[str, Any]:
     }
 
 
-def lines_of(report: dict[str, Any]) -> str:
+def lines_of(report: cli.Row) -> str:
     """Returns the numbers of each group of scans for the console."""
     lines = [
         f"{name}: {row['num_poses']} scans, median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees, "

@@ -21,20 +21,17 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, simulation, viz
 from dpmjax import deepmapping as dm
 from dpmjax import registration_rgbd as rgbd
-
-Poses = NDArray[np.float64]
 
 EXPERIMENT = "deepmapping_rgbd"
 METHODS = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct", "icp", "multiway")
@@ -63,8 +60,6 @@ class Config(cli.RunOptions):
     """Trajectories."""
     methods: tuple[str, ...] = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct")
     """What to compare; also icp and multiway (Open3D, extra `baselines`)."""
-    preset: Literal["fast", "paper"] = "fast"
-    """fast: seconds a trajectory; paper: its networks and sampling, for a GPU."""
     window_step: Annotated[int, arg(metavar="N")] = _FOLDER_VIEWS // 2
     """Windows of 8 images of a folder begin so many images apart."""
 
@@ -78,7 +73,7 @@ def main(config: Config) -> list[cli.Row]:
     """Runs the missing cases, then writes the table and the pictures."""
     if "multiway" in config.methods:
         cli.require_importable("open3d", "--methods multiway")
-    settings = dm.preset(config.preset, "depth", motion="planar" if read_trajectory(config, 0).is_planar else "full")
+    settings = dm.preset("fast", "depth", motion="planar" if read_trajectory(config, 0).is_planar else "full")
 
     def work(run: cli.TableRun, trajectory: int) -> cli.Row:
         return run_one(trajectory, run.folder, config, settings)
@@ -114,8 +109,8 @@ def read_trajectory(config: Config, index: int) -> io.DepthSequence:
 
 
 def run_method(
-    name: str, sequence: io.DepthSequence, settings: dm.DeepMappingConfig, found: Mapping[str, Poses], *, seed: int
-) -> Poses:
+    name: str, sequence: io.DepthSequence, settings: dm.DeepMappingConfig, found: Mapping[str, np.ndarray], *, seed: int
+) -> np.ndarray:
     """Returns (n, 4, 4) T_world_camera by one method.
 
     Args:
@@ -137,7 +132,7 @@ def run_method(
 
     scans, key = rgbd.as_depth_scans(sequence.points, sequence.mask), jax.random.key(seed)
 
-    def fit_cold(config: dm.DeepMappingConfig) -> Poses:
+    def fit_cold(config: dm.DeepMappingConfig) -> np.ndarray:
         return dm.fit_deepmapping(scans, config, key=key).T_world_scan
 
     methods = {
@@ -152,7 +147,7 @@ def run_method(
     return methods[name]()
 
 
-def chain_icp(sequence: io.DepthSequence, *, seed: int) -> Poses:
+def chain_icp(sequence: io.DepthSequence, *, seed: int) -> np.ndarray:
     """Returns poses by point-to-plane ICP of each image onto the one before, from the same pose."""
     from dpmjax.registration2d import icp
 
@@ -170,17 +165,14 @@ def chain_icp(sequence: io.DepthSequence, *, seed: int) -> Poses:
 
 def spread_of(sequence: io.DepthSequence) -> float:
     """Returns the root mean square distance of the cameras from their mean, mm: the ATE of not moving at all."""
-    assert sequence.T_world_camera is not None
     positions = sequence.T_world_camera[:, :3, 3]
     return 1e3 * float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
 
 
-def errors_of(T: Poses, sequence: io.DepthSequence) -> dict[str, float]:
+def errors_of(T: np.ndarray, sequence: io.DepthSequence) -> dict[str, float]:
     """Returns ATE (mm), mean point distance (mm) and the largest error of a turn between neighbours (degrees)."""
     errors = cli.depth_errors(sequence, T)
-    return {name.replace("_m", "_mm"): 1e3 * value for name, value in errors.items() if name.endswith("_m")} | {
-        name: value for name, value in errors.items() if name.endswith("_deg")
-    }
+    return {name.replace("_m", "_mm"): 1e3 * value if name.endswith("_m") else value for name, value in errors.items()}
 
 
 def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm.DeepMappingConfig) -> cli.Row:
@@ -198,7 +190,7 @@ def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm
         The remaining entries of the row.
     """
     sequence = read_trajectory(config, trajectory)
-    found: dict[str, Poses] = {}
+    found: dict[str, np.ndarray] = {}
     row: cli.Row = {"name": sequence.name, "views": len(sequence), "spread_mm": spread_of(sequence)}
     for name in config.methods:
         begun = time.perf_counter()
@@ -212,7 +204,7 @@ def run_one(trajectory: int, folder: cli.RunFolder, config: Config, settings: dm
     return row
 
 
-def summarise(rows: Sequence[cli.Row], methods: Sequence[str]) -> dict[str, Any]:
+def summarise(rows: list[cli.Row], methods: tuple[str, ...]) -> cli.Row:
     """Returns success rates and medians by method."""
     table: dict[str, dict[str, float]] = {}
     spread_mm = np.array([row["spread_mm"] for row in rows])
@@ -226,7 +218,7 @@ def summarise(rows: Sequence[cli.Row], methods: Sequence[str]) -> dict[str, Any]
     return {"num_trajectories": len(rows), "methods": table}
 
 
-def report(rows: list[cli.Row], methods: Sequence[str]) -> cli.Summary:
+def report(rows: list[cli.Row], methods: tuple[str, ...]) -> cli.Summary:
     """Returns the shares and medians of each method, and errors.png."""
     numbers = summarise(rows, methods)
     right = f"below {_RIGHT_SHARE:.0%} of the spread, turns {_RIGHT_DEG:g} degrees, points {_RIGHT_MM:g} mm"

@@ -11,10 +11,9 @@ metrics.json (with all rows), boxes.png.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from tyro.conf import arg
@@ -52,27 +51,25 @@ def list_trajectories() -> list[dict[str, int]]:
     return [entry for k in range(NUM_LONG) for entry in (short[2 * k], short[2 * k + 1], long[k])]
 
 
-def main(config: Config) -> list[dict[str, Any]]:
+def main(config: Config) -> list[cli.Row]:
     """Runs the missing cases, and writes the table."""
-    return shared.run_methods(
-        config, EXPERIMENT, list_trajectories()[: config.limit], partial(_prepare, config), report
-    )
+    cells = list_trajectories()[: config.limit]
+    return shared.run_methods(config, EXPERIMENT, cells, partial(_prepare, config), report)
 
 
-def _prepare(config: Config, cell: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
+def _prepare(config: Config, cell: cli.Row) -> tuple[Task, cli.Row]:
     """Returns the scans of a trajectory, and with noise the Cramer-Rao bound on their ATE."""
     world, noise = cell["world"], config.range_noise_px
     sequence = simulation.simulate_sequence(world, cell["num_scans"], seed=cell["walk"], range_noise_px=noise)
     task = shared.make_task(sequence, steps=config.steps, seed=config.seed)
     if not noise:
         return task, {}
-    assert sequence.reference_poses is not None
     cast = partial(simulation.cast_scans, simulation.make_world(world).is_obstacle, num_beams=sequence.mask.shape[1])
     bound = metrics.position_bound(cast, sequence.reference_poses, range_noise=noise)
     return task, {"bound_px": float(np.sqrt(np.mean(bound**2)))}
 
 
-def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarise(rows: list[cli.Row]) -> cli.Row:
     """Returns medians and success of one method and of each of its candidates, and how right its assessment was."""
     names = dict.fromkeys(name for row in rows for name in row["candidates"])
     medians = {"median_s": "seconds", "median_cpu_s": "cpu_s", "median_bound_px": "bound_px"}
@@ -90,7 +87,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _medians(numbers: list[cli.Row]) -> cli.Row:
     ates = np.array([row["ate_px"] for row in numbers])
     return {
         "num_trajectories": len(numbers),
@@ -100,11 +97,11 @@ def _medians(numbers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: list[cli.Row]) -> str:
     """Returns the table as Markdown: a row for each method, and below it one for each of several candidates."""
     columns = ("method", "trajectories", "median ATE, px", "median point distance, px", "success (ATE < 20 px)")
 
-    def cells(title: str, s: dict[str, Any], *last: object) -> list[object]:
+    def cells(title: str, s: cli.Row, *last: object) -> list[object]:
         medians = (f"{s[name]:.3g}" for name in ("median_ate_px", "median_point_distance_px"))
         return [title, s["num_trajectories"], *medians, f"{s['success']:.1%}", *last]
 
@@ -121,7 +118,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return cli.markdown((*columns, "median s", "trusted", "of these right"), lines)
 
 
-def report(rows: list[dict[str, Any]], not_run: dict[str, str]) -> cli.Summary:
+def report(rows: list[cli.Row], not_run: dict[str, str]) -> cli.Summary:
     """Returns the numbers of the methods, the table and boxes.png."""
     groups = {method: mine for (method,), mine in cli.group_rows(rows, "method").items()}
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from dpmjax.cli import METRICS, RunOptions, Summary, TableRun, load_json, markdown, run_command, run_table
@@ -149,7 +148,7 @@ def _run(table: TableRun, data: str, command: str, *, config: Config) -> dict[st
     }
 
 
-def _turned_deg(T: NDArray[np.float64]) -> float:
+def _turned_deg(T: np.ndarray) -> float:
     """Returns the largest angle between a pose and the first one."""
     cosines = (np.einsum("ij,nij->n", T[0, :3, :3], T[:, :3, :3]) - 1.0) / 2.0
     return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).max())

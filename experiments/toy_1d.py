@@ -16,7 +16,6 @@ from functools import partial
 from typing import Annotated, Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import arg
 
 from dpmjax import cli, viz
@@ -93,14 +92,13 @@ def descend_both(toy: dm.ToyConfig, config: Config) -> tuple[dm.Fit, dm.Fit]:
     return descend(replace(toy, form="network"), config), descend(replace(toy, form="direct"), config)
 
 
-def path(run: dm.Fit) -> NDArray[np.floating]:
+def path(run: dm.Fit) -> np.ndarray:
     """Returns (seeds, steps + 1) x of every seed from the start to the end."""
-    assert run.report is not None
     x = np.atleast_2d(np.asarray(run.report.terms))
     return np.concatenate([x, np.reshape(run.poses, (-1, 1))], axis=1)
 
 
-def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, NDArray[np.floating]], dict[str, Any]]:
+def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Returns the ends of all methods with the paper's settings, and the data of figure 14 of one seed."""
     import jax
     import jax.numpy as jnp
@@ -132,7 +130,7 @@ def minimize(x0: Any, *, solver: str, max_iterations: int) -> Any:
     return getattr(jaxopt, SOLVERS[solver])(fun=dm.toy_loss, maxiter=max_iterations).run(x0).params
 
 
-def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating]) -> int:
+def choose_seed(network_x: np.ndarray, direct_x: np.ndarray) -> int:
     """Returns the first seed that the network form brings to the minimum and the direct form does not, as in figure 14.
 
     Args:
@@ -146,12 +144,12 @@ def choose_seed(network_x: NDArray[np.floating], direct_x: NDArray[np.floating])
     return int(np.argmax(2 * is_example + (np.abs(network_x).max(axis=1) < VIEW)))
 
 
-def is_at_minimum(x: NDArray[np.floating]) -> NDArray[np.bool_]:
+def is_at_minimum(x: np.ndarray) -> np.ndarray:
     """Returns True for ends at the global minimum."""
     return np.abs(np.asarray(x, np.float64) - dm.global_minimum()[0]) < _SAME_PLACE
 
 
-def share_at_minimum(x: NDArray[np.floating]) -> float:
+def share_at_minimum(x: np.ndarray) -> float:
     """Returns the share of the seeds that end at the global minimum."""
     return float(is_at_minimum(x).mean())
 
