@@ -7,7 +7,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp
@@ -25,7 +24,7 @@ class Case(NamedTuple):
     ours: Callable[..., object]
     peer_name: str
     peer: Callable[..., object]
-    arguments: tuple[NDArray[np.generic], ...]
+    arguments: tuple[np.ndarray, ...]
 
 
 def run(quick: bool) -> list[Row]:
@@ -73,7 +72,7 @@ def difference(case: Case) -> float:
     return float(np.max(np.abs(np.asarray(case.ours(*case.arguments)) - np.asarray(case.peer(*exact)))))
 
 
-def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], weights: NDArray[np.floating]) -> object:
+def weighted_svd(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> object:
     """Returns T_target_source by SciPy's alignment of vectors."""
     source_centre, target_centre = (np.average(points, axis=0, weights=weights) for points in (source, target))
     turn, _ = Rotation.align_vectors(target - target_centre, source - source_centre, weights)
@@ -82,12 +81,12 @@ def weighted_svd(source: NDArray[np.floating], target: NDArray[np.floating], wei
     return T
 
 
-def chamfer_distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> object:
+def chamfer_distance(a: np.ndarray, b: np.ndarray) -> object:
     """Returns the mean distance from a to b plus from b to a, with a tree for each."""
     return np.mean(KDTree(b).query(a)[0]) + np.mean(KDTree(a).query(b)[0])
 
 
-def numpy_info_nce(queries: NDArray[np.floating], keys: NDArray[np.floating], positives: NDArray[np.int32]) -> object:
+def numpy_info_nce(queries: np.ndarray, keys: np.ndarray, positives: np.ndarray) -> object:
     """Returns InfoNCE of cosine similarities."""
     queries = queries / np.linalg.norm(queries, axis=1, keepdims=True)
     keys = keys / np.linalg.norm(keys, axis=1, keepdims=True)

@@ -12,12 +12,10 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks import DATA, Row, measure
 from dpmjax import ScanSet, fit_deepmapping
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping import Progress, fit, mapping_data, mapping_problem
 from dpmjax.io import ScanSequence, read_sequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import PlanarScans, incremental_icp, planar_scans, refine
@@ -46,12 +44,11 @@ def run(quick: bool) -> list[Row]:
     return rows + _paper_step(sequences[0]) + _from_zero(quick)
 
 
-def _poor_start(sequence: ScanSequence) -> NDArray[np.float64]:
+def _poor_start(sequence: ScanSequence) -> np.ndarray:
     """Returns the start that comes with the authors' trajectory; elsewhere a drift of its size."""
     file = RECORDED / "start_16px.txt"
     if file.exists() and sequence.name.startswith("v1_pose0"):
         return np.loadtxt(file)[: len(sequence)]
-    assert sequence.reference_poses is not None
     rng = np.random.default_rng(0)
     drift = np.cumsum(rng.normal(0.0, [1.2, 1.2, 0.004], sequence.reference_poses.shape), axis=0)
     return sequence.reference_poses + drift
@@ -69,8 +66,7 @@ def _lines(sequence: ScanSequence) -> PlanarScans:
     return planar_scans(sequence.points, sequence.mask)
 
 
-def _ate(sequence: ScanSequence, poses: NDArray[np.float64]) -> float:
-    assert sequence.reference_poses is not None
+def _ate(sequence: ScanSequence, poses: np.ndarray) -> float:
     return absolute_trajectory_error(poses[:, :2], sequence.reference_poses[:, :2])
 
 
@@ -85,9 +81,7 @@ def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
     return rows
 
 
-def _timed(
-    case: str, sequence: ScanSequence, function: Callable[[], NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], list[Row]]:
+def _timed(case: str, sequence: ScanSequence, function: Callable[[], np.ndarray]) -> tuple[np.ndarray, list[Row]]:
     """Returns the poses of the function, and its rows."""
     timing, poses = measure(function, repeats=1), function()
     times = (("compile", timing.compile_s), ("run", timing.median_s))
@@ -97,20 +91,20 @@ def _timed(
     ]
 
 
-def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, quick: bool) -> list[Row]:
+def _fit(sequence: ScanSequence, start: np.ndarray | None, case: str, quick: bool) -> list[Row]:
     """Measures neural losses alone: ATE at the marks and at the end; then the refinement of the result."""
     config = dm.with_steps(dm.preset("fast"), 100) if quick else dm.preset("fast")
-    data, length = mapping_data(ScanSet(sequence.points, sequence.mask), start)
+    data, length = dm.mapping_data(ScanSet(sequence.points, sequence.mask), start)
     unit = np.array([length, length, 1.0])
     marks = list(_MARKS_S)
     rows = [Row(case, "ate at start", _ate(sequence, np.zeros((len(sequence), 3)) if start is None else start), "px")]
 
-    def at_mark(progress: Progress) -> None:
+    def at_mark(progress: dm.Progress) -> None:
         while marks and progress.run_s >= marks[0]:
             ate = _ate(sequence, np.asarray(progress.report.poses, np.float64) * unit)
             rows.append(Row(case, f"ate after {marks.pop(0):.0f} s", ate, "px"))
 
-    done = fit(mapping_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
+    done = dm.fit(dm.mapping_problem(config, data), data, key=jax.random.key(0), on_report=at_mark)
     poses = np.asarray(done.poses, np.float64) * unit
     rows += [
         Row(case, "ate at the end", _ate(sequence, poses), "px"),
@@ -124,9 +118,9 @@ def _fit(sequence: ScanSequence, start: NDArray[np.float64] | None, case: str, q
 
 def _paper_step(sequence: ScanSequence) -> list[Row]:
     """Measures one step of the paper's architecture, losses and sampling: a batch of 128 scans, as published."""
-    data, _ = mapping_data(ScanSet(sequence.points, sequence.mask))
-    problem, run_s = mapping_problem(dm.preset("paper"), data), [0.0]
-    done = fit(
+    data, _ = dm.mapping_data(ScanSet(sequence.points, sequence.mask))
+    problem, run_s = dm.mapping_problem(dm.preset("paper"), data), [0.0]
+    done = dm.fit(
         problem, data, key=jax.random.key(0), stop=lambda: len(run_s) > 2,
         on_report=lambda progress: run_s.append(progress.run_s),
     )  # fmt: skip

@@ -13,12 +13,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 import dpmjax
 from benchmarks import DATA, Row, in_new_process, measure
@@ -29,7 +27,6 @@ from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, simulate_lidar_sequence
 
-Scan = NDArray[np.float32]
 KITTI = ("kitti_00", "kitti_07", "kitti_raw_0013")
 # Parts that run on the host, and the sum of parts that are compiled by then.
 NOT_COMPILED = ("preprocess", "pyramid", "preprocess + encode")
@@ -50,7 +47,7 @@ def make_scans(folder: Path, quick: bool) -> list[Row]:
     return [Row(f"{name} scan", "size", len(points), "points") for name, points in scans.items()]
 
 
-def read_scans(folder: Path) -> dict[str, Scan]:
+def read_scans(folder: Path) -> dict[str, np.ndarray]:
     """Returns the scans that `make_scans` wrote, by name."""
     return {file.stem: np.load(file) for file in sorted(folder.glob("*.npy"), reverse=True)}
 
@@ -191,33 +188,23 @@ def stage_rows(stage: str, folder: Path, quick: bool) -> list[Row]:
     return [*STAGES[stage](folder, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]
 
 
-class Figure(NamedTuple):
-    """Reference of a number, in its unit.
-
-    Attributes:
-        theirs: the authors' program, measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI
-            scan of 122,500 points); None where they have no such thing.
-        goal: ours; None where there is none.
-    """
-
-    theirs: float | None = None
-    goal: float | None = None
-
-
+# The authors' program was measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI scan of
+# 122,500 points).
+THEIRS, GOAL = "authors' program", "goal"
 # By case. Held against the median, or against the peak memory of the one process that does all of it.
-FIGURES: dict[str, Figure] = {
-    "paper, KITTI scan: preprocess": Figure(theirs=98.0),
-    "paper, KITTI scan: pyramid": Figure(theirs=990.0),
-    "paper, KITTI scan: network": Figure(theirs=250.0),
-    "paper, KITTI scan: preprocess + encode": Figure(theirs=1318.0, goal=60.0),
-    "paper, town scan: preprocess + encode": Figure(goal=60.0),
-    "small, KITTI scan: preprocess + encode": Figure(goal=30.0),
-    "small, town scan: preprocess + encode": Figure(goal=30.0),
-    "paper, 256 x 256: registration (correlate, match, align)": Figure(theirs=75.0, goal=40.0),
-    "paper, 256 x 2048: registration (correlate, match, align)": Figure(theirs=540.0, goal=300.0),
-    "paper, one pair: overlap": Figure(theirs=82.0, goal=40.0),
-    "small, K = 2, 16 scans: training step": Figure(goal=450.0),
-    "process of everything paper": Figure(theirs=1.0, goal=1.0),
+FIGURES: dict[str, dict[str, float]] = {
+    "paper, KITTI scan: preprocess": {THEIRS: 98.0},
+    "paper, KITTI scan: pyramid": {THEIRS: 990.0},
+    "paper, KITTI scan: network": {THEIRS: 250.0},
+    "paper, KITTI scan: preprocess + encode": {THEIRS: 1318.0, GOAL: 60.0},
+    "paper, town scan: preprocess + encode": {GOAL: 60.0},
+    "small, KITTI scan: preprocess + encode": {GOAL: 30.0},
+    "small, town scan: preprocess + encode": {GOAL: 30.0},
+    "paper, 256 x 256: registration (correlate, match, align)": {THEIRS: 75.0, GOAL: 40.0},
+    "paper, 256 x 2048: registration (correlate, match, align)": {THEIRS: 540.0, GOAL: 300.0},
+    "paper, one pair: overlap": {THEIRS: 82.0, GOAL: 40.0},
+    "small, K = 2, 16 scans: training step": {GOAL: 450.0},
+    "process of everything paper": {THEIRS: 1.0, GOAL: 1.0},
 }
 
 
@@ -247,7 +234,6 @@ def with_figures(rows: list[Row]) -> list[Row]:
     for row in rows:
         result.append(row)
         if row.metric in ("median", "peak memory"):
-            figures = zip(("authors' program", "goal"), FIGURES.get(row.case, Figure()), strict=True)
-            known = [(name, value) for name, value in figures if value is not None]
-            result += [row._replace(metric=f"{row.metric}, {name}", value=value) for name, value in known]
+            figures = FIGURES.get(row.case, {}).items()
+            result += [row._replace(metric=f"{row.metric}, {name}", value=value) for name, value in figures]
     return result

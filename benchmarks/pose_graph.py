@@ -39,8 +39,8 @@ def compare(path: Path, repeats: int, *, has_peer: bool) -> list[Row]:
     ours = measure(lambda: dpmjax.optimize_pose_graph(graph).chi2, repeats=repeats)
     solved = dpmjax.optimize_pose_graph(graph)
     rows = ours.rows(f"{case}: dpmjax")
-    rows += [Row(f"{case}: dpmjax", metric, getattr(solved, metric), "") for metric in ("chi2_initial", "chi2")]
-    rows.append(Row(f"{case}: dpmjax", "iterations", solved.iterations, ""))
+    metrics = ("chi2_initial", "chi2", "iterations")
+    rows += [Row(f"{case}: dpmjax", metric, getattr(solved, metric), "") for metric in metrics]
     if not has_peer:
         return rows
     theirs, chi2 = gtsam_timing(path, graph.tangent_size == 6, repeats)

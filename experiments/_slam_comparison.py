@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from dpmjax.saved_maps import Precision
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, Scene, TownConfig, simulate_scene
 from experiments import _slam_evaluation as evaluation
 from experiments._slam_evaluation import NETWORK, ODOMETRY, OURS, PRECISIONS, Drive, first_keyframes, map_path
-from experiments._slam_peers import PEERS, why_missing
+from experiments._slam_peers import PEERS
 
 TOWN = "town"
 # Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
@@ -50,7 +49,7 @@ SIZES = {
 LOCALIZATION = "localization, "
 
 
-def open_drives(paths: Sequence[str], options: cli.DriveOptions, towns_m: Sequence[float] = ()) -> list[LidarSequence]:
+def open_drives(paths: tuple[str, ...], options: cli.DriveOptions, towns_m: list[float] = ()) -> list[LidarSequence]:
     """Opens the drives that are compared.
 
     Args:
@@ -70,7 +69,7 @@ def open_drives(paths: Sequence[str], options: cli.DriveOptions, towns_m: Sequen
             simulated = (town_drive(number, length_m) for number, length_m in enumerate(towns_m))
             drives += [cli.keep_scans(drive).take(options.selection) for drive in simulated]
         else:
-            names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
+            names: list[str | None] = io.list_lidar_sequences(entry) or [None]
             drives += [cli.open_drive(Path(entry), options, name) for name in names]
     cli.check_names_differ(drives)
     return drives
@@ -85,11 +84,11 @@ def town_drive(number: int, length_m: float) -> LidarSequence:
 
 
 def compare(
-    config: cli.DriveOptions, experiment: str, sequences: Sequence[LidarSequence], num_localized: int
+    config: cli.DriveOptions, experiment: str, sequences: list[LidarSequence], num_localized: int
 ) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
     methods = slam.make_methods(load_model(config.weights), weights=config.weights)
-    missing = {name: reason for name in PEERS if (reason := why_missing(name)) is not None}
+    missing = {name: reason for name, (module, _) in PEERS.items() if (reason := cli.why_not_importable(module))}
     by_name = {sequence.name: sequence for sequence in sequences}
 
     def work(run: cli.TableRun, sequence: str, method: str) -> cli.Row:
@@ -167,7 +166,7 @@ def evaluate_localization(
     }
 
 
-def tables(rows: Sequence[cli.Row]) -> str:
+def tables(rows: list[cli.Row]) -> str:
     """Returns the tables as Markdown: trajectories and loops, sizes of maps, localisation."""
     tracks = [row for row in rows if "path_m" in row]
     places = [row for row in rows if "num_inside" in row]
@@ -199,7 +198,7 @@ def _track_cells(row: cli.Row) -> list[object]:
     return [*case, *errors, loops, recall, seconds]
 
 
-def _size_cells(rows: Sequence[cli.Row], sequence: str) -> list[object]:
+def _size_cells(rows: list[cli.Row], sequence: str) -> list[object]:
     of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence}
     merged = {name: row[name] for row in of_drive.values() for name in SIZES if row.get(name)}
     sizes = (merged[name][-1] / 1e6 if name in merged else None for name in SIZES)
@@ -217,7 +216,7 @@ def _place_cells(row: cli.Row) -> list[object]:
     return [row["sequence"], size, *counts, cli.cell_text(row["median_error_m"], 3), row["scan_s"]]
 
 
-def draw(folder: cli.RunFolder, *, sequences: Sequence[LidarSequence], rows: Sequence[cli.Row]) -> None:
+def draw(folder: cli.RunFolder, *, sequences: list[LidarSequence], rows: list[cli.Row]) -> None:
     """Draws trajectories.png, a panel a drive with all methods, and map_sizes.png, bytes against metres (figure 4)."""
     tracks, sizes = {}, {}
     for sequence in sequences:

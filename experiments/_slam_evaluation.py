@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -141,7 +140,7 @@ def _per_scan(run: cli.SlamRun, seconds: float) -> float | None:
     return seconds / run.num_done if run.num_done else None
 
 
-def tenths(scan_s: Sequence[float]) -> list[float]:
+def tenths(scan_s: list[float]) -> list[float]:
     """Returns the mean seconds of a scan in each tenth of a drive, which must not grow with the map."""
     return [float(part.mean()) for part in np.array_split(np.asarray(scan_s), 10) if len(part)]
 
@@ -190,7 +189,7 @@ def evaluate_peer(drive: Drive, name: str) -> cli.Row:
     }
 
 
-def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: Sequence[FoundLoop]) -> cli.Row:
+def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: list[FoundLoop]) -> cli.Row:
     """Writes the trajectory of a method, and returns its errors and those of its loops."""
     drive.save_trajectory(method, T_world_scan)
     known = T_world_scan if drive.reference is None else drive.reference
@@ -203,7 +202,7 @@ def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: S
     }
 
 
-def loop_numbers(drive: Drive, loops: Sequence[FoundLoop]) -> cli.Row:
+def loop_numbers(drive: Drive, loops: list[FoundLoop]) -> cli.Row:
     """Returns how many loops are wrong, and the recall of the right ones."""
     poses, scale = drive.reference, drive.scale
     newer, older = (

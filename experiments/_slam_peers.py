@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dpmjax.cli import UNKNOWN, why_not_importable
+from dpmjax.cli import UNKNOWN
 from dpmjax.geometry import rigid
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
@@ -176,11 +176,6 @@ PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
     "KISS-SLAM": ("kiss_slam.slam", KissSlam),
     "small_gicp": ("small_gicp", SmallGicp),
 }
-
-
-def why_missing(name: str) -> str | None:
-    """Returns why a peer cannot run; None where it can."""
-    return why_not_importable(PEERS[name][0])
 
 
 def peer_version(name: str) -> str:

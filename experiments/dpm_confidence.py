@@ -13,7 +13,6 @@ results/dpm_confidence/<time>/: table.md, metrics.json.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -86,7 +85,7 @@ def main(config: Config) -> list[cli.Row]:
     return cli.run_table(config, EXPERIMENT, cases, work, report)
 
 
-def rate(rows: Sequence[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.Row:
+def rate(rows: list[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.Row:
     """Returns the numbers of registrations that a calibration is sure of, and its expected calibration error."""
     confidence, is_right, distance_m = [], [], []
     for row in rows:
@@ -110,7 +109,7 @@ def rate(rows: Sequence[cli.Row], calibration: dpm.Calibration, rated: str) -> c
     }
 
 
-def table(numbers: Sequence[cli.Row]) -> str:
+def table(numbers: list[cli.Row]) -> str:
     """Returns the table as Markdown."""
     names = ("rated", "model", "kind", "num_pairs", "num_right", "num_sure", "num_sure_wrong")
     lines = [

@@ -11,7 +11,7 @@ pairs whose right hypothesis has the highest score, scene by scene, each by a fi
 
 from __future__ import annotations
 
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import asdict, astuple, dataclass
 from functools import partial
 from typing import Annotated, Any
 
@@ -123,7 +123,6 @@ def hypotheses(model: dpm.Model, measured: list[Any], found: Any, T_true: np.nda
 def fit(rows: list[cli.Row]) -> tuple[dpm.EvidenceWeights, list[cli.Row]]:
     """Returns the weights by all scenes, and a table of the choices by weights without the scene."""
     _, *present = astuple(dpm.EvidenceWeights())
-    names = tuple(field.name for field in fields(dpm.EvidenceWeights))
     scene = np.concatenate([np.full(len(pair["is_right"]), row["scene"]) for row in rows for pair in row["pairs"]])
     shares = np.concatenate([pair["shares"] for row in rows for pair in row["pairs"]])
     is_right = np.concatenate([pair["is_right"] for row in rows for pair in row["pairs"]])
@@ -144,7 +143,7 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.EvidenceWeights, list[cli.Row]]:
                 }
             )
     weights, bias = dpm.fit_weights(shares, is_right)
-    return dpm.EvidenceWeights(**dict(zip(names, (round(bias, 2), *np.round(weights, 2).tolist()), strict=True))), table
+    return dpm.EvidenceWeights(round(bias, 2), *np.round(weights, 2).tolist()), table
 
 
 def share_right(pairs: list[cli.Row], weights: np.ndarray) -> float:

@@ -13,7 +13,6 @@ results/dpm_keyframes/<time>/: table.md, metrics.json.
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -59,7 +58,7 @@ def main(config: Config) -> list[cli.Row]:
     return cli.run_table(config, EXPERIMENT, [{"sequence": name} for name in drives], work, report)
 
 
-def evaluate(model: dpm.Model, drive: LidarSequence, nums_keyframes: Sequence[int]) -> cli.Row:
+def evaluate(model: dpm.Model, drive: LidarSequence, nums_keyframes: tuple[int, ...]) -> cli.Row:
     """Returns the errors of all scans after the first for each number of keyframes."""
     poses = np.asarray(drive.T_world_lidar, np.float64)
     points = [drive.read_scan(number) for number in range(len(drive))]
@@ -78,9 +77,9 @@ def evaluate(model: dpm.Model, drive: LidarSequence, nums_keyframes: Sequence[in
             found.append(np.asarray(hypotheses.T_target_source[0], np.float64))
             true.append(np.linalg.inv(poses[near[0]]) @ poses[number])
         recall = registration_recall(np.stack(found), np.stack(true))
-        errors = np.asarray(recall.translation_errors_m)
+        errors = recall.translation_errors_m
         row[f"keyframes_{num}"] = {
-            "num_wrong": int((~np.asarray(recall.is_right)).sum()),
+            "num_wrong": int((~recall.is_right).sum()),
             "num_over_2_m": int((errors > 2).sum()),
             "median_error_m": float(np.median(errors)),
             "error_95_m": float(np.percentile(errors, 95)),
@@ -96,7 +95,7 @@ def keyframe_spacing_m(points: np.ndarray, model: dpm.Model) -> float:
     return float(np.clip(config.keyframe_share * extent_m, config.min_keyframe_m, config.max_keyframe_m))
 
 
-def choose_keyframes(positions: np.ndarray, spacings_m: Sequence[float]) -> np.ndarray:
+def choose_keyframes(positions: np.ndarray, spacings_m: list[float]) -> np.ndarray:
     """Returns True for the scans that lie at least a spacing from the keyframes before them."""
     is_keyframe = np.zeros(len(positions), bool)
     for number, (position, spacing_m) in enumerate(zip(positions, spacings_m, strict=True)):
@@ -119,7 +118,7 @@ def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacit
     return compact
 
 
-def table(rows: Sequence[cli.Row], nums_keyframes: Sequence[int]) -> str:
+def table(rows: list[cli.Row], nums_keyframes: tuple[int, ...]) -> str:
     """Returns the table as Markdown: scans that are wrong, median and 95th percentile of the error, metres."""
     names = [f"{num} merged" if num > 1 else "nearest" for num in nums_keyframes]
     lines = []

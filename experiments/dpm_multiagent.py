@@ -16,7 +16,6 @@ of each drive, and table.md a row a drive. A file of poses (TUM, KITTI) stands f
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -127,9 +126,7 @@ def cut_sequence(sequence: LidarSequence, num_agents: int, overlap: float) -> li
     return parts
 
 
-def write_agents(
-    folder: cli.RunFolder, result: AgentsResult, sequences: Sequence[LidarSequence]
-) -> list[dict[str, int]]:
+def write_agents(folder: cli.RunFolder, result: AgentsResult, sequences: list[LidarSequence]) -> list[dict[str, int]]:
     """Writes trajectories, graph, loops and maps; returns the bytes that each agent sends at each precision."""
     sizes = []
     for number, (T_world_scan, agent, sequence) in enumerate(
@@ -161,7 +158,7 @@ def loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
     return [{"kind": kind, **row} for kind, rows in kinds.items() for row in rows]
 
 
-def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> dict[str, Any]:
+def agents_numbers(result: AgentsResult, sequences: list[LidarSequence]) -> dict[str, Any]:
     """Returns what `metrics.json` says: errors of each component in its one frame, of each agent, and bytes."""
     agents = [
         {
@@ -199,7 +196,7 @@ def agents_numbers(result: AgentsResult, sequences: Sequence[LidarSequence]) -> 
     }
 
 
-def num_wrong(result: AgentsResult, sequences: Sequence[LidarSequence]) -> int | None:
+def num_wrong(result: AgentsResult, sequences: list[LidarSequence]) -> int | None:
     """Returns how many loops between agents are wrong beyond 2 m or 5 degrees; None without a reference for each."""
     known = [sequence.T_world_lidar for sequence in sequences if sequence.T_world_lidar is not None]
     if len(known) < len(sequences):
@@ -210,7 +207,7 @@ def num_wrong(result: AgentsResult, sequences: Sequence[LidarSequence]) -> int |
     return int((~metrics.registration_recall(found, rigid.inverse(T[target]) @ T[source]).is_right).sum())
 
 
-def keyframe_poses(result: AgentsResult, T_world_scan: Sequence[np.ndarray]) -> np.ndarray:
+def keyframe_poses(result: AgentsResult, T_world_scan: list[np.ndarray]) -> np.ndarray:
     """Returns the poses of all keyframes, agent by agent, out of those of all scans."""
     return np.concatenate([T[agent.keyframes] for T, agent in zip(T_world_scan, result.agents, strict=True)])
 
@@ -223,14 +220,14 @@ def members_of(result: AgentsResult) -> list[list[int]]:
     ]
 
 
-def joint_ate_m(result: AgentsResult, sequences: Sequence[LidarSequence], members: Sequence[int]) -> float | None:
+def joint_ate_m(result: AgentsResult, sequences: list[LidarSequence], members: list[int]) -> float | None:
     """Returns the ATE of agents in their one frame; None without a reference for each, or from different drives."""
     pairs = _positions(result, sequences, members)
     return None if pairs is None or len(pairs[0]) < 2 else metrics.absolute_trajectory_error(*pairs)
 
 
 def _positions(
-    result: AgentsResult, sequences: Sequence[LidarSequence], members: Sequence[int]
+    result: AgentsResult, sequences: list[LidarSequence], members: list[int]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Returns (n, 3) positions of agents and of their references, metres; None without a reference for each."""
     known = [T[:, :3, 3] for number in members if (T := sequences[number].T_world_lidar) is not None]
@@ -239,7 +236,7 @@ def _positions(
     return np.concatenate([result.T_world_scan[number][:, :3, 3] for number in members]), np.concatenate(known)
 
 
-def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> list[viz.AgentPanel]:
+def agent_panels(result: AgentsResult, sequences: list[LidarSequence]) -> list[viz.AgentPanel]:
     """Gathers the data of the picture: clouds, tracks and loops of each component."""
     panels, T_shown_keyframe = [], keyframe_poses(result, result.T_world_scan)
     for members in members_of(result):
@@ -262,7 +259,7 @@ def agent_panels(result: AgentsResult, sequences: Sequence[LidarSequence]) -> li
     return panels
 
 
-def table(rows: Sequence[cli.Row]) -> str:
+def table(rows: list[cli.Row]) -> str:
     """Returns a table as Markdown, one line for each run of agents."""
     columns = ("drive", "scans", "ATE of each agent (alone), m", "loops between (wrong)", "in one frame: ATE, m")
     return cli.markdown((*columns, "sent by each, MB", "points of all scans, MB"), map(_drive_cells, rows))

@@ -10,7 +10,7 @@ results/dpm_slam_ablations/<time>/: table.md, metrics.json (ATE, loops, their re
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -78,7 +78,7 @@ def ablated(model: Model, setting: str) -> slam.SlamMethods:
     return methods if setting == WHOLE else with_fewer_elements(model, int(setting.split()[0]))
 
 
-def table(rows: Sequence[cli.Row]) -> str:
+def table(rows: list[cli.Row]) -> str:
     """Returns the table as Markdown."""
 
     def cells(row: cli.Row) -> list[object]:
@@ -98,8 +98,28 @@ def with_fewer_elements(model: Model, num_elements: int) -> slam.SlamMethods:
     """
     factor = max(math.sqrt(model.config.pyramid.stages[0].num_points / num_elements), 1.0)
     whole = slam.make_methods(model, _with_wider_radii(slam.SlamConfig(), factor))
-    matcher = _FewerOfKeyframes(whole.matcher, num_elements)
-    return whole._replace(matcher=matcher, geometry=_FewerOfScans(whole.geometry, num_elements))
+
+    def encode(scan: slam.ThinnedScan) -> Any:
+        """Returns a keyframe with its first elements, in the order of farthest points, and their features."""
+        compact = whole.matcher.encode(scan)
+        unit_m, *arrays = compact.elements
+        elements = type(compact.elements)(unit_m, *(array[:num_elements] for array in arrays))
+        described = {
+            name: getattr(compact, name)[:num_elements] for name in ("features", "feature_steps", "directions")
+        }
+        return compact._replace(elements=elements, **described)
+
+    def thin(points: np.ndarray) -> slam.ThinnedScan | None:
+        """Returns a scan with its first elements only."""
+        scan = whole.geometry.thin(points)
+        if scan is None:
+            return None
+        points = scan.measured.surface.points
+        few = surface_at(points, np.arange(min(num_elements, len(points))))
+        return scan._replace(measured=scan.measured._replace(surface=few))
+
+    matcher, geometry = _Replaced(whole.matcher, encode=encode), _Replaced(whole.geometry, thin=thin)
+    return whole._replace(matcher=matcher, geometry=geometry)
 
 
 def _with_wider_radii(config: slam.SlamConfig, factor: float) -> slam.SlamConfig:
@@ -115,67 +135,33 @@ def _with_wider_radii(config: slam.SlamConfig, factor: float) -> slam.SlamConfig
 
 def without_elements(methods: slam.SlamMethods) -> slam.SlamMethods:
     """Returns methods without surface elements: each pose and each loop stays as the decoder proposes it."""
-    geometry = _Unmoved(methods.geometry)
-    return with_network(methods._replace(matcher=_DecoderAlone(methods.matcher), geometry=geometry))
+
+    def align(local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
+        """Accepts the given pose."""
+        return slam.Alignment(T_map_scan, 1.0, 0.0, 1.0, slam.DESCRIPTOR_INFORMATION)
+
+    def search(local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
+        """Accepts the first of the given poses."""
+        return align(local_map, scan, T_map_scan[0])
+
+    def register(pairs: list[tuple[slam.Submap, slam.Submap]]) -> list[slam.Match]:
+        """Registers the central scans of submaps by their descriptors, and verifies nothing."""
+        proposals = [methods.matcher.propose(source.scans[0], target.scans[0], 1) for source, target in pairs]
+        return [slam.Match(proposal.T_target_source[0], proposal.probability, np.nan) for proposal in proposals]
+
+    geometry = _Replaced(methods.geometry, align=align, search=search)
+    return with_network(methods._replace(matcher=_Replaced(methods.matcher, register=register), geometry=geometry))
 
 
-class _Wrapped:
+class _Replaced:
     """A matcher or a geometry of which some functions are replaced."""
 
-    def __init__(self, wrapped: Any) -> None:
+    def __init__(self, wrapped: Any, **functions: Callable[..., Any]) -> None:
         self._wrapped = wrapped
+        vars(self).update(functions)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._wrapped, name)
-
-
-class _FewerOfKeyframes(_Wrapped):
-    """A matcher whose keyframes keep the first elements, in the order of farthest points, and their features."""
-
-    def __init__(self, matcher: slam.Matcher, num_elements: int) -> None:
-        super().__init__(matcher)
-        self._num = num_elements
-
-    def encode(self, scan: slam.ThinnedScan) -> Any:
-        whole = self._wrapped.encode(scan)
-        unit_m, *arrays = whole.elements
-        elements = type(whole.elements)(unit_m, *(array[: self._num] for array in arrays))
-        described = {name: getattr(whole, name)[: self._num] for name in ("features", "feature_steps", "directions")}
-        return whole._replace(elements=elements, **described)
-
-
-class _FewerOfScans(_Wrapped):
-    """A geometry whose scans have their first elements only."""
-
-    def __init__(self, geometry: slam.Geometry, num_elements: int) -> None:
-        super().__init__(geometry)
-        self._num = num_elements
-
-    def thin(self, points: np.ndarray) -> slam.ThinnedScan | None:
-        whole = self._wrapped.thin(points)
-        if whole is None:
-            return None
-        points = whole.measured.surface.points
-        few = surface_at(points, np.arange(min(self._num, len(points))))
-        return whole._replace(measured=whole.measured._replace(surface=few))
-
-
-class _Unmoved(_Wrapped):
-    """A geometry that returns the first of the given poses and accepts it."""
-
-    def align(self, local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
-        return slam.Alignment(T_map_scan, 1.0, 0.0, 1.0, slam.DESCRIPTOR_INFORMATION)
-
-    def search(self, local_map: slam.LocalMap, scan: slam.ThinnedScan, T_map_scan: np.ndarray) -> slam.Alignment:
-        return self.align(local_map, scan, T_map_scan[0])
-
-
-class _DecoderAlone(_Wrapped):
-    """A matcher that registers the central scans of submaps by their descriptors, and verifies nothing."""
-
-    def register(self, pairs: Sequence[tuple[slam.Submap, slam.Submap]]) -> list[slam.Match]:
-        proposals = [self._wrapped.propose(source.scans[0], target.scans[0], 1) for source, target in pairs]
-        return [slam.Match(proposal.T_target_source[0], proposal.probability, np.nan) for proposal in proposals]
 
 
 if __name__ == "__main__":

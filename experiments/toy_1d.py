@@ -58,8 +58,8 @@ def main(config: Config) -> dict[str, Any]:
         ends, figure = run_paper(paper, config)
         variants = []
         for initialization, rate in itertools.product(get_args(dm.Initialization), LEARNING_RATES):
-            runs = descend_both(replace(paper, initialization=initialization, learning_rate=rate), config)
-            shares = {form: share_at_minimum(run.poses) for form, run in zip(FORMS, runs, strict=True)}
+            runs = descend(replace(paper, initialization=initialization, learning_rate=rate), config)
+            shares = {form: share_at_minimum(run.poses) for form, run in runs.items()}
             variants.append({"initialization": initialization, "learning_rate": rate, **shares})
         x_best, loss_best = dm.global_minimum()
         metrics = {
@@ -80,16 +80,13 @@ def main(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def descend(toy: dm.ToyConfig, config: Config) -> dm.Fit:
-    """Fits all seeds as starts of one fit."""
+def descend(toy: dm.ToyConfig, config: Config) -> dict[str, dm.Fit]:
+    """Fits all seeds as starts of one fit in each form, from the same starts."""
     import jax
 
-    return dm.fit(dm.toy_problem(toy), None, key=jax.random.key(config.seed), num_starts=config.seeds)
-
-
-def descend_both(toy: dm.ToyConfig, config: Config) -> tuple[dm.Fit, dm.Fit]:
-    """Fits all seeds in the network form, and in the direct form from the same starts."""
-    return descend(replace(toy, form="network"), config), descend(replace(toy, form="direct"), config)
+    problems = {form: dm.toy_problem(replace(toy, form=form)) for form in FORMS}
+    starts = {"key": jax.random.key(config.seed), "num_starts": config.seeds}
+    return {form: dm.fit(problem, None, **starts) for form, problem in problems.items()}
 
 
 def path(run: dm.Fit) -> np.ndarray:
@@ -103,8 +100,8 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, np.ndarray],
     import jax
     import jax.numpy as jnp
 
-    runs = descend_both(toy, config)
-    network, direct = map(path, runs)
+    runs = descend(toy, config)
+    network, direct = map(path, runs.values())
     ends = {f"{name} form, gradient descent": x[:, -1] for name, x in zip(FORMS, (network, direct), strict=True)}
     for solver in SOLVERS:
         solve = jax.jit(jax.vmap(partial(minimize, solver=solver, max_iterations=config.steps)))
@@ -112,7 +109,9 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, np.ndarray],
     # Out of the same vmap as the shares: the descent is chaotic, and one seed compiled alone rounds its way elsewhere.
     chosen = choose_seed(network, direct)
     z = jnp.linspace(-VIEW, VIEW, 1201)
-    params = runs[0].state.params if config.seeds == 1 else jax.tree.map(lambda x: x[chosen], runs[0].state.params)
+    params = runs["network"].state.params
+    if config.seeds > 1:
+        params = jax.tree.map(lambda x: x[chosen], params)
     converted = dm.toy_loss(jax.vmap(lambda one: dm.network_value(toy, params.replace(z=one)))(z))
     x_direct, visited = float(direct[chosen, -1]), network[chosen]
     return ends, {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli import RowStopped, TableRun
+from dpmjax.cli import RowStopped, TableRun, why_not_importable
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run_folder import RunFolder
@@ -210,7 +210,7 @@ def test_scans_are_chosen_for_slam_only(tmp_path, capsys) -> None:
 
 @pytest.mark.parametrize("name", list(_slam_peers.PEERS))
 def test_a_peer_follows_a_straight_drive(name: str) -> None:
-    reason = _slam_peers.why_missing(name)
+    reason = why_not_importable(_slam_peers.PEERS[name][0])
     if reason is not None:
         pytest.skip(reason)
     drive = toy.drive(num_scans=12, step_m=1.0)
