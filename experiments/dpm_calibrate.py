@@ -20,10 +20,10 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from dpmjax import DescriptorCloud, cli, encode, load_model, metrics, register, save_model, simulation, slam, viz
 from dpmjax import deeppointmap as dpm
@@ -53,6 +53,8 @@ AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0))
 # Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
 TOWN_LENGTH_M = 400.0
+# The kinds of town, of which there are nine, and of ambiguous place take turns, so that each counts the same.
+NUM_TOWNS, NUM_AMBIGUOUS, NUM_OVERLAP_TOWNS = 9, 30, 24
 # Pairs of each band of a place, and of each town of the overlap.
 NUM_PAIRS, NUM_OVERLAP_PAIRS = 30, 96
 
@@ -63,18 +65,10 @@ class Config(cli.RunOptions):
 
     model: Positional[str]
     """The model: a .safetensors file, or the name of a shipped one."""
-    towns: Annotated[int, arg(metavar="N")] = 9
-    """Number of towns. The kinds of place, of which there are nine, take turns, so that each counts the same."""
-    ambiguous: Annotated[int, arg(metavar="N")] = 30
-    """Number of ambiguous places, each with as many pairs 1 to 10 m and 10 to 20 m apart."""
-    overlap_towns: Annotated[int, arg(metavar="N")] = 24
-    """Number of towns for overlap; 0 keeps the overlap probability of the model."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, towns=2, ambiguous=2, overlap_towns=0, seed=0)
-        if self.overlap_towns == 1:
-            raise ValueError("--overlap-towns: expected 0, or 2 or more: each is left out once, got 1")
+        cli.check_least(self, seed=0)
 
 
 def main(config: Config) -> list[cli.Row]:
@@ -90,16 +84,16 @@ def main(config: Config) -> list[cli.Row]:
         drive, bands_m = open_place(**case)
         return measure_pairs(model, run.until_stopped(draw_pairs(drive, bands_m, NUM_PAIRS, config.seed)))
 
-    cases = list_cases(config)
+    cases = list_cases()
     return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))
 
 
-def list_cases(config: Config) -> list[cli.Row]:
+def list_cases() -> list[cli.Row]:
     """Returns the places of the confidence, then the towns of the overlap."""
     kinds = itertools.cycle(kind for kind, _ in simulation.SceneMixture().kinds)
-    towns = [{"town": FIRST_TOWN + number, "kind": next(kinds)} for number in range(config.towns)]
-    places = [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(config.ambiguous)]
-    return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(config.overlap_towns)]
+    towns = [{"town": FIRST_TOWN + number, "kind": next(kinds)} for number in range(NUM_TOWNS)]
+    places = [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(NUM_AMBIGUOUS)]
+    return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(NUM_OVERLAP_TOWNS)]
 
 
 def open_place(*, kind: str, town: int | None = None, place: int = 0, beams: int = 0) -> tuple[LidarSequence, Bands]:
@@ -113,23 +107,21 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
     """Fits the regressions; the model and the reliability of places left out are written with the pictures."""
     if len(rows) < num_cases:
         return cli.Summary({"model": config.model}, f"{len(rows)} of {num_cases} places", rows=())
-    overlap_rows = [row for row in rows if "overlap_town" in row]
     calibration, numbers, held_out = fit([row for row in rows if "overlap_town" not in row])
-    calibrated = replace(model.config, calibration=calibration)
-    note = f"Confidence calibrated on {config.towns} towns and {config.ambiguous} ambiguous places, "
+    overlap, overlap_numbers, overlap_held_out = fit_overlap([row for row in rows if "overlap_town" in row])
+    numbers |= overlap_numbers
+    calibrated = replace(model.config, calibration=calibration, overlap=overlap)
+    note = f"Confidence calibrated on {NUM_TOWNS} towns and {NUM_AMBIGUOUS} ambiguous places, "
     note += f"{numbers['num_pairs']} pairs"
+    note += f"; overlap fitted on {NUM_OVERLAP_TOWNS} towns, {numbers['num_overlap_pairs']} pairs"
     title = "places left out of the fit"
     figures = {
         name: viz.reliability_figure(*held_out[kind], title=title)
         for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png"))
     }
-    if overlap_rows:
-        fitted, overlap_numbers, found = fit_overlap(overlap_rows)
-        numbers |= overlap_numbers
-        calibrated = replace(calibrated, overlap=fitted)
-        note += f"; overlap fitted on {config.overlap_towns} towns, {numbers['num_overlap_pairs']} pairs"
-        figure = viz.reliability_figure(*found, title=f"overlap, {title}", labels=OVERLAP_LABELS)
-        figures["reliability_overlap.png"] = figure
+    figures["reliability_overlap.png"] = viz.reliability_figure(
+        *overlap_held_out, title=f"overlap, {title}", labels=OVERLAP_LABELS
+    )
 
     def write(folder: cli.RunFolder) -> None:
         card = read_card(Path(config.model)) if config.model.endswith(".safetensors") else config.model

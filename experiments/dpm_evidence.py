@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, astuple, dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from tyro.conf import arg
 
 from dpmjax import cli, load_model, registration_recall, scans, simulation
 from dpmjax import deeppointmap as dpm
@@ -38,6 +37,8 @@ SCENES = tuple(
 INDOORS = ("office", "hall", "flat")
 BANDS = {"near": (2.0, 10.0), "far": (10.0, 20.0)}
 BANDS_INDOORS = {"near": (1.0, 5.0), "far": (5.0, 12.0)}
+# Pairs of each distance of each scene.
+NUM_PAIRS = 20
 NUM_POINTS, MAX_RANGE_M = 1400, 30.0
 TILT_DEG = 1.0
 LENGTH_M = 200.0
@@ -47,23 +48,16 @@ LENGTH_M = 200.0
 class Config(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
-    pairs: Annotated[int, arg(metavar="N")] = 20
-    """Pairs of each distance of each scene."""
-    scenes: Annotated[int, arg(metavar="N")] = len(SCENES)
-    """Number of scenes."""
-
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, pairs=1, scenes=2, seed=0)
-        if self.scenes > len(SCENES):
-            raise ValueError(f"--scenes: expected at most {len(SCENES)}, got {self.scenes}")
+        cli.check_least(self, seed=0)
 
 
 def main(config: Config) -> list[cli.Row]:
     """Registers the pairs, fits, and writes weights and table."""
     cases = [
         {"scene": number, "kind": kind, "sensor": sensor, "points": points}
-        for number, (kind, sensor, points) in enumerate(SCENES[: config.scenes])
+        for number, (kind, sensor, points) in enumerate(SCENES)
     ]
 
     def report(rows: list[cli.Row]) -> cli.Summary:
@@ -88,9 +82,7 @@ def measure_scene(config: Config, model: dpm.Model, run: cli.TableRun, **case: A
     drawn = [
         (band, rows)
         for number, (band, limits_m) in enumerate(bands.items())
-        for rows in dpm.draw_rows_apart(
-            distances, *limits_m, config.pairs, np.random.default_rng([config.seed, number])
-        )
+        for rows in dpm.draw_rows_apart(distances, *limits_m, NUM_PAIRS, np.random.default_rng([config.seed, number]))
     ]
     pairs = []
     for band, rows in run.until_stopped(drawn):

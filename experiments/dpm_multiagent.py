@@ -29,6 +29,8 @@ from dpmjax.io import LidarSequence
 from dpmjax.slam import AgentsResult
 
 EXPERIMENT = "dpm_multiagent"
+# Parts of a drive that is cut, and the share of its length by which a part is longer at each end.
+NUM_AGENTS, OVERLAP = 3, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,22 +41,11 @@ class Config(cli.DriveOptions):
     """Drives: one is cut into parts, of several each is an agent. Without any: a simulated town."""
     cut: FlagCreatePairsOff[bool] = False
     """Cut each of several drives into parts, one run a drive."""
-    sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
-    """Which drive, where DATA holds several."""
-    agents: Annotated[int, arg(metavar="N")] = 3
-    """Number of parts that one drive is cut into."""
-    overlap: Annotated[float, arg(metavar="SHARE")] = 0.05
-    """By this share of its length a part is longer at each end."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
         super().__post_init__()
-        cli.check_least(self, agents=1, overlap=0)
-        self.check_data(self.data, self.sequence)
-        if self.overlap > 1:
-            raise ValueError(f"--overlap: expected a share from 0 to 1, got {self.overlap:g}")
-        if self.sequence is not None and len(self.data) != 1:
-            raise ValueError("--sequence chooses a drive of DATA: give one folder")
+        self.check_data(self.data, None)
 
 
 def main(config: Config) -> Any:
@@ -92,9 +83,8 @@ def map_agents(run: cli.TableRun, config: Config, methods: slam.SlamMethods, seq
     mapped = [sequence.take(slice(0, len(agent.reports))) for sequence, agent in zip(sequences, agents, strict=False)]
     with cli.progress_bar("loops between agents", " keyframes") as on_keyframe:
         result = slam.join_agents(methods, agents, on_keyframe=on_keyframe)
-    numbers = {"weights": config.weights, "overlap": config.overlap, **agents_numbers(result, mapped)}
-    for agent, size in zip(numbers["agents"], write_agents(folder, result, mapped), strict=True):
-        agent |= size
+    sizes = write_agents(folder, result, mapped)
+    numbers = {"weights": config.weights, "overlap": OVERLAP, **agents_numbers(result, mapped, sizes)}
     cli.write_metrics(folder, numbers, seed=config.seed)  # numbers first: a picture that fails must not cost them
     viz.save_figure(viz.agents_figure(f"{len(mapped)} agents", agent_panels(result, mapped)), folder / "agents.png")
     return numbers
@@ -102,11 +92,11 @@ def map_agents(run: cli.TableRun, config: Config, methods: slam.SlamMethods, seq
 
 def open_runs(config: Config) -> list[list[LidarSequence]]:
     """Opens the scans of the agents of each run; bad input that can be known before a run is a `ValueError`."""
-    drives = [cli.open_drive(data, config, config.sequence) for data in config.data or (None,)]
+    drives = [cli.open_drive(data, config) for data in config.data or (None,)]
     if len(drives) > 1 and not config.cut:
         return [drives]
     cli.check_names_differ(drives)
-    return [cut_sequence(drive, config.agents, config.overlap) for drive in drives]
+    return [cut_sequence(drive, NUM_AGENTS, OVERLAP) for drive in drives]
 
 
 def cut_sequence(sequence: LidarSequence, num_agents: int, overlap: float) -> list[LidarSequence]:
@@ -117,7 +107,7 @@ def cut_sequence(sequence: LidarSequence, num_agents: int, overlap: float) -> li
     """
     num = len(sequence)
     if num < num_agents:
-        raise ValueError(f"{sequence.name}: {num} scans are too few for --agents {num_agents}")
+        raise ValueError(f"{sequence.name}: {num} scans are too few for {num_agents} agents")
     length, parts = num / num_agents, []
     for agent in range(num_agents):
         start = max(round(agent * length - overlap * length), 0)
@@ -158,7 +148,7 @@ def loop_rows(result: AgentsResult) -> list[dict[str, Any]]:
     return [{"kind": kind, **row} for kind, rows in kinds.items() for row in rows]
 
 
-def agents_numbers(result: AgentsResult, sequences: list[LidarSequence]) -> dict[str, Any]:
+def agents_numbers(result: AgentsResult, sequences: list[LidarSequence], sizes: list[dict[str, int]]) -> cli.Row:
     """Returns what `metrics.json` says: errors of each component in its one frame, of each agent, and bytes."""
     agents = [
         {
@@ -171,9 +161,10 @@ def agents_numbers(result: AgentsResult, sequences: list[LidarSequence]) -> dict
             **cli.trajectory_errors(T_world_scan, sequence.T_world_lidar),
             **cli.trajectory_errors(agent.T_world_scan, sequence.T_world_lidar, "_alone"),
             **traffic._asdict(),
+            **size,
         }
-        for number, (T_world_scan, agent, traffic, sequence) in enumerate(
-            zip(result.T_world_scan, result.agents, result.traffic, sequences, strict=True), start=1
+        for number, (T_world_scan, agent, traffic, sequence, size) in enumerate(
+            zip(result.T_world_scan, result.agents, result.traffic, sequences, sizes, strict=True), start=1
         )
     ]
     components = [
@@ -247,7 +238,7 @@ def agent_panels(result: AgentsResult, sequences: list[LidarSequence]) -> list[v
             scans, sequence, T = result.agents[number].keyframes, sequences[number], result.T_world_scan[number]
             cloud = cli.gather_map(T[scans], lambda row, read=sequence.read_points, scans=scans: read(int(scans[row])))
             track = cli.map_track(f"agent {number + 1}, {len(T)} scans", number, T, cloud)
-            if T_shown_reference is not None and sequence.T_world_lidar is not None:
+            if T_shown_reference is not None:
                 R, t = T_shown_reference[:3, :3], T_shown_reference[:3, 3]
                 track = track._replace(reference=sequence.T_world_lidar[:, :3, 3] @ R.T + t)
             tracks.append(track)

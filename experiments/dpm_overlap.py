@@ -32,6 +32,10 @@ from experiments import dpm_calibrate as calibrate
 
 EXPERIMENT = "dpm_overlap"
 FIRST_OTHER_TOWN = 3_600_000
+# Towns that are trained and fitted on, and towns that are compared on.
+NUM_TOWNS, NUM_OTHER_TOWNS = 24, 9
+# Pairs of each kind of a recorded drive.
+NUM_PAIRS = 120
 # Every such town stops the training of the head and scales its logit.
 HELD_OUT_STRIDE = 5
 NUM_EPOCHS, BATCH, LEARNING_RATE, WEIGHT_DECAY = 30, 32, 1e-3, 1e-2
@@ -47,16 +51,10 @@ class Config(cli.RunOptions):
     """The model: a .safetensors file, or the name of a shipped one."""
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")] = ()
     """Folders of scans with poses."""
-    towns: Annotated[int, arg(metavar="N")] = 24
-    """Number of towns that are trained and fitted on."""
-    other_towns: Annotated[int, arg(metavar="N")] = 9
-    """Number of towns that are compared on."""
-    pairs: Annotated[int, arg(metavar="N")] = 120
-    """Pairs of each kind of a recorded drive."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, towns=2, other_towns=2, pairs=1, seed=0)
+        cli.check_least(self, seed=0)
 
 
 class Examples(NamedTuple):
@@ -79,11 +77,11 @@ def main(config: Config) -> list[cli.Row]:
     drives = cli.open_evaluation_drives(config.paths, [])
 
     def work(run: cli.TableRun) -> cli.Row:
-        fitted = measure_towns(model, calibrate.FIRST_OVERLAP_TOWN, config.towns, config.seed, run)
-        other = measure_towns(model, FIRST_OTHER_TOWN, config.other_towns, config.seed, run)
+        fitted = measure_towns(model, calibrate.FIRST_OVERLAP_TOWN, NUM_TOWNS, config.seed, run)
+        other = measure_towns(model, FIRST_OTHER_TOWN, NUM_OTHER_TOWNS, config.seed, run)
         places = {"towns": joined([town.at(~town.is_hard) for town in other]), "towns, hard pairs too": joined(other)}
         for drive, following in run.until_stopped(zip(drives, drives[1:] + drives[:1], strict=True)):
-            places[drive.name] = measure_drive(model, drive, following, config)
+            places[drive.name] = measure_drive(model, drive, following, config.seed)
         return {"compared": compare(model, fitted, places, config.seed)}
 
     def report(rows: list[cli.Row]) -> cli.Summary:
@@ -103,11 +101,11 @@ def measure_towns(model: dpm.Model, first: int, num_towns: int, seed: int, run: 
     return [measure(model, of_town) for of_town in run.until_stopped(pairs)]
 
 
-def measure_drive(model: dpm.Model, drive: io.LidarSequence, following: io.LidarSequence, config: Config) -> Examples:
+def measure_drive(model: dpm.Model, drive: io.LidarSequence, following: io.LidarSequence, seed: int) -> Examples:
     """Returns pairs of a recorded drive."""
     near, far, _ = dpm.overlap_candidates(drive)
-    rng = np.random.default_rng([calibrate.TOWN_STREAM, config.seed])
-    near, far = (dpm.draw_rows(rows, config.pairs, rng) for rows in (near, far))
+    rng = np.random.default_rng([calibrate.TOWN_STREAM, seed])
+    near, far = (dpm.draw_rows(rows, NUM_PAIRS, rng) for rows in (near, far))
     num_far = len(far) or len(near)
     pairs = np.concatenate([near, far if len(far) else rng.integers(len(drive), size=(num_far, 1)).repeat(2, axis=1)])
     rows, places = np.unique(pairs, return_inverse=True)

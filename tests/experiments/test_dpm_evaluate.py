@@ -113,8 +113,9 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     monkeypatch.setattr(dpm_calibrate, "register", lambda model, *clouds, refine: Found())
     monkeypatch.setattr(dpm_calibrate, "NUM_PAIRS", 20)
     monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
-    sizes = ["--towns", 3, "--ambiguous", 2, "--overlap-towns", 2]
-    assert run(dpm_calibrate, [weights, *sizes, "-o", tmp_path / "out"]) == EXIT_OK
+    for name, number in (("NUM_TOWNS", 3), ("NUM_AMBIGUOUS", 2), ("NUM_OVERLAP_TOWNS", 2)):
+        monkeypatch.setattr(dpm_calibrate, name, number)
+    assert run(dpm_calibrate, [weights, "-o", tmp_path / "out"]) == EXIT_OK
     assert len(set(kinds[:3])) == 3  # of towns for confidence; those for overlap are of any kind
     assert kinds[3:5] == ["corridor", "tunnel"]
     assert set(kinds[5:]) == {None}

@@ -55,9 +55,10 @@ def write_drive(folder: Path, numbers) -> Path:
     return folder
 
 
-def test_a_drive_is_cut_and_joined_again(tmp_path) -> None:
+def test_a_drive_is_cut_and_joined_again(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(dpm_multiagent, "OVERLAP", 0.5)
     drive, out = write_drive(tmp_path / "drive", range(len(TRUTH))), tmp_path / "out"
-    assert run(drive, "-o", out, "--overlap", 0.5) == EXIT_OK
+    assert run(drive, "-o", out) == EXIT_OK
     metrics = load_json(out / "metrics.json")
     assert [component["agents"] for component in metrics["components"]] == [[1, 2, 3]]
     assert metrics["ate_m"] < 1.0
@@ -80,7 +81,9 @@ def test_a_drive_is_cut_and_joined_again(tmp_path) -> None:
 def test_drives_are_cut_one_by_one_and_a_resumed_run_computes_nothing_again(tmp_path, monkeypatch) -> None:
     whole, half = write_drive(tmp_path / "whole", range(len(TRUTH))), write_drive(tmp_path / "half", range(40))
     out = tmp_path / "out"
-    assert run("--cut", whole, half, "-o", out, "--overlap", 0.5, "--agents", 2) == EXIT_OK
+    monkeypatch.setattr(dpm_multiagent, "OVERLAP", 0.5)
+    monkeypatch.setattr(dpm_multiagent, "NUM_AGENTS", 2)
+    assert run("--cut", whole, half, "-o", out) == EXIT_OK
     rows = load_json(out / "metrics.json")["rows"]
     assert [row["sequence"] for row in rows] == ["whole", "half"]
     for row in rows:
@@ -143,11 +146,8 @@ def test_parts_overlap_and_hold_all_scans() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--agents", 0], "--agents"),
-        (["--overlap", 2], "--overlap"),
-        (["--overlap", "nan"], "--overlap"),
         (["/no/such/folder"], "no such file or folder"),
-        (["a", "b", "--sequence", "00"], "--sequence"),
+        (["--kitti-angle-correction"], "--kitti-angle-correction"),
     ],
 )
 def test_wrong_usage_is_one_line(options, message, capsys) -> None:

@@ -45,9 +45,9 @@ def test_hard_pairs_are_far_apart(model) -> None:
 
 
 @pytest.mark.parametrize("num_scans", [8, 24])
-def test_a_drive_without_far_pairs_gets_them_from_the_next_one(model, num_scans: int) -> None:
-    config = dpm_overlap.Config(model="toy", pairs=3)
-    pairs = dpm_overlap.measure_drive(model, toy.drive(0, num_scans), toy.drive(1), config)
+def test_a_drive_without_far_pairs_gets_them_from_the_next_one(model, num_scans: int, monkeypatch) -> None:
+    monkeypatch.setattr(dpm_overlap, "NUM_PAIRS", 3)
+    pairs = dpm_overlap.measure_drive(model, toy.drive(0, num_scans), toy.drive(1), 0)
     np.testing.assert_array_equal(pairs.is_overlap, [True] * 3 + [False] * 3)
     assert pairs.features.shape[:2] == (6, 2)
 
@@ -57,7 +57,9 @@ def test_all_methods_are_compared_on_all_places(tmp_path, monkeypatch) -> None:
     dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), weights)
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
-    arguments = [str(weights), "--towns", "2", "--other-towns", "2", "-o", str(tmp_path / "out")]
+    for name in ("NUM_TOWNS", "NUM_OTHER_TOWNS"):
+        monkeypatch.setattr(dpm_overlap, name, 2)
+    arguments = [str(weights), "-o", str(tmp_path / "out")]
     names = {"name": dpm_overlap.EXPERIMENT, "description": dpm_overlap.__doc__}
     assert run_command(dpm_overlap.main, dpm_overlap.Config, args=arguments, **names) == EXIT_OK
     rows = load_json(tmp_path / "out" / "metrics.json")["rows"]
