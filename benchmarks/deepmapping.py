@@ -84,11 +84,8 @@ def _classical(sequence: ScanSequence, case: str, quick: bool) -> list[Row]:
 def _timed(case: str, sequence: ScanSequence, function: Callable[[], np.ndarray]) -> tuple[np.ndarray, list[Row]]:
     """Returns the poses of the function, and its rows."""
     timing, poses = measure(function, repeats=1), function()
-    times = (("compile", timing.compile_s), ("run", timing.median_s))
-    return poses, [
-        *(Row(case, name, value, "s") for name, value in times),
-        Row(case, "ate", _ate(sequence, poses), "px"),
-    ]
+    rows = [Row(case, "compile", timing.compile_s, "s"), Row(case, "run", timing.median_s, "s")]
+    return poses, [*rows, Row(case, "ate", _ate(sequence, poses), "px")]
 
 
 def _fit(sequence: ScanSequence, start: np.ndarray | None, case: str, quick: bool) -> list[Row]:

@@ -128,13 +128,9 @@ def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
     cloud = dpmjax.encode(model, scan)
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * SCANS_IN_MAP), cloud)
     poses = jnp.tile(jnp.eye(4), (SCANS_IN_MAP, 1, 1)).at[:, 0, 3].set(jnp.arange(SCANS_IN_MAP))
-    jax.block_until_ready(
-        (
-            dpmjax.register(model, cloud, scan),
-            dpmjax.register(model, cloud, dpm.merge_clouds(stacked, poses)),
-            dpmjax.overlap(model, cloud, cloud),
-        )
-    )
+    targets = (scan, dpm.merge_clouds(stacked, poses))
+    motions = [dpmjax.register(model, cloud, target) for target in targets]
+    jax.block_until_ready((motions, dpmjax.overlap(model, cloud, cloud)))
     return []
 
 

@@ -90,11 +90,6 @@ def choose(task: Task, candidates: Mapping[str, np.ndarray]) -> tuple[str, dict[
     }
 
 
-def assess(task: Task, poses: np.ndarray) -> dict[str, Any]:
-    """Returns the assessment of poses, from the scans alone, under the names of the result files."""
-    return registration2d.assess_trajectory(task.planar, poses)._asdict()
-
-
 def _fit(task: Task, start: np.ndarray | None, config: dm.DeepMappingConfig | None = None) -> np.ndarray:
     """Returns poses by DeepMapping from a start, or from zero poses."""
     settings = config or dm.preset("fast")
@@ -152,16 +147,16 @@ def _all_candidates(task: Task) -> Candidates:
 def _best_start(task: Task) -> tuple[str, np.ndarray]:
     """Returns refined ICP if trusted; else of it and refined global registration the more strongly connected one."""
 
-    def assessed(name: str, poses: np.ndarray) -> tuple[dict[str, Any], str, np.ndarray]:
-        return assess(task, poses), f"{name}, refined", poses
+    def assessed(name: str, poses: np.ndarray) -> tuple[registration2d.Assessment, str, np.ndarray]:
+        return registration2d.assess_trajectory(task.planar, poses), f"{name}, refined", poses
 
     starts = []
     if task.is_ordered:
         starts.append(assessed(START_NAMES["icp-plane"], refined(task, incremental(task))))
-    if not starts or not starts[0][0]["is_trusted"]:
+    if not starts or not starts[0][0].is_trusted:
         starts.append(assessed(START_NAMES["global"], refined(task, search(task))))
     # Between two different maps the sharper one may be wrong, so `choose` does not decide here.
-    return max(starts, key=lambda start: start[0]["weakest_connection"])[1:]
+    return max(starts, key=lambda start: start[0].weakest_connection)[1:]
 
 
 class Method(NamedTuple):
@@ -240,7 +235,7 @@ def run_method(name: str, task: Task) -> cli.Row:
         "cpu_s": cpu_seconds,
         "kept": kept,
         "candidates": measured,
-        **assess(task, candidates[kept]),
+        **registration2d.assess_trajectory(task.planar, candidates[kept])._asdict(),
     }
 
 

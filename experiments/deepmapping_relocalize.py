@@ -48,7 +48,7 @@ class Config:
         cli.check_least(self, stride_px=1)
 
 
-def main(config: Config) -> cli.Row:
+def main(config: Config) -> None:
     """Loads the run, trains L-Net on its poses, re-localises scans everywhere, draws, writes."""
     import jax
 
@@ -81,7 +81,6 @@ def main(config: Config) -> cli.Row:
     np.savez(config.run / "relocalization.npz", truth=truth, **queries._asdict())
     draw(config, sequence, grid.shape, truth, queries)
     print(lines_of(report), f"results in {config.run}", sep="\n")
-    return report
 
 
 class Queries(NamedTuple):

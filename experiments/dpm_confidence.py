@@ -112,14 +112,11 @@ def rate(rows: list[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.R
 def table(numbers: list[cli.Row]) -> str:
     """Returns the table as Markdown."""
     names = ("rated", "model", "kind", "num_pairs", "num_right", "num_sure", "num_sure_wrong")
-    lines = [
-        [
-            *(row[name] for name in names),
-            f"{row['num_near_sure_right']} of {row['num_near']}",
-            *(f"{row[name]:.3f}" for name in ("calibration_error", "brier_score")),
-        ]
-        for row in numbers
-    ]
+    lines = []
+    for row in numbers:
+        near = f"{row['num_near_sure_right']} of {row['num_near']}"
+        errors = (f"{row[name]:.3f}" for name in ("calibration_error", "brier_score"))
+        lines.append([*(row[name] for name in names), near, *errors])
     return cli.markdown(COLUMNS, lines)
 
 

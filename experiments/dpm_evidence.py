@@ -124,16 +124,15 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.EvidenceWeights, list[cli.Row]]:
         weights, _ = dpm.fit_weights(shares[others], is_right[others])
         case = {name: row[name] for name in ("kind", "sensor", "points")}
         for (band,), pairs in cli.group_rows(row["pairs"], "band").items():
-            table.append(
-                {
-                    **case,
-                    "band": band,
-                    "num_pairs": len(pairs),
-                    "by_the_present_weights": share_right(pairs, np.array(present)),
-                    "by_a_fit_on_the_others": share_right(pairs, weights),
-                    "any_right": float(np.mean([np.any(pair["is_right"]) for pair in pairs])),
-                }
-            )
+            numbers = {
+                **case,
+                "band": band,
+                "num_pairs": len(pairs),
+                "by_the_present_weights": share_right(pairs, np.array(present)),
+                "by_a_fit_on_the_others": share_right(pairs, weights),
+                "any_right": float(np.mean([np.any(pair["is_right"]) for pair in pairs])),
+            }
+            table.append(numbers)
     weights, bias = dpm.fit_weights(shares, is_right)
     return dpm.EvidenceWeights(round(bias, 2), *np.round(weights, 2).tolist()), table
 

@@ -205,10 +205,8 @@ def keyframe_poses(result: AgentsResult, T_world_scan: list[np.ndarray]) -> np.n
 
 def members_of(result: AgentsResult) -> list[list[int]]:
     """Returns the agents of each component."""
-    return [
-        [number for number, each in enumerate(result.component) if each == component]
-        for component in range(max(result.component) + 1)
-    ]
+    components = np.array(result.component)
+    return [np.flatnonzero(components == number).tolist() for number in range(components.max() + 1)]
 
 
 def joint_ate_m(result: AgentsResult, sequences: list[LidarSequence], members: list[int]) -> float | None:

@@ -49,7 +49,7 @@ class Config(cli.OutputOptions):
         cli.check_least(self, seeds=1, steps=1)
 
 
-def main(config: Config) -> dict[str, Any]:
+def main(config: Config) -> None:
     """Runs all seeds, then all variants, draws, measures, writes."""
     cli.require_importable("jaxopt", "the solvers of the direct form")
     folder = cli.open_run_folder(config, EXPERIMENT)
@@ -77,7 +77,6 @@ def main(config: Config) -> dict[str, Any]:
         ends_figure = viz.endings_figure(x, loss, ends, metrics["share_at_global_minimum"])
         viz.save_figure(ends_figure, folder / "endings.png")
         print(report(metrics), f"results in {folder.path}", sep="\n")
-    return metrics
 
 
 def descend(toy: dm.ToyConfig, config: Config) -> dict[str, dm.Fit]:
