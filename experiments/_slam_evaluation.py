@@ -205,9 +205,8 @@ def common_numbers(drive: Drive, method: str, T_world_scan: np.ndarray, loops: l
 def loop_numbers(drive: Drive, loops: list[FoundLoop]) -> cli.Row:
     """Returns how many loops are wrong, and the recall of the right ones."""
     poses, scale = drive.reference, drive.scale
-    newer, older = (
-        np.reshape([getattr(loop, end) for loop in loops], (-1, 2)).astype(int) for end in ("newer", "older")
-    )
+    ends = np.reshape([(loop.newer, loop.older) for loop in loops], (-1, 2, 2)).astype(int)
+    newer, older = ends[:, 0], ends[:, 1]
     found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
     is_right = metrics.registration_recall(found, rigid.inverse(poses[older[:, 0]]) @ poses[newer[:, 0]]).is_right
     revisits = metrics.find_revisits(poses, distance_m=scale.distance_m, min_path_m=scale.min_path_m)
