@@ -95,20 +95,14 @@ def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> np
     stride = max(1, -(-mask.shape[1] // sizes.num_beams))
     unit = typical_range(scans.points, scans.mask)
     widths = jnp.array([_SPREAD[0] * unit, _SPREAD[0] * unit, _SPREAD[1]])
-    steps = _swarm_pairs(points[:, ::stride], mask[:, ::stride], widths, key, sizes=sizes)
+    steps = _swarm_pairs(ScanSet(points[:, ::stride], mask[:, ::stride]), widths, key, sizes=sizes)
     return se2.chain(np.asarray(steps, np.float64))
 
 
 @partial(jax.jit, static_argnames="sizes")
-def _swarm_pairs(
-    points: Float[Array, "n b 2"],
-    mask: Bool[Array, "n b"],
-    widths: Float[Array, " 3"],
-    key: jax.Array,
-    *,
-    sizes: Swarms,
-) -> Float[Array, "m 3"]:
+def _swarm_pairs(scans: ScanSet, widths: Float[Array, " 3"], key: jax.Array, *, sizes: Swarms) -> Float[Array, "m 3"]:
     """Returns T_before_scan of every scan but the first."""
+    points, mask = scans.points, scans.mask
 
     def best_of_rounds(pair: tuple[jax.Array, ...]) -> Array:
         before, before_mask, after, after_mask, pair_key = pair
@@ -163,9 +157,8 @@ def multiway(scans: ScanSet) -> np.ndarray:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
     """
     unit = typical_range(scans.points, scans.mask)
-    points = [p[m] for p, m in zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)]
-    flat = [np.concatenate([p, np.zeros((len(p), 1))], axis=1) for p in points]
-    clouds = [_cloud(p) for p in flat]
+    pairs = zip(np.asarray(scans.points), np.asarray(scans.mask), strict=True)
+    clouds = [_cloud(np.pad(points[mask], [(0, 0), (0, 1)])) for points, mask in pairs]
     poses = _registered(clouds, unit, is_planar=True)
     planar = np.stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])], -1)
     return se2.relative(planar[0], planar)
