@@ -119,5 +119,5 @@ def draw_loss(folder: RunFolder, unit: str) -> None:
         seconds, loss, ate = (
             np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
         )
-        history = viz.History(seconds, loss, [row["phase"] for row in rows], ate)
-        viz.save_figure(viz.history_figure(history, unit), folder / "loss.png")
+        figure = viz.history_figure(seconds, loss, [row["phase"] for row in rows], ate, unit)
+        viz.save_figure(figure, folder / "loss.png")

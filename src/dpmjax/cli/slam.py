@@ -19,6 +19,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -72,7 +73,7 @@ class Config(DriveOptions):
 
 def main(config: Config) -> dict[str, Any]:
     """Maps a drive and writes the results; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_run import find_beginning, live_viewer, run_scans
+    from dpmjax.cli.slam_run import find_beginning, run_scans
 
     if config.visualize:
         require_importable("rerun", "-v")
@@ -91,8 +92,9 @@ def main(config: Config) -> dict[str, Any]:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""
         tell(f"{sequence.name}: {numbers.counted(len(sequence), 'scan')}{done}")
         notes = report_notes(sequence.notes)
-        with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
-            run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, on_scan)
+        viewer = viz.LiveViewer(sequence.name, folder / "slam.rrd") if config.visualize else None
+        with nullcontext() if viewer is None else closing(viewer):
+            run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, viewer)
         result = slam.finish_slam(run.state, run.reports, methods.config)
         drive = MappedDrive(sequence, start.front_end.num_scans, len(start.slam_map))
         metrics = write_results(folder, config, drive, run, result)

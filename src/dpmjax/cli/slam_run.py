@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -129,7 +129,7 @@ def run_scans(
     methods: slam.SlamMethods,
     beginning: RunState,
     is_stopped: Callable[[], bool],
-    on_scan: Callable[[Any, slam.SlamState, slam.ScanReport], None] | None = None,
+    viewer: viz.LiveViewer | None = None,
 ) -> SlamRun:
     """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
 
@@ -139,7 +139,7 @@ def run_scans(
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
         is_stopped: True to end before the next scan.
-        on_scan: called with each scan, the state after it and its report.
+        viewer: shows the run.
 
     Returns:
         The run.
@@ -166,8 +166,8 @@ def run_scans(
                 if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
                     watch.timed("write", save_state, folder / STATE, *resumable)
                     resumable, saved = None, time.perf_counter()
-                if on_scan is not None:
-                    watch.timed("viewer", on_scan, scan, state, report)
+                if viewer is not None:
+                    watch.timed("viewer", show_live, viewer, scan, state, report)
                 bar.set_postfix_str(_progress(state, report, watch), refresh=False)
                 bar.update(1)
                 if time.perf_counter() - flushed > FLUSH_EVERY_S:
@@ -214,25 +214,12 @@ def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) 
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])
 
 
-@contextmanager
-def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[Callable[..., None] | None]:
-    """Opens the viewer; yields a function that shows a scan, or None where the viewer is off."""
-    if not is_on:
-        yield None
+def show_live(viewer: viz.LiveViewer, scan: Any, state: slam.SlamState, report: slam.ScanReport) -> None:
+    """Shows a scan in the viewer, and the map after a new keyframe."""
+    T_world_keyframe = state.slam_map.T_world_keyframe
+    if not len(T_world_keyframe):
         return
-    viewer = viz.LiveViewer(name, folder / "slam.rrd")
-
-    def show(scan: Any, state: slam.SlamState, report: slam.ScanReport) -> None:
-        T_world_keyframe = state.slam_map.T_world_keyframe
-        if not len(T_world_keyframe):
-            return
-        points = slam.corrected_points(scan, report.T_turn)
-        viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
-        if report.is_keyframe:
-            positions = T_world_keyframe[accepted_ends(state.loops.loops), :3, 3]
-            viewer.show_map(T_world_keyframe, points, positions)
-
-    try:
-        yield show
-    finally:
-        viewer.close()
+    points = slam.corrected_points(scan, report.T_turn)
+    viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
+    if report.is_keyframe:
+        viewer.show_map(T_world_keyframe, points, T_world_keyframe[accepted_ends(state.loops.loops), :3, 3])

@@ -256,8 +256,9 @@ def draw_matches(folder: RunFolder, evaluation: deeppointmap.Evaluation, pairs: 
     q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
     distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
     title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
-    scans = viz.MatchedScans(pairs.scan_points(a), pairs.scan_points(b), p, q, distances < 3.0)
-    viz.save_figure(viz.matches_figure(scans, matches.T_target_source[number], title=title), folder / "matches.png")
+    motions = {"source laid onto target": matches.T_target_source[number]}
+    pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
+    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), folder / "matches.png")
 
 
 def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
