@@ -259,18 +259,13 @@ class LiveViewer:
         self._log_pose("world/lidar", T_world_scan)
         self._log_points("world/lidar/points", points)
 
-    def show_map(
-        self,
-        T_world_keyframe: Float[np.ndarray, "k 4 4"],
-        newest: Float[np.ndarray, "n 3"],
-        loops: Float[np.ndarray, "m 2 3"],
-    ) -> None:
+    def show_map(self, T_world_keyframe: np.ndarray, newest: np.ndarray, loops: np.ndarray) -> None:
         """Shows the map after a new keyframe.
 
         Args:
-            T_world_keyframe: poses of all keyframes, at least one.
-            newest: points of the last keyframe, metres, in the frame of the lidar.
-            loops: positions of both ends of each accepted loop.
+            T_world_keyframe: (k, 4, 4) poses of all keyframes, at least one.
+            newest: (n, 3) points of the last keyframe, metres, in the frame of the lidar.
+            loops: (m, 2, 3) positions of both ends of each accepted loop.
         """
         before, self._T_world_keyframe = self._T_world_keyframe, T_world_keyframe
         for row, T in enumerate(T_world_keyframe):
