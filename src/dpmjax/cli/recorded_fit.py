@@ -63,10 +63,8 @@ class FitRecorder:
 
         folder, state = self._folder, init(problem, data, key=key)
         checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
-        if folder.is_resumed:
-            state = checkpoints.restore_latest(state, fallback=state)
+        state = checkpoints.restore_latest(state, fallback=state)
         columns = (*_COLUMNS, f"ate_{self._length}")
-        keep_until = int(state.step) if folder.is_resumed else None
         bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
         saved_at = time.perf_counter()
 
@@ -78,7 +76,7 @@ class FitRecorder:
                 checkpoints.save(int(progress.state.step), progress.state)
                 saved_at = time.perf_counter()
 
-        with bar, HistoryFile(folder / HISTORY, columns, keep_until=keep_until) as history:
+        with bar, HistoryFile(folder / HISTORY, columns, keep_until=int(state.step)) as history:
             earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
             self.run_s = earlier_s
             done = resume(problem, state, data, on_report=record, stop=lambda: self._stop(self.run_s))
