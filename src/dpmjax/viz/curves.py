@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,14 +23,6 @@ RATIO_FOR_LOG_AXIS = 10.0
 _FEW_DECADES = 2
 SMOOTHED_PART = 0.03
 NUM_BINS = 10
-
-
-class _Phase(NamedTuple):
-    """A run of records of one phase: its name, its rows and its first and last second."""
-
-    name: str
-    rows: slice
-    seconds: tuple[float, float]
 
 
 def history_figure(seconds: Floats, loss: Floats, names: Sequence[str], ate: Floats, unit: str) -> Figure:
@@ -60,12 +52,13 @@ def history_figure(seconds: Floats, loss: Floats, names: Sequence[str], ate: Flo
     has_ate = bool(is_known.any())
     figure = figures.new_figure(8.0, 5.2 if has_ate else 3.0)
     rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
-    phases = _phases(names, seconds)
+    phases = _phases(names)
     for axes in rows:
         for number, phase in enumerate(phases):
-            axes.axvspan(*phase.seconds, color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
+            begin, end = seconds[max(0, phase.start - 1)], seconds[phase.stop - 1]
+            axes.axvspan(begin, end, color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
     for phase in phases:
-        _draw_line(rows[0], seconds[phase.rows], loss[phase.rows], LOSS_COLOR)
+        _draw_line(rows[0], seconds[phase], loss[phase], LOSS_COLOR)
     _finish_value_axis(rows[0], loss, "loss")
     if has_ate:
         _draw_line(rows[1], seconds[is_known], ate[is_known], ACCENT)
@@ -73,7 +66,7 @@ def history_figure(seconds: Floats, loss: Floats, names: Sequence[str], ate: Flo
         last = seconds[is_known][-1], ate[is_known][-1]
         style: Any = {"va": "center", "fontsize": 9, "color": ACCENT, "annotation_clip": False}
         rows[1].annotate(figures.format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
-    _name_phases(rows[0], phases)
+    _name_phases(rows[0], phases, names, seconds)
     rows[-1].set_xlabel("run time (s)", color=INK)
     first, last = seconds[0], seconds[-1]
     rows[-1].set_xlim(first, last if last > first else first + 1.0)
@@ -82,24 +75,22 @@ def history_figure(seconds: Floats, loss: Floats, names: Sequence[str], ate: Flo
     return figure
 
 
-def _phases(names: Sequence[str], seconds: Floats) -> list[_Phase]:
-    """Finds runs of equal names; a phase lasts from its predecessor's last record to its own last record."""
+def _phases(names: Sequence[str]) -> list[slice]:
+    """Returns the records of each phase, runs of equal names; it lasts from the last record before to its own last."""
     borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
-    return [
-        _Phase(names[first], slice(first, last), (float(seconds[max(0, first - 1)]), float(seconds[last - 1])))
-        for first, last in itertools.pairwise(borders)
-    ]
+    return [slice(first, last) for first, last in itertools.pairwise(borders)]
 
 
-def _name_phases(axes: Axes, phases: Sequence[_Phase]) -> None:
+def _name_phases(axes: Axes, phases: Sequence[slice], names: Sequence[str], seconds: Floats) -> None:
     """Writes the names above the first row; a name that would run into its left neighbour moves right of it."""
-    first, last = phases[0].seconds[0], phases[-1].seconds[1]
+    first, last = seconds[0], seconds[-1]
     taken_until = 0.0
     for phase in phases:
-        start = max((phase.seconds[0] - first) / max(last - first, 1e-9), taken_until)
+        name, begin = names[phase.start], seconds[max(0, phase.start - 1)]
+        start = max((begin - first) / max(last - first, 1e-9), taken_until)
         style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 9.5, "color": MUTED}
-        axes.annotate(phase.name, (start, 1), xytext=(2, 5), **style)
-        taken_until = start + 0.0135 * (len(phase.name) + 2)
+        axes.annotate(name, (start, 1), xytext=(2, 5), **style)
+        taken_until = start + 0.0135 * (len(name) + 2)
 
 
 def _draw_line(axes: Axes, seconds: Floats, values: Floats, color: str) -> None:
