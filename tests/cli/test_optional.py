@@ -15,6 +15,7 @@ from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
 from tests.optional import import_or_skip
 
 LIBUSB = "libusb-1.0.so.0: cannot open shared object file"
+PACKAGES = [name for names in EXTRAS.values() for name in names]
 FAILURES = {
     "a missing library": f"raise OSError({LIBUSB!r})",
     "a missing symbol": f"raise ImportError({LIBUSB!r})",
@@ -29,10 +30,10 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "packages"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
-    for name in (*EXTRAS, "broken"):
+    for name in (*PACKAGES, "broken"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     yield folder
-    for name in (*EXTRAS, "broken"):
+    for name in (*PACKAGES, "broken"):
         sys.modules.pop(name, None)
 
 
@@ -65,7 +66,7 @@ def test_a_package_that_warns_can_be_used(packages: Path) -> None:
 def test_info_names_what_is_broken_and_what_is_missing(
     packages: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    for name in EXTRAS:
+    for name in PACKAGES:
         (packages / f"{name}.py").touch()
     (packages / "open3d.py").write_text(FAILURES["a missing library"])
     monkeypatch.setitem(sys.modules, "gtsam", None)

@@ -76,7 +76,7 @@ def test_poses_of_a_camera_and_of_a_lidar_far_from_the_origin_make_the_same_driv
 def test_drives_to_train_and_to_evaluate_on_may_be_trajectories(without_rays) -> None:
     path = write_tum(without_rays / "hill.txt", hill())
     (source,) = find_sources([str(path)], [])
-    np.testing.assert_array_equal(source.open().T_world_lidar, route_drive(path, seed=0).T_world_lidar)
+    np.testing.assert_array_equal(source().T_world_lidar, route_drive(path, seed=0).T_world_lidar)
 
 
 def test_another_seed_makes_another_town(without_rays) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -48,7 +49,7 @@ class StopAfter:
         return int(self._left < 0)
 
 
-def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float | None = None):
+def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float = math.inf):
     folder.mkdir(exist_ok=True)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
     records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)

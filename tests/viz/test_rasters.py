@@ -7,7 +7,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dpmjax.viz import ErrorMap, Limits, error_maps_figure, from_above_figure, occupancy_figure
-from dpmjax.viz.rasters import UNEXPLORED_GREY
+from dpmjax.viz.registered_scans import UNEXPLORED_GREY
 
 
 def draw_occupancy(probability, explored, extent, unit, path=((0.0, 0.0),), **view):

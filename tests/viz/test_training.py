@@ -23,10 +23,10 @@ def test_matches_join_the_clouds_and_wrong_ones_stand_out():
     T = np.eye(4)
     T[:2, 3] = [2.0, 3.0]
     matched = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]])
-    scans = viz.MatchedScans(source, target, matched, matched, [True, False])
-    figure = viz.matches_figure(scans, T, title="pair")
+    pair = viz.RegisteredPair("pair", source, target, {"laid onto the target": T})
+    figure = viz.matches_figure(pair, matched, matched, [True, False])
     left, right = figure.axes
     right_match, wrong_match = left.lines[2:4]
     assert right_match.get_color() != wrong_match.get_color()
-    assert left.get_title() == "pair"
+    assert (left.get_title(), right.get_title()) == ("pair", "laid onto the target")
     np.testing.assert_allclose(right.lines[1].get_xydata(), np.tile([2.0, 3.0], (3, 1)))

@@ -17,22 +17,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
-from dpmjax.cli.command import StopFlag, check_least
-from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.result_files import named_initial, write_poses
-from dpmjax.cli.run_folder import RunFolder, RunOptions, ScanOptions, open_run_folder, recording, write_metrics
-
-if TYPE_CHECKING:
-    from dpmjax.deepmapping import Registered
-    from dpmjax.sequences import DepthSequence
-
-Floats = NDArray[np.float64]
+from dpmjax import cli, deepmapping, geometry, io, metrics, registration_rgbd, simulation, viz
+from dpmjax.sequences import DepthSequence, FloatArray
 
 NAME = "depth"
 _NUM_SIMULATED = 8
@@ -41,7 +32,7 @@ _LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ScanOptions, RunOptions):
+class Config(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
@@ -52,41 +43,36 @@ class Config(ScanOptions, RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, n_scans=2, jump=1)
+        cli.check_least(self, n_scans=2, jump=1)
 
 
-def main(config: Config) -> dict[str, Any]:
-    """Registers depth images and writes the results; returns the content of `metrics.json`."""
+def main(config: Config) -> None:
+    """Registers depth images and writes the results."""
     import jax
-
-    from dpmjax import deepmapping, registration_rgbd
 
     started = time.perf_counter()
     sequence = read_images(config)
     images = registration_rgbd.as_depth_scans(sequence.points, sequence.mask)
-    folder = open_run_folder(config, NAME)
-    with recording(folder), StopFlag() as stop:
+    folder = cli.open_run_folder(config, NAME)
+    with cli.recording(folder), cli.StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} images", "search of first poses ...", sep="\n", flush=True)
-        recorder = FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
+        recorder = cli.FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
         settings = deepmapping.preset(config.preset, "depth", motion="planar" if sequence.is_planar else "full")
         found = deepmapping.register_depth(images, settings, key=jax.random.key(config.seed), engine=recorder)
-        metrics = {
+        numbers = {
             **depth_numbers(sequence, found),
             **recorder.numbers,
             "is_interrupted": stop.is_requested,
         }
         write_depth_results(folder, sequence, found.T_world_scan)
         draw(folder, sequence, found)
-        metrics["wall_s"] = time.perf_counter() - started
-        write_metrics(folder, metrics, seed=config.seed)
-        print(depth_report(metrics), f"results in {folder.path}", sep="\n")
-    return metrics
+        numbers["wall_s"] = time.perf_counter() - started
+        cli.write_metrics(folder, numbers, seed=config.seed)
+        print(depth_report(numbers), f"results in {folder.path}", sep="\n")
 
 
 def read_images(config: Config) -> DepthSequence:
     """Returns the chosen images of DATA or of a simulated walk."""
-    from dpmjax import io, simulation
-
     if config.data is None:
         sequence = simulation.simulate_depth_sequence(0, config.selection.stop or _NUM_SIMULATED, seed=config.seed)
     else:
@@ -97,7 +83,7 @@ def read_images(config: Config) -> DepthSequence:
     return chosen
 
 
-def depth_numbers(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
+def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
@@ -109,11 +95,11 @@ def depth_numbers(sequence: DepthSequence, found: Registered) -> dict[str, Any]:
         "consistency": 1 - (found.misfit if found.kept == "fit" else found.start_misfit),
         "consistency_initial": 1 - found.start_misfit,
         **after,
-        **named_initial(before),
+        **cli.named_initial(before),
     }
 
 
-def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, float]:
+def depth_errors(sequence: DepthSequence, T_world_camera: FloatArray) -> dict[str, float]:
     """Computes ATE, mean distance of map points, and the largest error of a turn between neighbours.
 
     Args:
@@ -125,15 +111,12 @@ def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, f
     """
     from scipy.spatial.transform import Rotation
 
-    from dpmjax import metrics
-    from dpmjax.geometry import typical_range
-
     reference = sequence.T_world_camera
     if reference is None:
         return {}
     count = len(sequence)
     points, mask = sequence.points.reshape(count, -1, 3), sequence.mask.reshape(count, -1)
-    lever = _LEVER * typical_range(points, mask)
+    lever = _LEVER * geometry.typical_range(points, mask)
     T_reference_world = np.asarray(metrics.align_poses(T_world_camera, reference, lever=lever))
     aligned = T_reference_world @ T_world_camera
     off = np.einsum("nij,nbj->nbi", aligned[:, :3, :3] - reference[:, :3, :3], points)
@@ -147,26 +130,22 @@ def depth_errors(sequence: DepthSequence, T_world_camera: Floats) -> dict[str, f
     }
 
 
-def write_depth_results(folder: RunFolder, sequence: DepthSequence, T_world_camera: Floats) -> None:
+def write_depth_results(folder: cli.RunFolder, sequence: DepthSequence, T_world_camera: FloatArray) -> None:
     """Writes the trajectory and map.ply."""
-    from dpmjax import io
-
-    write_poses(folder.path, T_world_camera)
+    cli.write_poses(folder.path, T_world_camera)
     points = np.einsum("nij,nhwj->nhwi", T_world_camera[:, :3, :3], sequence.points)
     points += T_world_camera[:, None, None, :3, 3]
     io.write_ply(folder / "map.ply", points[sequence.mask].astype(np.float32))
 
 
-def draw(folder: RunFolder, sequence: DepthSequence, found: Registered) -> None:
+def draw(folder: cli.RunFolder, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
-    from dpmjax import viz
-
     assert found.start is not None
     panels = [("search of first poses", found.start), ("DeepMapping", found.fitted.T_world_scan)]
     if sequence.T_world_camera is not None:
         panels.append(("reference", sequence.T_world_camera))
     viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), folder / "map.png", dpi=110)
-    draw_loss(folder, "m")
+    cli.draw_loss(folder, "m")
 
 
 def depth_report(numbers: dict[str, Any]) -> str:

@@ -180,34 +180,14 @@ def _digest(drive: LidarSequence) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()[:8]
 
 
-@dataclass(frozen=True)
-class Source:
-    """Origin of a drive to train on or to evaluate with; a worker process opens it.
+Source = Callable[[], LidarSequence]
+"""Opens or simulates a drive to train on or to evaluate with; a worker process calls it, so it can be pickled."""
 
-    Attributes:
-        path: folder of scans, or a file of poses along which a town is simulated; None for any town.
-        name: name of the sequence in the folder; None where it holds one.
-        town_seed: seed of the town.
-        town_length_m: length of the drive through the town.
-        town_kind: kind of place; None draws one.
-        town_mixture: distribution from which the town is drawn; None for that of `simulate_drive`.
-    """
 
-    path: Path | None = None
-    name: str | None = None
-    town_seed: int = 0
-    town_length_m: float = 600.0
-    town_kind: str | None = None
-    town_mixture: simulation.SceneMixture | None = None
-
-    def open(self) -> LidarSequence:
-        """Opens or simulates the drive; scans without a pose of an existing reference are left out."""
-        if self.path is None:
-            mixture = self.town_mixture or simulation.SceneMixture()
-            length_m, kind = self.town_length_m, self.town_kind
-            return simulation.simulate_drive(self.town_seed, length_m=length_m, kind=kind, mixture=mixture)
-        drive = open_path(self.path, self.town_seed, sequence=self.name)
-        return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
+def open_with_poses(path: Path, name: str | None) -> LidarSequence:
+    """Opens a drive, or simulates a town along a file of poses; scans without a pose of its reference are left out."""
+    drive = open_path(path, 0, sequence=name)
+    return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
 
 
 def find_sources(
@@ -233,7 +213,7 @@ def find_sources(
             sources += towns
             continue
         names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
-        found = {source: source.open() for source in (Source(Path(entry), name) for name in names)}
+        found = {source: source() for source in (partial(open_with_poses, Path(entry), name) for name in names)}
         checked = ((source, deeppointmap.why_useless(drive, sampling)) for source, drive in found.items())
         reasons = {source: reason for source, reason in checked if reason is not None}
         if len(reasons) == len(found):

@@ -24,11 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import deeppointmap, metrics, simulation, viz, weights
-from dpmjax.cli.command import check_least
-from dpmjax.cli.drives import Source, check_names_differ, find_sources
-from dpmjax.cli.resumable_table import Row, Summary, TableRun, cell_text, group_rows, markdown, run_table
-from dpmjax.cli.run_folder import ModelOptions, RunFolder, RunOptions
+from dpmjax import cli, deeppointmap, metrics, simulation, viz, weights
 from dpmjax.sequences import LidarSequence
 
 NAME = "evaluate"
@@ -47,7 +43,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ModelOptions, RunOptions):
+class Config(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
@@ -59,45 +55,43 @@ class Config(ModelOptions, RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, pairs=1, num_towns=1, seed=0)
+        cli.check_least(self, pairs=1, num_towns=1, seed=0)
         if not self.data:
             raise ValueError("give at least one folder of scans, or town")
 
 
-def main(config: Config) -> list[Row]:
+def main(config: Config) -> list[cli.Row]:
     """Computes the missing rows, and writes table, numbers and pictures."""
     model = weights.load_model(config.weights)
     kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
     drives = open_evaluation_drives(config.data, evaluation_towns(config.num_towns, TOWN_LENGTH_M, kinds))
     by_name = {drive.name: drive for drive in drives}
 
-    def work(run: TableRun, sequence: str, band: str) -> Row:
+    def work(run: cli.TableRun, sequence: str, band: str) -> cli.Row:
         drive = by_name[sequence]
         if band == "overlap":
             return overlap_row(model, drive, OVERLAP_FACTOR * config.pairs, seed=config.seed, on_scan=run.check_stop)
         return registration_row(model, read_pairs(run, drive, band, config), config.pairs)
 
-    def report(rows: list[Row]) -> Summary:
+    def report(rows: list[cli.Row]) -> cli.Summary:
         numbers, text = calibration_numbers(rows), table(rows)
         if numbers:
             note = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
             text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note})."
         draw = partial(draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
-        return Summary({"weights": config.weights, **numbers}, text, draw)
+        return cli.Summary({"weights": config.weights, **numbers}, text, draw)
 
     cases = [{"sequence": name, "band": band} for name in by_name for band in ("near", "middle", "far", "overlap")]
-    return run_table(config, NAME, cases, work, report)
+    return cli.run_table(config, NAME, cases, work, report)
 
 
-def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[Source]:
+def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[cli.Source]:
     """Returns towns that no training uses, with the kinds of place in turn; None draws one."""
-    return [
-        Source(town_seed=FIRST_TOWN + number, town_length_m=length_m, town_kind=kinds[number % len(kinds)])
-        for number in range(num_towns)
-    ]
+    town = partial(simulation.simulate_drive, length_m=length_m)
+    return [partial(town, FIRST_TOWN + number, kind=kinds[number % len(kinds)]) for number in range(num_towns)]
 
 
-def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list[LidarSequence]:
+def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> list[LidarSequence]:
     """Opens the drives of a command line.
 
     Args:
@@ -110,24 +104,24 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[Source]) -> list
     Raises:
         ValueError: a path cannot be read, or a drive has no poses or no pairs, or two drives have the same name.
     """
-    drives = [source.open() for source in find_sources(data, towns)]
+    drives = [source() for source in cli.find_sources(data, towns)]
     for drive in drives:
         if not len(deeppointmap.draw_scan_pairs(drive, "near", 1)):
             raise ValueError(f"{drive.name}: no two scans are 2 to 10 m apart; are the poses in metres?")
-    check_names_differ(drives)
+    cli.check_names_differ(drives)
     return drives
 
 
-def read_pairs(run: TableRun, drive: LidarSequence, band: str, config: Any) -> Iterator[deeppointmap.ScanPair]:
+def read_pairs(run: cli.TableRun, drive: LidarSequence, band: str, config: Any) -> Iterator[deeppointmap.ScanPair]:
     """Yields random pairs of scans of a band of distances; `config` has their number, `pairs`, and the seed."""
     drawn = deeppointmap.draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
     return run.until_stopped(deeppointmap.read_scan_pairs(drive, drawn, seed=config.seed))
 
 
-def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.ScanPair], num_asked: int) -> Row:
+def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.ScanPair], num_asked: int) -> cli.Row:
     """Returns errors by stage, confidence and seconds of the registrations of a band of distances."""
     found = deeppointmap.evaluate_scan_pairs(model, pairs)
-    row: Row = {
+    row: cli.Row = {
         "is_calibrated": model.config.calibration is not None,
         "num_asked": num_asked,
         "confidence": found.confidence.tolist(),
@@ -144,17 +138,17 @@ def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.Sca
 
 def overlap_row(
     model: deeppointmap.Model, drive: LidarSequence, num_pairs: int, *, seed: int, on_scan: Callable[[], object]
-) -> Row:
+) -> cli.Row:
     """Returns AUC and Brier score of the overlap probability; AUC None where the drive lacks pairs."""
     found = deeppointmap.evaluate_overlap(model, drive, num_pairs, seed=seed, on_scan=on_scan)
-    row: Row = {"auc": None, "has_revisits": found.has_revisits, "num_pairs": len(found.is_overlap)}
+    row: cli.Row = {"auc": None, "has_revisits": found.has_revisits, "num_pairs": len(found.is_overlap)}
     if len(found.is_overlap):
         row |= {"auc": found.area_under_curve, "brier": found.brier_score}
         row |= {"probability": found.probability.tolist(), "is_overlap": found.is_overlap.tolist()}
     return row
 
 
-def error_columns(errors: metrics.RegistrationRecall, suffix: str) -> Row:
+def error_columns(errors: metrics.RegistrationRecall, suffix: str) -> cli.Row:
     """Returns the recall, all errors, and the median errors of right registrations."""
     is_right = errors.is_right
     of_right = np.column_stack([errors.translation_errors_m, errors.rotation_errors_deg])[is_right]
@@ -170,34 +164,32 @@ def error_columns(errors: metrics.RegistrationRecall, suffix: str) -> Row:
     }
 
 
-def calibration_numbers(rows: Sequence[Row]) -> Row:
+def calibration_numbers(rows: Sequence[cli.Row]) -> cli.Row:
     """Returns the Brier score of the confidence, over all pairs and those of each band, and `is_calibrated`."""
     known = [row for row in rows if "confidence" in row and row["num_pairs"]]
 
-    def brier(some: Sequence[Row]) -> float:
+    def brier(some: Sequence[cli.Row]) -> float:
         confidence, is_right = (np.concatenate([row[name] for row in some]) for name in ("confidence", "is_right"))
         return metrics.brier_score(confidence, is_right.astype(bool))
 
-    numbers = {f"brier_{band}": brier(some) for (band,), some in group_rows(known, "band").items()}
+    numbers = {f"brier_{band}": brier(some) for (band,), some in cli.group_rows(known, "band").items()}
     is_calibrated = all(row["is_calibrated"] for row in known)
     return {"brier": brier(known), **numbers, "is_calibrated": is_calibrated} if known else {}
 
 
 def draw_evaluation(
-    folder: RunFolder, *, drives: Sequence[LidarSequence], rows: Sequence[Row], weights: str, seed: int
+    folder: cli.RunFolder, *, drives: Sequence[LidarSequence], rows: Sequence[cli.Row], weights: str, seed: int
 ) -> None:
     """Draws reliability.png, and failures.png where a registration of an overlapping pair is wrong."""
     known = [row for row in rows if "confidence" in row]
     confidence, is_right = (np.concatenate([[], *(row[name] for row in known)]) for name in ("confidence", "is_right"))
     title = f"{Path(weights).stem}, all pairs"
     viz.save_figure(viz.reliability_figure(confidence, is_right, title=title), folder / "reliability.png")
-    if worst := worst_failures(drives, known, NUM_SHOWN, seed):
+    if worst := worst_failures(drives, known, seed):
         viz.save_figure(viz.registered_pairs_figure(worst), folder / "failures.png")
 
 
-def worst_failures(
-    drives: Sequence[LidarSequence], rows: Sequence[Row], num_shown: int, seed: int
-) -> list[viz.RegisteredPair]:
+def worst_failures(drives: Sequence[LidarSequence], rows: Sequence[cli.Row], seed: int) -> list[viz.RegisteredPair]:
     """Returns the wrong registrations of overlapping pairs that have the highest confidence."""
     names = {drive.name: drive for drive in drives}
     wrong = [
@@ -207,7 +199,7 @@ def worst_failures(
         for number in np.flatnonzero(~np.asarray(row["is_right"], bool))
     ]
     shown = []
-    for confidence, row, number in sorted(wrong, key=lambda failure: -failure[0])[:num_shown]:
+    for confidence, row, number in sorted(wrong, key=lambda failure: -failure[0])[:NUM_SHOWN]:
         drive = names[row["sequence"]]
         drawn = deeppointmap.draw_scan_pairs(drive, row["band"], row["num_asked"], seed=seed)
         *_, pair = deeppointmap.read_scan_pairs(drive, drawn[: number + 1], seed=seed)
@@ -218,7 +210,7 @@ def worst_failures(
     return shown
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[cli.Row]) -> str:
     """Returns the table as Markdown: a row for each drive and distance."""
     by_case = {(row["sequence"], row["band"]): row for row in rows}
     lines = []
@@ -231,8 +223,8 @@ def table(rows: Sequence[Row]) -> str:
         recalls = (row[f"recall_{stage}"] for stage in ("descriptors", "verified"))
         errors = (length_text(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
         case = (sequence, BAND_NAMES[band], row["num_pairs"])
-        lines.append([*case, *recalls, interval, *errors, row["pair_s"], cell_text(auc, 3)])
-    return markdown(COLUMNS, lines)
+        lines.append([*case, *recalls, interval, *errors, row["pair_s"], cli.cell_text(auc, 3)])
+    return cli.markdown(COLUMNS, lines)
 
 
 def length_text(metres: float | None) -> str:

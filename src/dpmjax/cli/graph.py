@@ -19,10 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import io, pose_graph, viz
-from dpmjax.cli.command import check_least
-from dpmjax.cli.drives import report_notes
-from dpmjax.cli.run_folder import OutputOptions, open_run_folder, recording, write_metrics
+from dpmjax import cli, io, pose_graph, viz
 from dpmjax.sequences import InputError, Note
 
 NAME = "graph"
@@ -31,7 +28,7 @@ LET_GO = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OutputOptions):
+class Config(cli.OutputOptions):
     """Options of the run."""
 
     graph: Annotated[Positional[Path], arg(metavar="GRAPH", help_behavior_hint="required")] = Path()
@@ -45,27 +42,25 @@ class Config(OutputOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, iterations=1, outlier_chi2=1e-9)
+        cli.check_least(self, iterations=1, outlier_chi2=1e-9)
         if self.graph == Path():
             raise ValueError("give a pose graph, a file of g2o or TORO")
 
 
-def main(config: Config) -> dict[str, Any]:
-    """Optimises a pose graph and writes the results; returns the content of `metrics.json`."""
-    from dpmjax.io.g2o import read_g2o, write_g2o
-
+def main(config: Config) -> None:
+    """Optimises a pose graph and writes the results."""
     started = time.perf_counter()
-    graph = read_g2o(config.graph, nearest_psd=config.nearest_psd)
+    graph = io.read_g2o(config.graph, nearest_psd=config.nearest_psd)
     settings = pose_graph.PoseGraphConfig(outlier_chi2=config.outlier_chi2, max_iterations=config.iterations)
-    folder = open_run_folder(config, NAME)
-    with recording(folder):
-        notes = report_notes(notes_on_parts(config.graph, graph))
+    folder = cli.open_run_folder(config, NAME)
+    with cli.recording(folder):
+        notes = cli.report_notes(notes_on_parts(config.graph, graph))
         found = pose_graph.optimize_pose_graph(graph, settings)
         metrics = {"graph": config.graph.name, **graph_numbers(found), **notes, "wall_s": time.perf_counter() - started}
         poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
-        write_g2o(folder / "graph.g2o", found.graph)
+        io.write_g2o(folder / "graph.g2o", found.graph)
         io.write_tum(folder / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
-        write_metrics(folder, metrics)
+        cli.write_metrics(folder, metrics)
         title = f"{config.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
         tracks = [
             viz.Track(f"start, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
@@ -79,16 +74,13 @@ def main(config: Config) -> dict[str, Any]:
         if not found.is_converged:
             advice = "give more --iterations, or a kernel by --outlier-chi2"
             raise InputError(config.graph, f"no minimum after {found.iterations} iterations", advice)
-    return metrics
 
 
 def notes_on_parts(path: Path, graph: pose_graph.PoseGraph) -> tuple[Note, ...]:
     """Returns a note on a graph whose edges, those with any information, do not join all nodes."""
-    from dpmjax.pose_graph.graph import label_parts
-
     source, target, _, information = graph.edges
     has_any = information.any(axis=(1, 2))
-    sizes = np.bincount(label_parts(len(graph.poses), source[has_any], target[has_any]))
+    sizes = np.bincount(pose_graph.label_parts(len(graph.poses), source[has_any], target[has_any]))
     text = f"{path}: no edge joins its {len(sizes)} parts, the largest of {sizes.max()} nodes"
     return () if len(sizes) == 1 else (Note(f"{text}; each stays where its first or its fixed nodes are"),)
 

@@ -16,7 +16,6 @@ import resource
 import subprocess
 import sys
 import warnings
-from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -26,20 +25,16 @@ from dpmjax.compile_cache import cpu_model, enable_compile_cache
 NAME = "info"
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
 EXTRAS = {
-    "evosax": "baselines",
-    "jaxopt": "baselines",
-    "open3d": "baselines",
-    "gtsam": "gtsam",
-    "kiss_matcher": "kiss",
-    "laspy": "las",
-    "lazrs": "las",
-    "rosbags": "ros",
-    "kiss_icp": "peers",
-    "kiss_slam": "peers",
-    "rerun": "viewer",
-    "torch": "torch",
+    "baselines": ("evosax", "jaxopt", "open3d"),
+    "gtsam": ("gtsam",),
+    "kiss": ("kiss_matcher",),
+    "las": ("laspy", "lazrs"),
+    "ros": ("rosbags",),
+    "peers": ("kiss_icp", "kiss_slam"),
+    "viewer": ("rerun",),
+    "torch": ("torch",),
 }
-"""Extra of dpmjax for each package."""
+"""Packages of each extra of dpmjax."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +55,9 @@ def main(config: Config) -> None:
     print(f"cache      {enable_compile_cache() or 'off'} (compiled programs)")
     for name in shipped_models():
         print(f"weights    {name}: {read_card(name)}")
-    reasons = defaultdict(list)
-    for package, extra in EXTRAS.items():
-        reasons[extra].append(why_not_importable(package))
-    for extra, of_packages in reasons.items():
-        print(f"extra      {extra}: {'; '.join(filter(None, of_packages)) or 'installed'}")
+    for extra, packages in EXTRAS.items():
+        reasons = filter(None, map(why_not_importable, packages))
+        print(f"extra      {extra}: {'; '.join(reasons) or 'installed'}")
 
 
 def select_device(device: Literal["cpu", "gpu"] | None) -> None:
@@ -161,7 +154,7 @@ def why_not_importable(module: str) -> str | None:
             importlib.import_module(module)
     except ModuleNotFoundError as error:
         missing = error.name or module
-        package = f"dpmjax[{EXTRAS[missing]}]" if missing in EXTRAS else missing
+        package = next((f"dpmjax[{extra}]" for extra, packages in EXTRAS.items() if missing in packages), missing)
         return f"{missing} is not installed (pip install '{package}')"
     except Exception as error:
         lines = str(error).splitlines() or [type(error).__name__]

@@ -21,17 +21,10 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import io, slam, viz, weights
-from dpmjax.cli.command import StopFlag
-from dpmjax.cli.drives import DriveOptions, open_drive, report_notes
-from dpmjax.cli.result_files import HistoryFile, read_history
-from dpmjax.cli.run_folder import RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.cli.slam_files import open_map
-from dpmjax.cli.slam_numbers import localization_errors
+from dpmjax import cli, io, slam, viz, weights
 from dpmjax.sequences import InputError, LidarSequence
 
 NAME = "localize"
-TABLE = "localizations.csv"
 POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
 COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "seconds", *POSE, "reason"]
 # Largest distance from a keyframe at which a scan is expected in the map.
@@ -40,7 +33,7 @@ NUM_MAP_POINTS = 200_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(DriveOptions):
+class Config(cli.DriveOptions):
     """Options of the run."""
 
     map: Annotated[Positional[Path], arg(metavar="MAP", help_behavior_hint="required")] = Path()
@@ -75,23 +68,23 @@ class Case(NamedTuple):
     is_calibrated: bool
 
 
-def main(config: Config) -> list[dict[str, str]]:
+def main(config: Config) -> None:
     """Localises the remaining scans, and writes table, trajectory, numbers and picture."""
     model = weights.load_model(config.weights)
-    slam_map = open_map(config.map, slam.make_methods(model, weights=config.weights))
-    drive = open_drive(config.scans, config, config.sequence)
+    slam_map = cli.open_map(config.map, slam.make_methods(model, weights=config.weights))
+    drive = cli.open_drive(config.scans, config, config.sequence)
     case = Case(slam_map, drive, reference_of(config, slam_map, drive), model.config.calibration is not None)
-    folder = open_run_folder(config, NAME)
-    path = folder / TABLE
-    rows = read_history(path) if folder.is_resumed and path.exists() else []
+    folder = cli.open_run_folder(config, NAME)
+    path = folder / "localizations.csv"
+    rows = cli.read_history(path) if path.exists() else []
     results = slam.localize_each(model, slam_map, (drive.read_points(i) for i in range(len(rows), len(drive))))
     with (
-        recording(folder),
-        StopFlag() as stop,
-        HistoryFile(path, COLUMNS, keep_until=len(drive) if rows else None) as table,
+        cli.recording(folder),
+        cli.StopFlag() as stop,
+        cli.HistoryFile(path, COLUMNS, keep_until=len(drive)) as table,
         tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar,
     ):
-        notes = report_notes(drive.notes)
+        notes = cli.report_notes(drive.notes)
         clock = time.perf_counter()
         while len(rows) < len(drive) and not stop.is_requested:
             row = as_row(len(rows), case, next(results), time.perf_counter() - clock)
@@ -105,7 +98,6 @@ def main(config: Config) -> list[dict[str, str]]:
             found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
             raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
     print(f"results in {folder.path}")
-    return rows
 
 
 def reference_of(config: Config, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
@@ -141,7 +133,7 @@ def as_localization(row: dict[str, str]) -> slam.Localization:
 
 
 def write_found(
-    folder: RunFolder, config: Config, case: Case, rows: list[dict[str, str]], notes: dict[str, list[str]]
+    folder: cli.RunFolder, config: Config, case: Case, rows: list[dict[str, str]], notes: dict[str, list[str]]
 ) -> str:
     """Writes trajectory, metrics and picture; returns a summary."""
     results = [as_localization(row) for row in rows]
@@ -163,7 +155,7 @@ def write_found(
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
         **errors,
     }
-    write_metrics(folder, metrics, seed=config.seed)
+    cli.write_metrics(folder, metrics, seed=config.seed)
     found = f"{len(numbers)} of {len(rows)} scans found"
     title = f"{case.drive.name} in {config.map.name}: {found}"
     figure = viz.localization_figure(
@@ -184,7 +176,7 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[st
     reference, drive = case.T_reference_keyframe, case.drive.take(slice(0, len(results)))
     if reference is None or drive.T_world_lidar is None or not results:
         return {}, None
-    errors = localization_errors(results, case.slam_map, reference, drive.T_world_lidar)
+    errors = cli.localization_errors(results, case.slam_map, reference, drive.T_world_lidar)
     is_wrong = (~errors.is_right & drive.has_reference)[errors.is_found]
     num_inside, num_right = int((errors.keyframe_distance_m <= REACH_M).sum()), int(errors.is_right.sum())
     numbers: dict[str, Any] = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
@@ -196,12 +188,8 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[st
 
 def map_points(slam_map: slam.KeyframeMap) -> np.ndarray:
     """Returns surface points of the map, thinned at random."""
-    points = np.concatenate(
-        [
-            slam.keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3]
-            for row, T in enumerate(slam_map.T_world_keyframe)
-        ]
-    )
+    poses = enumerate(slam_map.T_world_keyframe)
+    points = np.concatenate([slam.keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3] for row, T in poses])
     return points[np.random.default_rng(0).permutation(len(points))[:NUM_MAP_POINTS]]
 
 

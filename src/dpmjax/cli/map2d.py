@@ -17,44 +17,32 @@ recording, scans half a metre or 20 degrees apart are registered, and all others
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import deepmapping, io, registration2d, simulation
+from dpmjax import cli, deepmapping, geometry, io, registration2d, simulation
 from dpmjax.cli import map2d_results as results
-from dpmjax.cli import run_folder
-from dpmjax.cli.command import StopFlag, check_least
-from dpmjax.cli.drives import report_notes
-from dpmjax.cli.recorded_fit import FitRecorder, draw_loss
-from dpmjax.cli.result_files import named_initial, write_poses
+from dpmjax.sequences import FloatArray, ScanSequence
 
-if TYPE_CHECKING:
-    from dpmjax.deepmapping import DeepMappingConfig, Fit, Fitted
-    from dpmjax.registration2d import RegisteredScans, RegistrationConfig
-    from dpmjax.sequences import ScanSequence
-
-Floats = NDArray[np.float64]
 # Computes numbers, by name, of the poses of all scans.
-Measure = Callable[[Floats], dict[str, float]]
+Measure = Callable[[FloatArray], dict[str, float]]
 
 NAME = "map2d"
-LOGGER = logging.getLogger("dpmjax.map2d")
 # Scans of a recording in metres that lie this far apart are registered.
 _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(run_folder.ScanOptions, run_folder.RunOptions):
+class Config(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
@@ -88,7 +76,7 @@ class Config(run_folder.ScanOptions, run_folder.RunOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
+        cli.check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
         if self.seconds is not None and not self.seconds > 0.0:
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
         if not self.ordered and self.init != "global":
@@ -101,12 +89,12 @@ def main(config: Config) -> dict[str, Any]:
     sequence = read_scans(config)
     start = starting_poses(config, sequence)
     measure = measures_of(config, sequence)
-    folder = run_folder.open_run_folder(config, NAME)
-    with run_folder.recording(folder), StopFlag() as stop:
+    folder = cli.open_run_folder(config, NAME)
+    with cli.recording(folder), cli.StopFlag() as stop:
         print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
-        notes = report_notes(sequence.notes)
+        notes = cli.report_notes(sequence.notes)
         seconds = math.inf if config.seconds is None else config.seconds
-        recorder = FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
+        recorder = cli.FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
         result = register_sequence(sequence, start, config, recorder, stop)
         metrics = {
             **map_numbers(sequence, result, config, measure),
@@ -115,29 +103,24 @@ def main(config: Config) -> dict[str, Any]:
             "is_interrupted": stop.is_requested,
         }
         # Numbers first, so that they are written even if a picture fails.
-        write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
-        run_folder.write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
-        registered = results.registered_scans(sequence, result)
+        cli.write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
+        cli.write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
+        registered = sequence.take(result.recording.chosen)
         limits = results.draw_map(folder, registered, result, metrics)
         if recorder.has_map:
             results.draw_occupancy(folder, registered, result, limits)
-        draw_loss(folder, sequence.unit)
+        cli.draw_loss(folder, sequence.unit)
         metrics["wall_s"] = time.perf_counter() - started
-        run_folder.write_metrics(folder, metrics, seed=config.seed)
-        summary = results.report(sequence.unit, metrics)
-        LOGGER.info(summary)
-        print(summary, f"results in {folder.path}", sep="\n")
+        cli.write_metrics(folder, metrics, seed=config.seed)
+        cli.tell(f"{results.report(sequence.unit, metrics)}\nresults in {folder.path}")
     return metrics
 
 
 def register_sequence(
-    sequence: ScanSequence, start: str | Floats, config: Config, recorder: FitRecorder, stop: StopFlag
-) -> RegisteredScans:
+    sequence: ScanSequence, start: str | FloatArray, config: Config, recorder: cli.FitRecorder, stop: cli.StopFlag
+) -> registration2d.RegisteredScans:
     """Registers the scans, with the recorder as engine of the fit, and prints each stage and a bar of all."""
     import jax
-    from tqdm import tqdm
-
-    from dpmjax.geometry import typical_range
 
     bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}]", desc="registration")
 
@@ -145,11 +128,11 @@ def register_sequence(
         if share == 0.0:
             bar.write(f"{stage} ...")
 
-    def engine(rows: NDArray[np.integer]) -> Callable[..., Fit]:
+    def engine(rows: np.ndarray) -> Callable[..., deepmapping.Fit]:
         if len(rows) < len(sequence):
             bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
-        return partial(recorder, measure=results.ate_of(fitted, typical_range(fitted.points, fitted.mask)))
+        return partial(recorder, measure=results.ate_of(fitted, geometry.typical_range(fitted.points, fitted.mask)))
 
     def advance(share: float) -> None:
         bar.update(share - bar.n)
@@ -166,9 +149,11 @@ def register_sequence(
         )
 
 
-def map_numbers(sequence: ScanSequence, result: RegisteredScans, config: Config, measure: Measure) -> dict[str, Any]:
+def map_numbers(
+    sequence: ScanSequence, result: registration2d.RegisteredScans, config: Config, measure: Measure
+) -> dict[str, Any]:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
-    registered = results.registered_scans(sequence, result)
+    registered = sequence.take(result.recording.chosen)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
 
     def title(name: str) -> str:
@@ -178,7 +163,7 @@ def map_numbers(sequence: ScanSequence, result: RegisteredScans, config: Config,
         "num_scans": len(sequence),
         "num_registered": len(registered),
         **results.before_and_after(registered, start, kept),
-        **named_initial(measure(result.recording.between(start))),
+        **cli.named_initial(measure(result.recording.between(start))),
         **measure(result.poses),
         "start": title(result.start),
         "kept": title(result.kept),
@@ -211,7 +196,7 @@ def measures_of(config: Config, sequence: ScanSequence) -> Measure:
     if times is None:
         raise ValueError(f"{sequence.name}: its scans have no times, which relations and a corrected log need")
 
-    def measure(poses: Floats) -> dict[str, float]:
+    def measure(poses: FloatArray) -> dict[str, float]:
         by_relations = {} if relations is None else results.relation_numbers(times, poses, relations)
         return by_relations | ({} if corrected is None else results.corrected_numbers(times, poses, corrected))
 
@@ -247,7 +232,7 @@ def starting_poses(config: Config, sequence: ScanSequence) -> Any:
     return io.read_planar_poses(init, len(sequence), sequence.unit)
 
 
-def registration_settings(config: Config, sequence: ScanSequence) -> RegistrationConfig:
+def registration_settings(config: Config, sequence: ScanSequence) -> registration2d.RegistrationConfig:
     """Returns the settings of the registration; scans in metres are chosen by their motion."""
     return registration2d.RegistrationConfig(
         is_ordered=config.ordered,
@@ -258,7 +243,7 @@ def registration_settings(config: Config, sequence: ScanSequence) -> Registratio
     )
 
 
-def fit_settings(config: Config, sequence: ScanSequence) -> DeepMappingConfig:
+def fit_settings(config: Config, sequence: ScanSequence) -> deepmapping.DeepMappingConfig:
     """Returns the preset, with the given number of steps."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
@@ -274,7 +259,7 @@ class Map2dRun(NamedTuple):
     """
 
     sequence: ScanSequence
-    fitted: Fitted
+    fitted: deepmapping.Fitted
     world: int | str | None
 
 
@@ -295,7 +280,7 @@ def read_map2d_run(path: Path) -> Map2dRun:
 
     from dpmjax.checkpoints import Checkpoints
 
-    config, trajectory = run_folder.load_config(run_folder.find_run(NAME, path), Config), path / "trajectory.npy"
+    config, trajectory = cli.load_config(cli.find_run(NAME, path), Config), path / "trajectory.npy"
     if not trajectory.is_file():
         raise ValueError(f"{path} holds no trajectory.npy: let the run end, or resume it")
     if not config.ordered:
@@ -311,7 +296,7 @@ def read_map2d_run(path: Path) -> Map2dRun:
     )
     problem = deepmapping.mapping_problem(settings, data)
     like = deepmapping.init(problem, data, key=jax.random.key(0))
-    state = Checkpoints((path / run_folder.CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
+    state = Checkpoints((path / cli.CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
     if state is None:
         raise ValueError(f"{path} holds no checkpoint that can be read")
     poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)

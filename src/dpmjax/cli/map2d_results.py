@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dpmjax import deepmapping, metrics, registration2d, viz
-from dpmjax.cli.result_files import named_initial
-from dpmjax.cli.run_folder import RunFolder
-from dpmjax.sequences import Relations, ScanSequence
+from dpmjax import cli, deepmapping, geometry, metrics, registration2d, viz
+from dpmjax.sequences import FloatArray, Relations, ScanSequence
 
 if TYPE_CHECKING:
-    from dpmjax.registration2d import RegisteredScans
     from dpmjax.types import ScanSet
-
-Floats = NDArray[np.float64]
 
 UNITS = ("m", "deg")
 # Largest number of printed spans of uncertain scans.
@@ -28,7 +21,7 @@ _NUM_SPANS = 8
 _MIN_COMMON = 10
 
 
-def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
+def planar_errors(sequence: ScanSequence, poses: FloatArray) -> dict[str, float]:
     """Computes ATE, the largest error of a scan after the same alignment, and point distance, in the unit of the scans.
 
     Args:
@@ -38,12 +31,11 @@ def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
     Returns:
         The numbers by name; empty without a reference.
     """
-    from dpmjax.geometry import se2
-
     reference = sequence.reference_poses
     if reference is None:
         return {}
-    distance = metrics.point_distance(sequence.points, sequence.mask, se2.to_matrix(poses), se2.to_matrix(reference))
+    matrices = geometry.se2.to_matrix(poses), geometry.se2.to_matrix(reference)
+    distance = metrics.point_distance(sequence.points, sequence.mask, *matrices)
     T_reference_world = np.asarray(metrics.align_rigid(poses[:, :2], reference[:, :2]))
     off = poses[:, :2] @ T_reference_world[:2, :2].T + T_reference_world[:2, 2] - reference[:, :2]
     return {
@@ -53,7 +45,7 @@ def planar_errors(sequence: ScanSequence, poses: Floats) -> dict[str, float]:
     }
 
 
-def ate_of(sequence: ScanSequence, unit: float) -> Callable[[Floats], float]:
+def ate_of(sequence: ScanSequence, unit: float) -> Callable[[FloatArray], float]:
     """Returns a function to the ATE of poses whose lengths are multiples of `unit`; NaN without a reference."""
     reference = sequence.reference_poses
     if reference is None:
@@ -61,7 +53,7 @@ def ate_of(sequence: ScanSequence, unit: float) -> Callable[[Floats], float]:
     return lambda poses: float(metrics.absolute_trajectory_error(unit * poses[:, :2], reference[:, :2]))
 
 
-def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> dict[str, Any]:
+def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArray) -> dict[str, Any]:
     """Returns errors of the kept and of the initial poses; `success` is None without a reference."""
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
@@ -72,13 +64,13 @@ def before_and_after(sequence: ScanSequence, start: Floats, poses: Floats) -> di
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
     return {
         **after,
-        **named_initial(before),
+        **cli.named_initial(before),
         f"success_threshold_{unit}": threshold,
         "success": after[f"ate_{unit}"] < threshold,
     }
 
 
-def relation_numbers(times: Floats, poses: Floats, relations: Relations) -> dict[str, float]:
+def relation_numbers(times: FloatArray, poses: FloatArray, relations: Relations) -> dict[str, float]:
     """Computes the mean errors of the poses of all scans against hand-checked relations."""
     found = metrics.relation_errors(relations, times, poses)
     return {
@@ -88,7 +80,7 @@ def relation_numbers(times: Floats, poses: Floats, relations: Relations) -> dict
     }
 
 
-def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence) -> dict[str, float]:
+def corrected_numbers(times: FloatArray, poses: FloatArray, corrected: ScanSequence) -> dict[str, float]:
     """Computes the ATE at the common scans of a corrected log of the same drive, and errors of its relations.
 
     The relations are the relative poses of successive scans of the corrected log.
@@ -104,8 +96,6 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence) -> 
     Raises:
         ValueError: the corrected log has no poses with times, or few scans of the same times.
     """
-    from dpmjax.geometry import se2
-
     if corrected.reference_poses is None or corrected.times is None:
         raise ValueError(f"{corrected.name}: has no corrected poses with times")
     _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)
@@ -115,7 +105,7 @@ def corrected_numbers(times: Floats, poses: Floats, corrected: ScanSequence) -> 
         )
     reference, at = corrected.reference_poses[theirs], times[mine]
     steps = metrics.relation_errors(
-        Relations(at[:-1], at[1:], se2.relative(reference[:-1], reference[1:])), at, poses[mine]
+        Relations(at[:-1], at[1:], geometry.se2.relative(reference[:-1], reference[1:])), at, poses[mine]
     )
     return {
         "ate_corrected_m": float(metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2])),
@@ -174,36 +164,30 @@ def scan_set_of(sequence: ScanSequence) -> ScanSet:
     return ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask))
 
 
-def registered_scans(sequence: ScanSequence, result: RegisteredScans) -> ScanSequence:
-    """Returns the scans that were registered."""
-    chosen = result.recording.chosen
-    return sequence if len(chosen) == len(sequence) else sequence.take(chosen)
-
-
 def draw_map(
-    folder: RunFolder, registered: ScanSequence, result: RegisteredScans, numbers: Mapping[str, Any]
+    folder: cli.RunFolder, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
 ) -> viz.Limits:
     """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
-    scans, unit = scan_set_of(registered), registered.unit
+    scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
     panels = []
     titles = dict(zip(result.candidates, numbers["candidates"], strict=True))
-    for name in dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept)):
-        if name not in result.candidates:
-            continue
-        title, found = titles[name], numbers["candidates"][titles[name]]
+    shown = dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept))
+    for name in [name for name in shown if name in result.candidates]:
+        title, found, is_kept = titles[name], numbers["candidates"][titles[name]], name == result.kept
         ate, distance = found.get(f"ate_{unit}"), found.get(f"point_distance_{unit}")
-        title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "")
-        panels.append(viz.Panel(title, scans, result.candidates[name].poses, ate=ate, point_distance=distance))
-    if registered.reference_poses is None:
-        panels = [replace(panel, is_reference=panel.title.endswith(" (kept)")) for panel in panels]
-    else:
-        panels.append(viz.Panel("Reference", scans, registered.reference_poses, is_reference=True))
+        title = title[0].upper() + title[1:] + (" (kept)" if is_kept else "")
+        is_anchor = is_kept and reference is None
+        panels.append(viz.Panel(title, scans, result.candidates[name].poses, ate, distance, is_anchor))
+    if reference is not None:
+        panels.append(viz.Panel("Reference", scans, reference, is_reference=True))
     figure = viz.registered_scans_figure(panels, unit)
     viz.save_figure(figure, folder / "map.png")
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 
 
-def draw_occupancy(folder: RunFolder, registered: ScanSequence, result: RegisteredScans, limits: viz.Limits) -> None:
+def draw_occupancy(
+    folder: cli.RunFolder, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
+) -> None:
     """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
     picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
     kept, reference = result.candidates[result.kept].poses, registered.reference_poses

@@ -24,60 +24,52 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import saved_maps, slam, viz, weights
-from dpmjax.cli import slam_files as files
-from dpmjax.cli.command import progress_bar
-from dpmjax.cli.result_files import write_table
-from dpmjax.cli.run_folder import ModelOptions, OutputOptions, RunFolder, open_run_folder, recording, write_metrics
-from dpmjax.cli.slam_numbers import counted
+from dpmjax import cli, io, saved_maps, slam, viz, weights
 
 NAME = "merge"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ModelOptions, OutputOptions):
+class Config(cli.ModelOptions, cli.OutputOptions):
     """Options of the run."""
 
     maps: Annotated[Positional[tuple[Path, ...]], arg(metavar="MAP MAP ...", help_behavior_hint="required")] = ()
     """Two or more maps, files of dpmjax.save_map."""
 
 
-def main(config: Config) -> dict[str, Any]:
-    """Merges maps and writes the results; returns the content of `metrics.json`."""
+def main(config: Config) -> None:
+    """Merges maps and writes the results."""
     started = time.perf_counter()
     if len(config.maps) < 2:
         raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
     methods = slam.make_methods(weights.load_model(config.weights), weights=config.weights)
-    maps = [files.open_map(path, methods) for path in config.maps]
-    folder = open_run_folder(config, NAME)
-    with recording(folder):
-        with progress_bar("loops between maps", " keyframes") as on_keyframe:
+    maps = [cli.open_map(path, methods) for path in config.maps]
+    folder = cli.open_run_folder(config, NAME)
+    with cli.recording(folder):
+        with cli.progress_bar("loops between maps", " keyframes") as on_keyframe:
             merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
         write_maps(folder, maps, merged)
         metrics = {"weights": config.weights, **merge_numbers(config.maps, maps, merged)}
-        write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started})
+        cli.write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started})
         parts = len(merged.maps)
         title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
         panels = [panel_of(config.maps, merged, part) for part in range(parts)]
         viz.save_figure(viz.agents_figure(title, panels), folder / "map.png")
         print(merge_text(metrics), f"results in {folder.path}", sep="\n")
-    return metrics
 
 
-def write_maps(folder: RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
+def write_maps(folder: cli.RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
-    from dpmjax.io.g2o import write_g2o
-
     for part, slam_map in enumerate(merged.maps, start=1):
         saved_maps.save_map(folder / map_name(part, len(merged.maps)), slam_map)
-    write_g2o(folder / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
+    io.write_g2o(folder / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
     ends = [
         {"map": number, "scan": keyframe.scan}
         for number, each in enumerate(maps, start=1)
         for keyframe in each.keyframes
     ]
-    columns = ("map", "scan", "other_map", "other_scan", *files.LOOP_CELLS)
-    write_table(folder / "loops.csv", columns, files.loop_rows(merged.loops, ends))
+    columns = ("map", "scan", "other_map", "other_scan", *cli.LOOP_CELLS)
+    cli.write_table(folder / "loops.csv", columns, cli.loop_rows(merged.loops, ends))
 
 
 def map_name(part: int, num_parts: int) -> str:
@@ -103,7 +95,7 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
     return {
         "num_maps": len(maps),
         "num_parts": len(parts),
-        "num_loops": len(files.accepted_ends(merged.loops)),
+        "num_loops": len(cli.accepted_ends(merged.loops)),
         "num_candidates": len(merged.loops),
         "num_keyframes": len(merged.joined.slam_map),
         "parts": parts,
@@ -111,14 +103,14 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
             {"map": number, "file": short_name(path), "num_keyframes": len(each)}
             for number, (path, each) in enumerate(zip(paths, maps, strict=True), start=1)
         ],
-        "loops_between": [{"maps": pair, "num_loops": number} for pair, number in files.count_meetings(merged.joined)],
+        "loops_between": [{"maps": pair, "num_loops": number} for pair, number in cli.count_meetings(merged.joined)],
     }
 
 
 def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.AgentPanel:
     """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
     members = [number for number, component in enumerate(merged.component) if component == part]
-    ends = files.accepted_ends(merged.loops)
+    ends = cli.accepted_ends(merged.loops)
     ends = ends[np.isin(merged.joined.map_of_keyframe[ends[:, 0]], members)]
     is_joined = len(members) > 1
     text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
@@ -131,8 +123,8 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
-    cloud = files.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
-    return files.map_track(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
+    cloud = cli.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
+    return cli.map_track(f"{short_name(path)}, {cli.counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 
 def merge_text(metrics: dict[str, Any]) -> str:
@@ -142,6 +134,6 @@ def merge_text(metrics: dict[str, Any]) -> str:
     for part in metrics["parts"]:
         members = ", ".join(names[number] for number in part["maps"])
         text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
-        lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
-    loops, candidates = counted(metrics["num_loops"], "loop"), counted(metrics["num_candidates"], "candidate")
+        lines.append(f"{members}: {text}, {cli.counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
+    loops, candidates = cli.counted(metrics["num_loops"], "loop"), cli.counted(metrics["num_candidates"], "candidate")
     return "\n".join([*lines, f"{loops} between maps, of {candidates}"])

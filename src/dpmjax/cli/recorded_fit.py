@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from dpmjax.cli.result_files import HistoryFile, read_history
-from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
+from dpmjax import cli
 
 if TYPE_CHECKING:
     import jax
@@ -38,7 +37,7 @@ class FitRecorder:
         has_map: True where M-Net has been trained.
     """
 
-    def __init__(self, folder: RunFolder, length: str, *, stop: Callable[[float], bool]) -> None:
+    def __init__(self, folder: cli.RunFolder, length: str, *, stop: Callable[[float], bool]) -> None:
         """Makes an engine for one fit.
 
         Args:
@@ -62,11 +61,9 @@ class FitRecorder:
         from dpmjax.deepmapping import init, resume
 
         folder, state = self._folder, init(problem, data, key=key)
-        checkpoints = Checkpoints(Path(folder.path) / CHECKPOINTS)
-        if folder.is_resumed:
-            state = checkpoints.restore_latest(state, fallback=state)
+        checkpoints = Checkpoints(Path(folder.path) / cli.CHECKPOINTS)
+        state = checkpoints.restore_latest(state, fallback=state)
         columns = (*_COLUMNS, f"ate_{self._length}")
-        keep_until = int(state.step) if folder.is_resumed else None
         bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
         saved_at = time.perf_counter()
 
@@ -78,8 +75,8 @@ class FitRecorder:
                 checkpoints.save(int(progress.state.step), progress.state)
                 saved_at = time.perf_counter()
 
-        with bar, HistoryFile(folder / HISTORY, columns, keep_until=keep_until) as history:
-            earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
+        with bar, cli.HistoryFile(folder / cli.HISTORY, columns, keep_until=int(state.step)) as history:
+            earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
             self.run_s = earlier_s
             done = resume(problem, state, data, on_report=record, stop=lambda: self._stop(self.run_s))
         checkpoints.save(int(done.state.step), done.state)
@@ -92,7 +89,7 @@ class FitRecorder:
         """Returns seconds and steps under the names of `metrics.json`."""
         return {"fit_s": self.run_s, "compile_s": self.compile_s, "steps": self.steps}
 
-    def _write(self, progress: Progress, ate: float, history: HistoryFile, bar: tqdm) -> None:
+    def _write(self, progress: Progress, ate: float, history: cli.HistoryFile, bar: tqdm) -> None:
         """Adds one call of the step to the table and to the progress bar."""
         report, phase, step = progress.report, progress.phase.name, int(progress.state.step)
         losses = {name: float(np.mean(term)) for name, term in report.terms._asdict().items()}
@@ -110,14 +107,14 @@ def show_progress(bar: tqdm, text: str, done: float, run_s: float) -> None:
     bar.update(done - bar.n)
 
 
-def draw_loss(folder: RunFolder, unit: str) -> None:
+def draw_loss(folder: cli.RunFolder, unit: str) -> None:
     """Draws loss.png: loss and error of the fit over its run time."""
     from dpmjax import viz
 
-    rows = read_history(folder / HISTORY)
+    rows = cli.read_history(folder / cli.HISTORY)
     if rows:
         seconds, loss, ate = (
             np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
         )
-        history = viz.History(seconds, loss, [row["phase"] for row in rows], ate)
-        viz.save_figure(viz.history_figure(history, unit), folder / "loss.png")
+        figure = viz.history_figure(seconds, loss, [row["phase"] for row in rows], ate, unit)
+        viz.save_figure(figure, folder / "loss.png")

@@ -19,10 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import deeppointmap, io, viz, weights
-from dpmjax.cli.command import check_least
-from dpmjax.cli.drives import report_notes
-from dpmjax.cli.run_folder import ModelOptions, OutputOptions, RunFolder, open_run_folder, recording, write_metrics
+from dpmjax import cli, deeppointmap, io, viz, weights
 
 NAME = "register"
 # Least calibrated probability of a certain motion.
@@ -31,7 +28,7 @@ SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ModelOptions, OutputOptions):
+class Config(cli.ModelOptions, cli.OutputOptions):
     """Options of the run."""
 
     source: Annotated[Positional[Path], arg(metavar="A")]
@@ -45,20 +42,20 @@ class Config(ModelOptions, OutputOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, columns=3)
+        cli.check_least(self, columns=3)
 
 
-def main(config: Config) -> dict[str, Any]:
-    """Registers two scans and writes the results; returns the content of `metrics.json`."""
+def main(config: Config) -> None:
+    """Registers two scans and writes the results."""
     started = time.perf_counter()
     paths = (config.source, config.target)
     source, target = (io.read_lidar_file(path, bin_columns=config.columns) for path in paths)
     scans = zip(paths, (source, target), strict=True)
     notes = [note for path, points in scans for note in io.scan_notes(path, points, bin_columns=config.columns)]
     model = weights.load_model(config.weights)
-    folder = open_run_folder(config, NAME)
-    with recording(folder):
-        noted = report_notes(notes)
+    folder = cli.open_run_folder(config, NAME)
+    with cli.recording(folder):
+        noted = cli.report_notes(notes)
         clock = time.perf_counter()
         found = deeppointmap.register(model, source, target, refine=config.refine)
         T = np.asarray(found.T_target_source, np.float64)
@@ -78,13 +75,12 @@ def main(config: Config) -> dict[str, Any]:
         }
         write_motion(folder, T, source, target)
         metrics["wall_s"] = time.perf_counter() - started
-        write_metrics(folder, metrics)
+        cli.write_metrics(folder, metrics)
         title = f"{config.source.name} (blue), {config.target.name} (orange)"
         motions = {"as measured": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
         figure = viz.registered_pairs_figure([viz.RegisteredPair(title, source, target, motions)])
         viz.save_figure(figure, folder / "registration.png")
         print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")
-    return metrics
 
 
 def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
@@ -99,7 +95,7 @@ def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
     }
 
 
-def write_motion(folder: RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
+def write_motion(folder: cli.RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
     """Writes T_target_source.txt and aligned.ply."""
     rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
     io.write_atomically(folder / "T_target_source.txt", "\n".join(rows) + "\n")

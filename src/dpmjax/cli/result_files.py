@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import json
 import math
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
@@ -129,13 +128,9 @@ class HistoryFile:
 
     def __init__(self, path: Path, columns: Sequence[str], *, keep_until: int | None = None) -> None:
         earlier = read_history(path) if keep_until is not None and path.exists() else []
-        unfinished = path.with_name(f".{path.name}.tmp")
-        self._file = unfinished.open("w", newline="", encoding="utf-8")
+        write_table(path, columns, [row for row in earlier if int(row[columns[0]]) <= (keep_until or 0)])
+        self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
-        self._writer.writeheader()
-        self._writer.writerows(row for row in earlier if int(row[columns[0]]) <= (keep_until or 0))
-        self._file.flush()
-        os.replace(unfinished, path)
 
     def append(self, **row: object) -> None:
         """Adds a row; a column that is not given stays empty."""

@@ -276,6 +276,12 @@ def recording(folder: RunFolder) -> Iterator[None]:
         handler.close()
 
 
+def tell(text: str) -> None:
+    """Prints a text, and writes it to the log of the run."""
+    print(text, flush=True)
+    logging.getLogger("dpmjax").info("%s", text)
+
+
 def _check_same_options(config: Any, path: Path) -> None:
     stored, now = load_json(path / CONFIG), as_json(config)
     for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - getattr(config, "may_change", frozenset())):

@@ -16,9 +16,9 @@ and writes all files too.
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -26,21 +26,16 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import io, slam, viz, weights
+from dpmjax import cli, io, slam, viz, weights
 from dpmjax.cli import slam_files as files
 from dpmjax.cli import slam_numbers as numbers
-from dpmjax.cli.command import StopFlag, progress_bar
-from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, report_notes
-from dpmjax.cli.info import require_importable
-from dpmjax.cli.run_folder import RunFolder, find_run, open_run_folder, recording, write_metrics
 from dpmjax.sequences import InputError, LidarSequence, require
 
 NAME = "slam"
-LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(DriveOptions):
+class Config(cli.DriveOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
@@ -70,64 +65,64 @@ class Config(DriveOptions):
         self.check_data(self.data, self.sequence)
 
 
-def main(config: Config) -> dict[str, Any]:
-    """Maps a drive and writes the results; returns the content of `metrics.json`."""
-    from dpmjax.cli.slam_run import find_beginning, live_viewer, run_scans
+def main(config: Config) -> None:
+    """Maps a drive and writes the results."""
+    from dpmjax.cli.slam_run import find_beginning, run_scans
 
     if config.visualize:
-        require_importable("rerun", "-v")
+        cli.require_importable("rerun", "-v")
     started = time.perf_counter()
     methods = slam_methods(config)
     # A map of other weights is refused here, before the scans are opened.
     start = slam.init_slam(None if config.map is None else files.open_map(config.map, methods))
-    sequence = open_drive(config.data, config, config.sequence)
-    reader = ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
-    beginning = find_beginning(find_run(NAME, config.output) if config.resume else None, methods, start)
+    sequence = cli.open_drive(config.data, config, config.sequence)
+    reader = cli.ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
+    beginning = find_beginning(cli.find_run(NAME, config.output) if config.resume else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{numbers.counted(num_done, 'scan')} done, {len(sequence)} wanted"
     require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
-    folder = open_run_folder(config, NAME)
-    with recording(folder), StopFlag() as stop:
+    folder = cli.open_run_folder(config, NAME)
+    with cli.recording(folder), cli.StopFlag() as stop:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""
-        tell(f"{sequence.name}: {numbers.counted(len(sequence), 'scan')}{done}")
-        notes = report_notes(sequence.notes)
-        with live_viewer(folder, sequence.name, is_on=config.visualize) as on_scan:
-            run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, on_scan)
+        cli.tell(f"{sequence.name}: {numbers.counted(len(sequence), 'scan')}{done}")
+        notes = cli.report_notes(sequence.notes)
+        viewer = viz.LiveViewer(sequence.name, folder / "slam.rrd") if config.visualize else None
+        with nullcontext() if viewer is None else closing(viewer):
+            run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, viewer)
         result = slam.finish_slam(run.state, run.reports, methods.config)
-        drive = MappedDrive(sequence, start.front_end.num_scans, len(start.slam_map))
-        metrics = write_results(folder, config, drive, run, result)
+        drive = MappedDrive(sequence.take(slice(0, len(result.reports))), start, result)
+        metrics = write_results(folder, config, drive, run)
         if config.refine and run.failure is None and not stop.is_requested:
-            metrics |= refine_trajectory(folder, config, drive, result, lambda: stop.is_requested)
+            metrics |= refine_trajectory(folder, config, drive, lambda: stop.is_requested)
         metrics["is_interrupted"] = stop.is_requested or run.failure is not None
         metrics |= {**notes, "status": numbers.run_status(metrics), "wall_s": time.perf_counter() - started}
-        write_metrics(folder, metrics, seed=config.seed)
-        tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
+        cli.write_metrics(folder, metrics, seed=config.seed)
+        cli.tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
             raise run.failure
         failed = numbers.why_failed(metrics["scan_statuses"])
         if failed is not None and not stop.is_requested:
             raise InputError(sequence.name, failed, "check that the scans are 3-D, in metres, and follow each other")
-    return metrics
 
 
 class MappedDrive(NamedTuple):
-    """The scans of a run, and the first scan and keyframe of the run in a map.
+    """The scans of a run and their poses.
 
     Attributes:
-        sequence: the scans.
-        first_scan: number of the first scan in the map; 0 for a new one.
-        num_keyframes_before: number of keyframes of the extended map.
+        sequence: the scans that were placed.
+        start: state before the first scan, with the map that the run extends.
+        result: trajectory and map.
     """
 
     sequence: LidarSequence
-    first_scan: int
-    num_keyframes_before: int
+    start: slam.SlamState
+    result: slam.SlamResult
 
-    def read_keyframe(self, slam_map: slam.KeyframeMap, row: int) -> np.ndarray:
+    def read_keyframe(self, row: int) -> np.ndarray:
         """Reads the points of a keyframe; those of the extended map are the points of its surface."""
-        if row < self.num_keyframes_before:
-            return slam.keyframe_points(slam_map, row)
-        return self.sequence.read_points(slam_map.keyframes[row].scan - self.first_scan)
+        if row < len(self.start.slam_map):
+            return slam.keyframe_points(self.result.map, row)
+        return self.sequence.read_points(self.result.map.keyframes[row].scan - self.start.front_end.num_scans)
 
 
 def slam_methods(config: Config) -> slam.SlamMethods:
@@ -140,11 +135,9 @@ def slam_methods(config: Config) -> slam.SlamMethods:
     return slam.make_methods(weights.load_model(config.weights), settings, weights=config.weights)
 
 
-def write_results(
-    folder: RunFolder, config: Config, drive: MappedDrive, run: numbers.SlamRun, result: slam.SlamResult
-) -> dict[str, Any]:
+def write_results(folder: cli.RunFolder, config: Config, drive: MappedDrive, run: numbers.SlamRun) -> dict[str, Any]:
     """Writes all files but metrics.json, and returns its numbers; pictures come last."""
-    sequence, slam_map = drive.sequence.take(slice(0, len(result.reports))), result.map
+    sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
     metrics = {"weights": config.weights, **numbers.run_numbers(run, result, sequence)}
     if not result.reports:
         return metrics
@@ -155,35 +148,23 @@ def write_results(
     files.write_scans(folder / "scans.csv", result.reports, result.keyframes, sequence.sources)
     if len(slam_map):
         metrics |= files.write_map_file(folder / "map.npz", slam_map)
-    write_metrics(folder, metrics, seed=config.seed)  # numbers first, even if a picture fails
-    cloud = files.gather_map(slam_map.T_world_keyframe, lambda row: drive.read_keyframe(slam_map, row))
+    cli.write_metrics(folder, metrics, seed=config.seed)  # numbers first, even if a picture fails
+    cloud = files.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
     io.write_ply(folder / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
-    files.draw_pictures(folder.path, sequence, result, cloud, drive.num_keyframes_before)
+    files.draw_pictures(folder.path, sequence, result, cloud, len(drive.start.slam_map))
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
 
 
 def refine_trajectory(
-    folder: RunFolder, config: Config, drive: MappedDrive, result: slam.SlamResult, is_stopped: Callable[[], bool]
+    folder: cli.RunFolder, config: Config, drive: MappedDrive, is_stopped: Callable[[], bool]
 ) -> dict[str, Any]:
     """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
     import jax
 
-    sequence = drive.sequence.take(slice(0, len(result.reports)))
-    with progress_bar("refine", " windows of keyframes") as on_window:
-        refined = slam.refine_keyframes(
-            result.map,
-            lambda row: drive.read_keyframe(result.map, row),
-            key=jax.random.key(config.seed),
-            on_window=on_window,
-            stop=is_stopped,
-        )
+    result, key = drive.result, jax.random.key(config.seed)
+    with cli.progress_bar("refine", " windows of keyframes") as on_window:
+        refined = slam.refine_keyframes(result.map, drive.read_keyframe, key=key, on_window=on_window, stop=is_stopped)
     T = slam.place_scans(refined.slam_map.T_world_keyframe, result.reports)
-    files.write_trajectory(folder.path, T, sequence.times, "refined")
+    files.write_trajectory(folder.path, T, drive.sequence.times, "refined")
     windows = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
-    return {**windows, **numbers.trajectory_errors(T, sequence.T_world_lidar, "_refined")}
-
-
-def tell(text: str) -> None:
-    """Prints a text and writes it to the log."""
-    print(text, flush=True)
-    LOGGER.info("%s", text)
+    return {**windows, **numbers.trajectory_errors(T, drive.sequence.T_world_lidar, "_refined")}

@@ -46,14 +46,10 @@ def write_trajectory(
 
 def write_graph(folder: Path, result: slam.SlamResult) -> None:
     """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
-    from dpmjax.io.g2o import write_g2o
-
     if result.graph is not None:
-        write_g2o(folder / "graph.g2o", result.graph)
-    poses = result.map.T_world_keyframe
-    io.write_tum(
-        folder / "keyframes.txt", poses, times=result.keyframes, frame="T_map_keyframe; stamps are numbers of scans"
-    )
+        io.write_g2o(folder / "graph.g2o", result.graph)
+    poses, frame = result.map.T_world_keyframe, "T_map_keyframe; stamps are numbers of scans"
+    io.write_tum(folder / "keyframes.txt", poses, times=result.keyframes, frame=frame)
 
 
 def write_loops(path: Path, loops: Sequence[slam.Loop], keyframes: Sequence[int] | np.ndarray) -> None:
@@ -213,8 +209,13 @@ def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
     Raises:
         ValueError: no such file, no map, or a map of other weights.
     """
-    slam_map, origin = saved_maps.load_map(path), methods.origin
-    if slam_map.origin is not None and slam_map.origin.fingerprint != origin.fingerprint:
-        found = f"made with weights {slam_map.origin}, these are {origin}"
-        raise ValueError(f"{path}: {found}; name the weights that made it with --weights")
+    slam_map = saved_maps.load_map(path)
+    require_same_weights(path, slam_map, methods, "name the weights that made it with --weights")
     return slam_map
+
+
+def require_same_weights(path: Path, slam_map: slam.KeyframeMap, methods: slam.SlamMethods, advice: str) -> None:
+    """Raises a ValueError with the advice where other weights than those of the methods made a map."""
+    made_by, given = slam_map.origin, methods.origin
+    if made_by is not None and made_by.fingerprint != given.fingerprint:
+        raise ValueError(f"{path}: made with weights {made_by}, these are {given}; {advice}")

@@ -12,9 +12,6 @@ import numpy as np
 from dpmjax import geometry, metrics, slam
 from dpmjax.sequences import LidarSequence
 
-MAX_ERROR_M, MAX_ERROR_DEG = 2.0, 5.0
-"""Largest errors of a right localisation."""
-
 MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
 """Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres."""
 
@@ -84,14 +81,13 @@ def localization_errors(
     """
     is_found = np.array([one.is_in_map for one in found], bool)
     is_right, errors = np.zeros(len(found), bool), np.full((2, len(found)), np.nan)
-    if is_found.any():
-        keyframes = np.array([one.keyframe for one in found if one.is_in_map], np.int64)
-        T_world_scan = np.array([one.T_world_scan for one in found if one.is_in_map])
-        T = geometry.rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
-        true = geometry.rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
-        recall = metrics.registration_recall(T, true, max_translation_m=MAX_ERROR_M, max_rotation_deg=MAX_ERROR_DEG)
-        is_right[is_found] = recall.is_right
-        errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg
+    keyframes = np.array([one.keyframe for one in found if one.is_in_map], np.int64)
+    T_world_scan = np.reshape([one.T_world_scan for one in found if one.is_in_map], (-1, 4, 4))
+    T = geometry.rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
+    true = geometry.rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
+    recall = metrics.registration_recall(T, true)
+    is_right[is_found] = recall.is_right
+    errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg
     apart = np.linalg.norm(T_reference_scan[:, None, :3, 3] - T_reference_keyframe[None, :, :3, 3], axis=2)
     translation_m, rotation_deg = errors
     return LocalizationErrors(is_found, is_right, translation_m, rotation_deg, apart.min(axis=1))
@@ -211,10 +207,8 @@ def run_status(numbers: Mapping[str, Any]) -> str:
 
 def count_parts(slam_map: slam.KeyframeMap) -> int:
     """Returns the number of parts of a map that measured motions join."""
-    from dpmjax.slam.keyframe_map import connected_parts
-
     measured = [edge for edge in slam_map.edges if edge.kind != "guess"]
-    return len(set(connected_parts(len(slam_map), measured).tolist()))
+    return len(set(slam.connected_parts(len(slam_map), measured).tolist()))
 
 
 def summary(numbers: Mapping[str, Any]) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import slam, viz
-from dpmjax.cli.drives import ScanReader
-from dpmjax.cli.run_folder import RunFolder
-from dpmjax.cli.slam_files import accepted_ends, write_scans, write_trajectory
-from dpmjax.cli.slam_numbers import SlamRun
+from dpmjax import cli, slam, viz
 from dpmjax.saved_maps import RunState, load_state, save_state
 from dpmjax.sequences import LidarSequence
 
@@ -93,15 +89,13 @@ def find_beginning(earlier: Path | None, methods: slam.SlamMethods, start: slam.
     if path is None or not path.is_file():
         return RunState(start, ())
     found = load_state(path)
-    made_by, given = found.state.slam_map.origin, methods.origin
-    if made_by is not None and made_by.fingerprint != given.fingerprint:
-        raise ValueError(f"{path}: made with weights {made_by}, these are {given}; give those, or start again")
+    cli.require_same_weights(path, found.state.slam_map, methods, "give those, or start again")
     return found
 
 
 def map_drive(
-    folder: RunFolder, sequence: LidarSequence, methods: slam.SlamMethods, is_stopped: Callable[[], bool]
-) -> tuple[SlamRun, slam.SlamResult]:
+    folder: cli.RunFolder, sequence: LidarSequence, methods: slam.SlamMethods, is_stopped: Callable[[], bool]
+) -> tuple[cli.SlamRun, slam.SlamResult]:
     """Maps a drive from its beginning, or from the state in its folder.
 
     Args:
@@ -117,20 +111,20 @@ def map_drive(
         InputError: a scan on the way that cannot be read.
     """
     beginning = find_beginning(folder.path if folder.is_resumed else None, methods, slam.init_slam())
-    run = run_scans(folder, ScanReader(sequence), methods, beginning, is_stopped)
+    run = run_scans(folder, cli.ScanReader(sequence), methods, beginning, is_stopped)
     if run.failure is not None:
         raise run.failure
     return run, slam.finish_slam(run.state, run.reports, methods.config)
 
 
 def run_scans(
-    folder: RunFolder,
-    reader: ScanReader,
+    folder: cli.RunFolder,
+    reader: cli.ScanReader,
     methods: slam.SlamMethods,
     beginning: RunState,
     is_stopped: Callable[[], bool],
-    on_scan: Callable[[Any, slam.SlamState, slam.ScanReport], None] | None = None,
-) -> SlamRun:
+    viewer: viz.LiveViewer | None = None,
+) -> cli.SlamRun:
     """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
 
     Args:
@@ -139,7 +133,7 @@ def run_scans(
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
         is_stopped: True to end before the next scan.
-        on_scan: called with each scan, the state after it and its report.
+        viewer: shows the run.
 
     Returns:
         The run.
@@ -166,8 +160,8 @@ def run_scans(
                 if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
                     watch.timed("write", save_state, folder / STATE, *resumable)
                     resumable, saved = None, time.perf_counter()
-                if on_scan is not None:
-                    watch.timed("viewer", on_scan, scan, state, report)
+                if viewer is not None:
+                    watch.timed("viewer", show_live, viewer, scan, state, report)
                 bar.set_postfix_str(_progress(state, report, watch), refresh=False)
                 bar.update(1)
                 if time.perf_counter() - flushed > FLUSH_EVERY_S:
@@ -180,10 +174,10 @@ def run_scans(
                 watch.timed("write", save_state, folder / STATE, *resumable)
     run_s = watch.now_s() - started
     watch.count_rest(run_s)
-    return SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
+    return cli.SlamRun(state, tuple(reports), dict(watch.stages_s), watch.compile_s, run_s, tuple(scan_s), failure)
 
 
-def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -> Generator[_Prepared, None, None]:
+def _prepared_scans(reader: cli.ScanReader, methods: slam.SlamMethods, first: int) -> Generator[_Prepared, None, None]:
     """Reads and prepares each scan while the caller works on the one before."""
 
     def prepare(index: int) -> _Prepared:
@@ -199,40 +193,28 @@ def _timed(methods: slam.SlamMethods, watch: Stopwatch, suffix: str = "") -> sla
 
 
 def write_interim(
-    folder: RunFolder, sequence: LidarSequence, state: slam.SlamState, reports: Sequence[slam.ScanReport]
+    folder: cli.RunFolder, sequence: LidarSequence, state: slam.SlamState, reports: Sequence[slam.ScanReport]
 ) -> None:
     """Writes the present trajectory and scans.csv."""
     slam_map, done = state.slam_map, sequence.take(slice(0, len(reports)))
-    write_trajectory(folder.path, slam.place_scans(slam_map.T_world_keyframe, reports), done.times)
-    write_scans(folder / "scans.csv", reports, [keyframe.scan for keyframe in slam_map.keyframes], done.sources)
+    cli.write_trajectory(folder.path, slam.place_scans(slam_map.T_world_keyframe, reports), done.times)
+    cli.write_scans(folder / "scans.csv", reports, [keyframe.scan for keyframe in slam_map.keyframes], done.sources)
 
 
 def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) -> str:
-    parts = [f"kf {len(state.slam_map)}", f"loops {len(accepted_ends(state.loops.loops))}", f"score {report.score:.2f}"]
+    num_loops = len(cli.accepted_ends(state.loops.loops))
+    parts = [f"kf {len(state.slam_map)}", f"loops {num_loops}", f"score {report.score:.2f}"]
     if report.status not in ("first", "tracked"):
         parts.append(report.status)
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])
 
 
-@contextmanager
-def live_viewer(folder: RunFolder, name: str, *, is_on: bool) -> Iterator[Callable[..., None] | None]:
-    """Opens the viewer; yields a function that shows a scan, or None where the viewer is off."""
-    if not is_on:
-        yield None
+def show_live(viewer: viz.LiveViewer, scan: Any, state: slam.SlamState, report: slam.ScanReport) -> None:
+    """Shows a scan in the viewer, and the map after a new keyframe."""
+    T_world_keyframe = state.slam_map.T_world_keyframe
+    if not len(T_world_keyframe):
         return
-    viewer = viz.LiveViewer(name, folder / "slam.rrd")
-
-    def show(scan: Any, state: slam.SlamState, report: slam.ScanReport) -> None:
-        T_world_keyframe = state.slam_map.T_world_keyframe
-        if not len(T_world_keyframe):
-            return
-        points = slam.corrected_points(scan, report.T_turn)
-        viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
-        if report.is_keyframe:
-            positions = T_world_keyframe[accepted_ends(state.loops.loops), :3, 3]
-            viewer.show_map(T_world_keyframe, points, positions)
-
-    try:
-        yield show
-    finally:
-        viewer.close()
+    points = slam.corrected_points(scan, report.T_turn)
+    viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
+    if report.is_keyframe:
+        viewer.show_map(T_world_keyframe, points, T_world_keyframe[cli.accepted_ends(state.loops.loops), :3, 3])

@@ -19,21 +19,18 @@ apart. The model is the one of the step with the best mean recall on other towns
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import deeppointmap, simulation, viz, weights
-from dpmjax.cli.command import StopFlag, check_least
-from dpmjax.cli.drives import Source, find_sources
-from dpmjax.cli.info import select_device
-from dpmjax.cli.result_files import read_history
-from dpmjax.cli.run_folder import HISTORY, METRICS, RunFolder, RunOptions, open_run_folder, recording, write_metrics
+from dpmjax import cli, deeppointmap, simulation, viz, weights
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
@@ -48,19 +45,7 @@ SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProcessOptions(RunOptions):
-    """Options of a run of several processes."""
-
-    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
-    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
-    num_processes: Annotated[int | None, arg(metavar="N")] = None
-    """How many processes there are."""
-    process_id: Annotated[int | None, arg(metavar="I")] = None
-    """Which of them this one is, from 0; process 0 alone writes and prints."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Config(ProcessOptions):
+class Config(cli.RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
@@ -101,12 +86,18 @@ class Config(ProcessOptions):
     """Folders of real scans with poses: their recall is drawn beside that of the towns, and chooses nothing."""
     recall_every: Annotated[int, arg(metavar="N")] = 200
     """Measure recall every N steps, and at the end."""
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
+    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
+    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    """How many processes there are."""
+    process_id: Annotated[int | None, arg(metavar="I")] = None
+    """Which of them this one is, from 0; process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2, scans=2)
-        check_least(self, town_length_m=100, num_processes=1, process_id=0)
-        if self.hours is not None and not 0 < self.hours < float("inf"):
+        cli.check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2, scans=2)
+        cli.check_least(self, town_length_m=100, num_processes=1, process_id=0)
+        if self.hours is not None and not 0 < self.hours < math.inf:
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
         if not self.data:
             raise ValueError("--data: expected town or a folder of scans")
@@ -121,17 +112,17 @@ def main(config: Config) -> None:
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)
     if config.coordinator is not None:  # not before the processes have found each other
-        select_device(config.device)
+        cli.select_device(config.device)
     from dpmjax.cli.train_run import Records, draw_sets, prepare_sources, run_training
 
     with together():
         first = None if config.weights is None else weights.load_model(config.weights)
         settings = training_settings(config, first)
-        town = Source(town_length_m=config.town_length_m, town_mixture=simulation.TRAINING_MIXTURE)
-        towns = [replace(town, town_seed=config.seed + number) for number in range(config.num_towns)]
-        sources = find_sources(config.data, towns, settings.sampling)
-        folder = open_run_folder(config, NAME) if is_first() else None
-    with recording(folder) if folder is not None else nullcontext(), StopFlag() as stop:
+        town = partial(simulation.simulate_drive, length_m=config.town_length_m, mixture=simulation.TRAINING_MIXTURE)
+        towns = [partial(town, config.seed + number) for number in range(config.num_towns)]
+        sources = cli.find_sources(config.data, towns, settings.sampling)
+        folder = cli.open_run_folder(config, NAME) if is_first() else None
+    with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
         with together():
             store = deeppointmap.ScanStore(prepare_sources(sources, settings, config.cache, seed=config.seed))
             records = None
@@ -156,18 +147,18 @@ def main(config: Config) -> None:
             "seed": config.seed,
         }
         # Numbers first, so that they are written even if a picture fails.
-        write_metrics(folder, metrics)
+        cli.write_metrics(folder, metrics)
         write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
         draw_curves(folder)
         draw_matches(folder, evaluation, records.sets.held_out)
         print_summary(folder, metrics)
 
 
-def plateau_seconds(config: Config) -> float | None:
-    """Returns the seconds of steps after which the learning rate falls; None where the steps decide."""
+def plateau_seconds(config: Config) -> float:
+    """Returns the seconds of steps after which the learning rate falls; infinite where the steps decide."""
     if config.finish:
         return 0.0
-    return None if config.hours is None else 3600 * config.hours * (1 - deeppointmap.DECAY_RATIO)
+    return math.inf if config.hours is None else 3600 * config.hours * (1 - deeppointmap.DECAY_RATIO)
 
 
 def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
@@ -214,14 +205,12 @@ def measure(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointm
         near = evaluation.recalls[0]
         of_kinds = zip(KIND_NAMES, evaluation.recalls, strict=True)
         metrics |= {f"{name}{suffix}": recall.recall for name, recall in of_kinds}
-        metrics |= {
-            f"translation_error_median{suffix}_m": float(np.median(near.translation_errors_m)),
-            f"rotation_error_median{suffix}_deg": float(np.median(near.rotation_errors_deg)),
-        }
+        metrics[f"translation_error_median{suffix}_m"] = float(np.median(near.translation_errors_m))
+        metrics[f"rotation_error_median{suffix}_deg"] = float(np.median(near.rotation_errors_deg))
     return evaluations[""], metrics
 
 
-def write_model(folder: RunFolder, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
+def write_model(folder: cli.RunFolder, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
     """Writes model.safetensors with a description of its training, which begins with the preset and the data."""
     best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
     card = (
@@ -235,17 +224,18 @@ def write_model(folder: RunFolder, model: deeppointmap.Model, metrics: dict[str,
     unfinished.replace(folder / MODEL)
 
 
-def draw_curves(folder: RunFolder) -> None:
+def draw_curves(folder: cli.RunFolder) -> None:
     """Draws loss.png: losses and recalls over the steps."""
-    rows = read_history(folder / HISTORY)
+    rows = cli.read_history(folder / cli.HISTORY)
     if rows:
-        names = {name: name.replace("_", " ") for name in SHOWN_CURVES}
-        curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
-        curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
+        curves = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SHOWN_CURVES}
+        curves = {name.replace("_", " "): curve for name, curve in curves.items() if np.isfinite(curve).any()}
         viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), folder / "loss.png")
 
 
-def draw_matches(folder: RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:
+def draw_matches(
+    folder: cli.RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs
+) -> None:
     """Draws matches.png: the held-out pair of scans of median error."""
     errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
     number = int(np.argsort(errors)[len(errors) // 2])
@@ -256,17 +246,18 @@ def draw_matches(folder: RunFolder, evaluation: deeppointmap.Evaluation, pairs: 
     q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
     distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
     title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
-    scans = viz.MatchedScans(pairs.scan_points(a), pairs.scan_points(b), p, q, distances < 3.0)
-    viz.save_figure(viz.matches_figure(scans, matches.T_target_source[number], title=title), folder / "matches.png")
+    motions = {"source laid onto target": np.asarray(matches.T_target_source[number], np.float64)}
+    pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
+    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), folder / "matches.png")
 
 
-def print_summary(folder: RunFolder, metrics: dict[str, Any]) -> None:
+def print_summary(folder: cli.RunFolder, metrics: dict[str, Any]) -> None:
     """Prints the recall, the scans that were left out, and the folder."""
     at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
     print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
     bad = metrics["bad_scans"]
     if bad:
-        print(f"{len(bad)} scans left out, all of them in {folder / METRICS}:")
+        print(f"{len(bad)} scans left out, all of them in {folder / cli.METRICS}:")
         for source, reason in list(bad.items())[:MAX_LISTED]:
             print(f"  {source}: {reason}")
     print(f"results in {folder.path}")

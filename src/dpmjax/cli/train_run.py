@@ -17,11 +17,9 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.cli.drives import Source
-from dpmjax.cli.result_files import HistoryFile, read_history
-from dpmjax.cli.run_folder import BEST, CHECKPOINTS, HISTORY, RunFolder
 from dpmjax.io import open_lidar_sequence
 from dpmjax.simulation import HDL32E, HDL64E, OS1_64, simulate_drive
 
@@ -75,7 +73,7 @@ def draw_sets(
 
 
 def prepare_sources(
-    sources: Sequence[Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
+    sources: Sequence[cli.Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
 ) -> list[dpm.PreparedDrive]:
     """Returns all drives, each prepared in a process of its own and kept in `folder` for later runs."""
     prepare = partial(_prepare, settings=settings, folder=folder, seed=seed)
@@ -94,8 +92,8 @@ def _use_processor() -> None:
     jax.config.update("jax_platforms", "cpu")
 
 
-def _prepare(source: Source, *, settings: dpm.TrainingConfig, **options: Any) -> dpm.PreparedDrive:
-    return dpm.prepare_drive(source.open(), settings, **options)
+def _prepare(source: cli.Source, *, settings: dpm.TrainingConfig, **options: Any) -> dpm.PreparedDrive:
+    return dpm.prepare_drive(source(), settings, **options)
 
 
 class Records:
@@ -111,7 +109,7 @@ class Records:
 
     def __init__(
         self,
-        folder: RunFolder,
+        folder: cli.RunFolder,
         settings: dpm.TrainingConfig,
         sets: EvaluationSets,
         *,
@@ -119,14 +117,13 @@ class Records:
         weights: dpm.Model | None = None,
     ) -> None:
         self.folder, self.sets, self._settings = folder, sets, settings
-        self._checkpoints, self._best = Checkpoints(folder / CHECKPOINTS), Checkpoints(folder / BEST)
-        self.start = dpm.begin_training(settings, seed=seed, start=weights)
-        self.untrained = dpm.Model(self.start.state.params, settings.model)
-        if folder.is_resumed:
-            self.start = self._restored(self.start)
+        self._checkpoints, self._best = Checkpoints(folder / cli.CHECKPOINTS), Checkpoints(folder / cli.BEST)
+        begun = dpm.begin_training(settings, seed=seed, start=weights)
+        self.untrained = dpm.Model(begun.state.params, settings.model)
+        self.start = self._restored(begun)
         first = int(self.start.state.step)
-        self._history = HistoryFile(folder / HISTORY, COLUMNS, keep_until=first if folder.is_resumed else None)
-        self.earlier_s = max((float(row["run_s"]) for row in read_history(folder / HISTORY)), default=0.0)
+        self._history = cli.HistoryFile(folder / cli.HISTORY, COLUMNS, keep_until=first)
+        self.earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
         total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
@@ -136,13 +133,14 @@ class Records:
 
     def evaluate(self, model: dpm.Model) -> float:
         """Returns the mean recall on the selection pairs, and measures that on real pairs."""
-        found = [dpm.evaluate_registration(model, pairs) for pairs in self.sets.selection]
-        real = [dpm.evaluate_registration(model, pairs) for pairs in self.sets.real]
-        of_kinds = np.mean([[recall.recall for recall in evaluation.recalls] for evaluation in found], axis=0)
-        of_real = np.mean(
-            [[recall.recall for recall in evaluation.recalls] for evaluation in real] or [[math.nan] * 2], 0
-        )
-        self._recalls = dict(zip(RECALLS, (*of_kinds.tolist(), *of_real.tolist()), strict=True))
+
+        def mean_recalls(sets: Sequence[dpm.EvaluationPairs]) -> list[float]:
+            found = (dpm.evaluate_registration(model, pairs).recalls for pairs in sets)
+            return np.mean([[recall.recall for recall in recalls] for recalls in found], axis=0).tolist()
+
+        of_kinds = mean_recalls(self.sets.selection)
+        of_real = mean_recalls(self.sets.real) if self.sets.real else [math.nan, math.nan]
+        self._recalls = dict(zip(RECALLS, (*of_kinds, *of_real), strict=True))
         return float(np.mean(of_kinds))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
@@ -198,7 +196,7 @@ def run_training(
     hooks: dpm.TrainingHooks,
     *,
     seed: int,
-    plateau_s: float | None = None,
+    plateau_s: float = math.inf,
 ) -> dpm.Trained:
     """Returns the result of training, after saving its last state; one process has records.
 
@@ -209,8 +207,7 @@ def run_training(
         return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
         hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
-        if plateau_s is not None:
-            hooks = replace(hooks, finish=lambda: records.run_s >= plateau_s)
+        hooks = replace(hooks, finish=lambda: records.run_s >= plateau_s)
         trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         return trained

@@ -6,6 +6,8 @@ from .depth import read_active_vision as read_active_vision
 from .depth import read_pose_folder as read_pose_folder
 from .files import InputError as InputError
 from .files import write_atomically as write_atomically
+from .g2o import read_g2o as read_g2o
+from .g2o import write_g2o as write_g2o
 from .lidar import LidarSequence as LidarSequence
 from .lidar import list_lidar_sequences as list_lidar_sequences
 from .lidar import open_lidar_sequence as open_lidar_sequence

@@ -22,6 +22,7 @@ from .interfaces import ThinnedScan as ThinnedScan
 from .keyframe_map import KeyframeMap as KeyframeMap
 from .keyframe_map import Submap as Submap
 from .keyframe_map import as_pose_graph as as_pose_graph
+from .keyframe_map import connected_parts as connected_parts
 from .keyframe_map import keyframe_points as keyframe_points
 from .keyframe_map import take_keyframes as take_keyframes
 from .local_map import LocalMap as LocalMap

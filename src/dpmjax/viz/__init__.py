@@ -1,6 +1,6 @@
 """Pictures: registered scans, the learned map, the course of a fit. NumPy in, `matplotlib` figures and PNG files out.
 
-The pictures need neither a screen nor `pyplot`; matplotlib is imported with the first picture.
+The pictures need neither a screen nor `pyplot`; matplotlib is imported with the first name that is used.
 """
 
 import lazy_loader as _lazy

@@ -1,22 +1,21 @@
-"""Comparisons: errors and success of methods (DeepMapping figure 6), forms of the toy (figure 14), pairs of scans."""
+"""Comparisons: errors of methods (DeepMapping figures 6 and 7), forms of the toy (figure 14), pairs of scans."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.viz import figures
-from dpmjax.viz.figures import ACCENT, INK, MUTED
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
 SOURCE, GREEN, DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
-TARGET = "#d98c3f"
+TARGET, OBSTACLE, TRAJECTORY = "#d98c3f", "#e4e6e9", "#16c7d9"
 GRIDS_IN_A_LINE, LETTERS_IN_A_LINE = 5, 24
 # Points farther out than this share of them are outside of the picture of a pair.
 SHOWN_SHARE = 0.99
@@ -164,52 +163,6 @@ def endings_figure(
     return figure
 
 
-class MatchedScans(NamedTuple):
-    """Two scans and the matches between them, metres.
-
-    Attributes:
-        source: (n, 3) points in the source frame.
-        target: (m, 3) points in the target frame.
-        source_matched: (k, 3) matched points of the source.
-        target_matched: (k, 3) matched points of the target, row for row.
-        is_right: (k,) True where the true motion maps the two points of a match onto each other.
-    """
-
-    source: ArrayLike
-    target: ArrayLike
-    source_matched: ArrayLike
-    target_matched: ArrayLike
-    is_right: ArrayLike
-
-
-def matches_figure(scans: MatchedScans, T_target_source: ArrayLike, *, title: str) -> Figure:
-    """Draws two scans side by side from above with lines between matches, and overlaid by the estimated motion.
-
-    Args:
-        scans: both scans and their matches.
-        T_target_source: (4, 4) the estimated motion, metres.
-        title: title of the picture.
-
-    Returns:
-        The figure.
-    """
-    a, b, T, pa, pb = (np.asarray(x, np.float64) for x in (*scans[:2], T_target_source, *scans[2:4]))
-    figure = figures.new_figure(12.0, 4.6, layout="tight")
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
-    laid = (a @ T[:3, :3].T + T[:3, 3])[:, :2]
-    dots = ((left, a[:, :2], SOURCE), (left, b[:, :2] + shift, MUTED), (right, b[:, :2], MUTED), (right, laid, SOURCE))
-    for axes, points, color in dots:
-        axes.plot(*points.T, ",", color=color, alpha=0.6)
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(scans.is_right, bool), strict=True):
-        left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
-    figures.set_title(left, title)
-    figures.set_title(right, "source laid onto target")
-    return figure
-
-
 class RegisteredPair(NamedTuple):
     """Two scans and the motions between them.
 
@@ -224,6 +177,38 @@ class RegisteredPair(NamedTuple):
     source: NDArray[np.float32]
     target: NDArray[np.float32]
     motions: Mapping[str, NDArray[np.float64]]
+
+
+def matches_figure(
+    pair: RegisteredPair, source_matched: ArrayLike, target_matched: ArrayLike, is_right: ArrayLike
+) -> Figure:
+    """Draws two scans side by side from above with lines between matches, and overlaid by the estimated motion.
+
+    Args:
+        pair: both scans and the estimated motion.
+        source_matched: (k, 3) matched points of the source.
+        target_matched: (k, 3) matched points of the target, row for row.
+        is_right: (k,) True where the true motion maps the two points of a match onto each other.
+
+    Returns:
+        The figure.
+    """
+    a, b, pa, pb = (np.asarray(x, np.float64) for x in (pair.source, pair.target, source_matched, target_matched))
+    ((label, T),) = pair.motions.items()
+    figure = figures.new_figure(12.0, 4.6, layout="tight")
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
+    laid = (a @ T[:3, :3].T + T[:3, 3])[:, :2]
+    dots = ((left, a[:, :2], SOURCE), (left, b[:, :2] + shift, MUTED), (right, b[:, :2], MUTED), (right, laid, SOURCE))
+    for axes, points, color in dots:
+        axes.plot(*points.T, ",", color=color, alpha=0.6)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(is_right, bool), strict=True):
+        left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
+    figures.set_title(left, pair.title)
+    figures.set_title(right, label)
+    return figure
 
 
 def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
@@ -247,4 +232,61 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
             corners = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
             figures.frame_map(axes, figures.plane_limits(corners, 0.05))
             figures.set_title(axes, f"{pair.title}\n{label}", 9)
+    return figure
+
+
+class ErrorMap(NamedTuple):
+    """One panel.
+
+    Attributes:
+        title: title of the network.
+        subtitle: numbers of the network.
+        error: (h, w) distance to the truth; NaN where no scan was taken. Row 0 has the smallest y.
+    """
+
+    title: str
+    subtitle: str
+    error: NDArray[np.floating]
+
+
+def error_maps_figure(
+    maps: Sequence[ErrorMap],
+    extent: tuple[float, float, float, float],
+    trajectory_world: NDArray[np.floating],
+    unit: str,
+    *,
+    worst: float,
+) -> Figure:
+    """Draws errors of re-localisation in the manner of DeepMapping figure 7; black is an error of zero.
+
+    Args:
+        maps: maps, at least one, all of one shape.
+        extent: x_min, x_max, y_min, y_max of the grids' outer edges, in `unit`.
+        trajectory_world: (n, 2) where the scans of the fit were taken.
+        unit: unit of lengths.
+        worst: least error of the last colour.
+
+    Returns:
+        The figure; the trajectory of the fit is cyan.
+
+    Raises:
+        ValueError: no panel, panels of different shapes, or `worst` is not positive.
+    """
+    if not maps or len({panel.error.shape for panel in maps}) != 1 or not worst > 0.0:
+        raise ValueError(f"expected panels of one shape and worst > 0; got {len(maps)} panels, worst {worst}")
+    limits = Limits(*map(float, extent))
+    colormap = matplotlib.colormaps["inferno"].with_extremes(bad=OBSTACLE)
+    figure = figures.new_figure(4.6 * len(maps) + 0.9, 5.0)
+    axes_row = figure.subplots(1, len(maps), squeeze=False)[0]
+    for axes, panel in zip(axes_row, maps, strict=True):
+        image = figures.show_raster(axes, panel.error, limits, cmap=colormap, vmin=0.0, vmax=worst)
+        axes.plot(*np.asarray(trajectory_world).T, ".", color=TRAJECTORY, ms=1.8)
+        figures.set_title(axes, f"{panel.title}\n", 11, loc="left", fontweight="bold")
+        figures.annotate_corner(axes, panel.subtitle, (0, 6))
+        figures.frame_map(axes, limits, unit if panel is maps[0] else None)
+    # The bar and its label need about 0.9 inches at the right, whatever the number of maps.
+    right = 1.0 - 0.9 / figure.get_figwidth()
+    figure.tight_layout(rect=(0.0, 0.0, right, 1.0))
+    bar = figure.add_axes((right + 0.005, 0.1, 0.15 / figure.get_figwidth(), 0.75))
+    figure.colorbar(image, cax=bar, label=f"error, {unit}", extend="max")
     return figure

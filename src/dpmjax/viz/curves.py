@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+Floats = NDArray[np.floating]
 
 PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
 LOSS_COLOR = "#30638e"
@@ -25,39 +25,17 @@ SMOOTHED_PART = 0.03
 NUM_BINS = 10
 
 
-@dataclass(frozen=True)
-class History:
-    """Course of a fit, one entry a record.
-
-    Attributes:
-        seconds: (k,) run time, never decreasing, compile time left out.
-        loss: (k,) value of the phase's own objective; NaN where there is none.
-        phase: (k,) name of the phase of each record ("L-Net", "free poses", "polish").
-        ate: (k,) absolute trajectory error in the unit of the figure, NaN where not measured.
-    """
-
-    seconds: NDArray[np.floating]
-    loss: NDArray[np.floating]
-    phase: Sequence[str]
-    ate: NDArray[np.floating]
-
-
-class _Phase(NamedTuple):
-    """A run of records of one phase: its name, its rows and its first and last second."""
-
-    name: str
-    rows: slice
-    seconds: tuple[float, float]
-
-
-def history_figure(history: History, unit: str) -> Figure:
+def history_figure(seconds: Floats, loss: Floats, names: Sequence[str], ate: Floats, unit: str) -> Figure:
     """Draws loss and ATE over run time, the phases of the fit shaded and named.
 
     The loss line breaks between phases, because each phase has an objective of its own. A value axis is logarithmic
     where all its values are positive and span more than a factor of ten.
 
     Args:
-        history: history of the fit.
+        seconds: (k,) run time of each record of the fit, never decreasing, compile time left out.
+        loss: (k,) value of the phase's own objective; NaN where there is none.
+        names: (k,) name of the phase of each record ("L-Net", "free poses", "polish").
+        ate: (k,) absolute trajectory error, NaN where not measured.
         unit: unit of the ATE.
 
     Returns:
@@ -66,8 +44,7 @@ def history_figure(history: History, unit: str) -> Figure:
     Raises:
         ValueError: no record, or columns of different lengths.
     """
-    seconds, loss, ate = (np.asarray(column, np.float64) for column in (history.seconds, history.loss, history.ate))
-    lengths = [len(column) for column in (seconds, loss, history.phase, ate)]
+    lengths = [len(column) for column in (seconds, loss, names, ate)]
     if len(set(lengths)) != 1 or lengths[0] == 0:
         raise ValueError(f"expected one or more records and columns of one length; got lengths {lengths}")
 
@@ -75,12 +52,13 @@ def history_figure(history: History, unit: str) -> Figure:
     has_ate = bool(is_known.any())
     figure = figures.new_figure(8.0, 5.2 if has_ate else 3.0)
     rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
-    phases = _phases(history.phase, seconds)
+    phases = _phases(names)
     for axes in rows:
         for number, phase in enumerate(phases):
-            axes.axvspan(*phase.seconds, color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
+            begin, end = seconds[max(0, phase.start - 1)], seconds[phase.stop - 1]
+            axes.axvspan(begin, end, color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
     for phase in phases:
-        _draw_line(rows[0], seconds[phase.rows], loss[phase.rows], LOSS_COLOR)
+        _draw_line(rows[0], seconds[phase], loss[phase], LOSS_COLOR)
     _finish_value_axis(rows[0], loss, "loss")
     if has_ate:
         _draw_line(rows[1], seconds[is_known], ate[is_known], ACCENT)
@@ -88,7 +66,7 @@ def history_figure(history: History, unit: str) -> Figure:
         last = seconds[is_known][-1], ate[is_known][-1]
         style: Any = {"va": "center", "fontsize": 9, "color": ACCENT, "annotation_clip": False}
         rows[1].annotate(figures.format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
-    _name_phases(rows[0], phases)
+    _name_phases(rows[0], phases, names, seconds)
     rows[-1].set_xlabel("run time (s)", color=INK)
     first, last = seconds[0], seconds[-1]
     rows[-1].set_xlim(first, last if last > first else first + 1.0)
@@ -97,32 +75,30 @@ def history_figure(history: History, unit: str) -> Figure:
     return figure
 
 
-def _phases(names: Sequence[str], seconds: NDArray[np.floating]) -> list[_Phase]:
-    """Finds runs of equal names; a phase lasts from its predecessor's last record to its own last record."""
+def _phases(names: Sequence[str]) -> list[slice]:
+    """Returns the records of each phase, runs of equal names; it lasts from the last record before to its own last."""
     borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
-    return [
-        _Phase(names[first], slice(first, last), (float(seconds[max(0, first - 1)]), float(seconds[last - 1])))
-        for first, last in itertools.pairwise(borders)
-    ]
+    return [slice(first, last) for first, last in itertools.pairwise(borders)]
 
 
-def _name_phases(axes: Axes, phases: Sequence[_Phase]) -> None:
+def _name_phases(axes: Axes, phases: Sequence[slice], names: Sequence[str], seconds: Floats) -> None:
     """Writes the names above the first row; a name that would run into its left neighbour moves right of it."""
-    first, last = phases[0].seconds[0], phases[-1].seconds[1]
+    first, last = seconds[0], seconds[-1]
     taken_until = 0.0
     for phase in phases:
-        start = max((phase.seconds[0] - first) / max(last - first, 1e-9), taken_until)
+        name, begin = names[phase.start], seconds[max(0, phase.start - 1)]
+        start = max((begin - first) / max(last - first, 1e-9), taken_until)
         style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 9.5, "color": MUTED}
-        axes.annotate(phase.name, (start, 1), xytext=(2, 5), **style)
-        taken_until = start + 0.0135 * (len(phase.name) + 2)
+        axes.annotate(name, (start, 1), xytext=(2, 5), **style)
+        taken_until = start + 0.0135 * (len(name) + 2)
 
 
-def _draw_line(axes: Axes, seconds: NDArray[np.floating], values: NDArray[np.floating], color: str) -> None:
+def _draw_line(axes: Axes, seconds: Floats, values: Floats, color: str) -> None:
     # A phase of one record has no line: it shows as a dot.
     axes.plot(seconds, values, "-" if len(seconds) > 1 else "o", color=color, linewidth=1.6, markersize=4, zorder=3)
 
 
-def _finish_value_axis(axes: Axes, values: NDArray[np.floating], label: str) -> None:
+def _finish_value_axis(axes: Axes, values: Floats, label: str) -> None:
     known = values[np.isfinite(values)]
     if len(known) and known.min() > 0.0 and known.max() > RATIO_FOR_LOG_AXIS * known.min():
         axes.set_yscale("log")
@@ -135,10 +111,8 @@ def _finish_value_axis(axes: Axes, values: NDArray[np.floating], label: str) -> 
         spine.set_color(FRAME)
 
 
-def _label_log_axis(axes: Axes, values: NDArray[np.floating]) -> None:
+def _label_log_axis(axes: Axes, values: Floats) -> None:
     # Plain numbers at powers of ten; over few decades also at 2 and 5 times these. Other ticks have no label.
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     is_short = values.max() < RATIO_FOR_LOG_AXIS**_FEW_DECADES * values.min()
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,), numticks=8))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -175,7 +149,7 @@ def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
     return figure
 
 
-def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smoothed(values: Floats) -> Floats:
     # Running mean over a small part of the curve; at the ends, of the values that are there.
     width = max(3, int(SMOOTHED_PART * len(values)))
     ones = np.ones(width)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 INK = "#1b1f24"
 MUTED = "#6a737d"
@@ -42,8 +41,6 @@ class Limits(NamedTuple):
 
 def new_figure(width_in: float, height_in: float, layout: Literal["tight"] | None = None) -> Figure:
     """Returns a white figure that belongs to no window and to no global state; "tight" makes room for labels."""
-    from matplotlib.figure import Figure
-
     return Figure(figsize=(width_in, height_in), facecolor="white", layout=layout)
 
 
@@ -174,8 +171,6 @@ def size_in(limits: Limits) -> tuple[float, float]:
 
 def draw_loops(axes: Axes, loops: Float[np.ndarray, "m 2 3"], label: str, color: str) -> None:
     """Draws loops, at least one, as lines between the positions of their ends."""
-    from matplotlib.collections import LineCollection
-
     axes.add_collection(LineCollection(list(loops[:, :, :2]), colors=color, linewidths=1.0, zorder=5, label=label))
     axes.plot(*loops.reshape(-1, 3)[:, :2].T, ".", ms=3.2, color=color, zorder=6)
 

@@ -1,25 +1,24 @@
-"""The picture of a registration: the same scans under several sets of poses, side by side in one frame."""
+"""Pictures of a registration: the same scans under several sets of poses, the map of M-Net, depth images from above."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.transforms import Affine2D
+from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.alignment import best_motion
+from dpmjax.types import ScanSet
 from dpmjax.viz import figures
-from dpmjax.viz.figures import INK, MUTED, Limits
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
-    from matplotlib.figure import Figure
-
-    from dpmjax.types import ScanSet
+from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
 PANEL_WIDTH_IN = 4.2
 HEADER_IN = 0.62
@@ -28,6 +27,10 @@ GAP_IN = 0.14
 MAX_POINTS_PER_PANEL = 120_000
 OUTER_QUANTILE = 0.002
 MARGIN = 0.04
+UNEXPLORED_GREY = 0.74
+OCCUPANCY_SIDE_IN, OCCUPANCY_GAP_IN = 6.4, 0.12
+# Points with a smaller y than this, in the frame of the first camera, are the ceiling.
+CEILING_M = -0.9
 
 
 @dataclass(frozen=True)
@@ -118,9 +121,6 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
 
 def time_colormap() -> Colormap:
     """Returns violet over red to amber: even in lightness, and nowhere too pale for a white ground."""
-    import matplotlib
-    from matplotlib.colors import LinearSegmentedColormap
-
     colors = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.86, 256))
     return LinearSegmentedColormap.from_list("dpmjax_time", colors)
 
@@ -188,3 +188,85 @@ def _add_time_bar(figure: Figure, num_scans: int, colormap: Colormap) -> None:
     style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center", "fontsize": 8.5}
     axes.annotate("first scan", (0, 0.5), xytext=(-6, 0), ha="right", color=MUTED, **style)
     axes.annotate(f"scan {num_scans}", (1, 0.5), xytext=(6, 0), ha="left", color=MUTED, **style)
+
+
+def occupancy_figure(
+    picture: tuple[ArrayLike, ArrayLike, tuple[float, float, float, float]],
+    trajectory_world: NDArray[np.floating],
+    unit: str,
+    *,
+    T_view_world: NDArray[np.floating],
+    limits: Limits,
+) -> Figure:
+    """Draws an occupancy map in the manner of DeepMapping, Figure 5.
+
+    Args:
+        picture: (h, w) probability that a cell is occupied, row 0 at the smallest y; (h, w) True where a beam passed or
+            ended; and x_min, x_max, y_min, y_max of the grid's outer edges in the world, in `unit`.
+        trajectory_world: (n, 2) sensor positions.
+        unit: unit of lengths, "px" or "m".
+        T_view_world: (3, 3) rigid motion into the frame of the picture.
+        limits: shown part of that frame.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: where the shapes do not fit, or the extent is empty.
+    """
+    probability, explored = np.asarray(picture[0], np.float64), np.asarray(picture[1], bool)
+    if probability.ndim != 2 or explored.shape != probability.shape:
+        raise ValueError(f"expected two arrays (h, w); got probability {probability.shape}, explored {explored.shape}")
+    extent = Limits(*(float(edge) for edge in picture[2]))
+    if not (extent.width > 0.0 and extent.height > 0.0):
+        raise ValueError(f"expected an extent (x_min, x_max, y_min, y_max) with min < max; got {tuple(extent)}")
+    scale_in = OCCUPANCY_SIDE_IN / max(limits.width, limits.height)
+    width_in, height_in = limits.width * scale_in, limits.height * scale_in
+    figure = figures.new_figure(width_in + 2.0 * OCCUPANCY_GAP_IN, height_in + 2.0 * OCCUPANCY_GAP_IN)
+    axes = figures.add_axes(figure, (OCCUPANCY_GAP_IN, OCCUPANCY_GAP_IN, width_in, height_in))
+    brightness = np.where(explored, 1.0 - np.clip(probability, 0.0, 1.0), UNEXPLORED_GREY)
+    axes.set_facecolor(str(UNEXPLORED_GREY))
+    image = figures.show_raster(axes, brightness, extent, cmap="gray", vmin=0.0, vmax=1.0)
+    image.set_transform(Affine2D(T_view_world) + axes.transData)
+    figures.draw_trajectory(axes, trajectory_world @ T_view_world[:2, :2].T + T_view_world[:2, 2], ACCENT)
+    figures.frame_map(axes, limits, unit)
+    return figure
+
+
+def from_above_figure(panels: Sequence[tuple[str, NDArray[np.float64]]], points: ArrayLike, mask: ArrayLike) -> Figure:
+    """Draws depth images from above, without the ceiling, one colour for each image, for several sets of poses.
+
+    Args:
+        panels: title and (n, 4, 4) T_world_camera in metres; all are aligned with the last.
+        points: (n, h, w, 3) in the camera frames (y down).
+        mask: (n, h, w).
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no panel.
+    """
+    if not panels:
+        raise ValueError("panels: expected at least one")
+    cloud, valid = np.asarray(points, np.float64), np.asarray(mask, bool)
+    poses = [T for _, T in panels]
+    # The first camera is level in every panel, so the panels are aligned by the first poses.
+    aligned = [poses[-1][0] @ np.linalg.inv(T[0]) @ T for T in poses]
+    clouds = [np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3] for T in aligned]
+    sensors = [T[:, :3, 3] for T in aligned]
+    low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
+    limits = figures.plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.12)
+    figure = figures.new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5, layout="tight")
+    colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
+    axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
+    # Few points would hardly be seen.
+    size = float(np.clip(200 / np.sqrt(max(valid.sum(), 1)), 1.2, 4))
+    for axes, (title, _), world, centres in zip(axes_row, panels, clouds, sensors, strict=True):
+        for image, color in enumerate(colors):
+            shown = world[image][valid[image] & (world[image][..., 1] > CEILING_M)]
+            axes.plot(shown[:, 0], shown[:, 2], ".", ms=size, mew=0, color=color)
+        axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
+        figures.frame_map(axes, limits, "m" if axes is axes_row[0] else None)
+        figures.set_title(axes, title, loc="left")
+    return figure

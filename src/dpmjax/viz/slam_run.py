@@ -1,26 +1,28 @@
-"""Pictures of a SLAM run from above: trajectories with their loops, and the map by height; and its live viewer."""
+"""Pictures of SLAM from above: trajectories with loops, the map by height, scans found in it; and the live viewer."""
 
 from __future__ import annotations
 
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
-    from matplotlib.figure import Figure
-
 OURS, ODOMETRY, LOOP = "#1f4e8c", "#e08a1e", "#2a9d5c"
+RIGHT, HEAD_SHARE = "#2a9d5c", 0.02
 # Heights above the lidar that the colours of maps span.
 HEIGHTS_M = (-2.5, 5.5)
 
@@ -103,9 +105,6 @@ def height_map_figure(
     Returns:
         The figure.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     if _is_roofed(points, heights_m, path):
         points, heights_m = points[heights_m < _ROOF_M], heights_m[heights_m < _ROOF_M]
     # Few far points must not determine the limits.
@@ -126,6 +125,49 @@ def height_map_figure(
     return figure
 
 
+def localization_figure(
+    points_map: ArrayLike,
+    T_map_keyframe: ArrayLike,
+    T_map_scan: ArrayLike,
+    *,
+    is_wrong: ArrayLike | None = None,
+    title: str,
+) -> Figure:
+    """Draws a map from above, the keyframes' positions, and the poses of the scans that were found as arrows.
+
+    Args:
+        points_map: (n, 3) points of the map, metres.
+        T_map_keyframe: (k, 4, 4) at least one.
+        T_map_scan: (s, 4, 4) of the scans that were found.
+        is_wrong: (s,) scans that a reference puts elsewhere; None without a reference.
+        title: title of the picture.
+
+    Returns:
+        The figure.
+    """
+    points, path = np.asarray(points_map, float).reshape(-1, 3), np.asarray(T_map_keyframe, float)[:, :3, 3]
+    T = np.asarray(T_map_scan, float).reshape(-1, 4, 4)
+    wrong = np.zeros(len(T), bool) if is_wrong is None else np.asarray(is_wrong, bool)
+    # Few far points must not determine the limits.
+    shown = np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]])
+    limits = figures.plane_limits(np.percentile(shown, [0.5, 99.5], axis=0), 0.06)
+    width_in, height_in = figures.size_in(limits)
+    figure = figures.new_figure(width_in + 0.3, height_in + 0.8, layout="tight")
+    axes = figure.subplots()
+    axes.scatter(points[:, 0], points[:, 1], s=0.4, color=MUTED, alpha=0.35, linewidths=0, rasterized=True)
+    axes.plot(path[:, 0], path[:, 1], ".", color=INK, ms=3, label=f"{len(path)} keyframes", zorder=4)
+    head = HEAD_SHARE * max(limits.width, limits.height)
+    for mask, color, label in ((~wrong, RIGHT, "found"), (wrong, ACCENT, "found elsewhere than the reference")):
+        if mask.any():
+            (x, y), (dx, dy) = T[mask, :2, 3].T, T[mask, :2, 0].T
+            axes.quiver(x, y, dx, dy, color=color, scale=1 / head, scale_units="xy", width=0.004, zorder=6)
+            axes.plot(x, y, "o", color=color, ms=3.5, label=f"{mask.sum()} {label}", zorder=5)
+    figures.frame_map(axes, limits, "m")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
+    figures.set_title(axes, title)
+    return figure
+
+
 def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
     """Returns the colours of heights above the lidar, for maps.
 
@@ -140,9 +182,6 @@ def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"
 
 
 def _height_colormap() -> Colormap:
-    import matplotlib
-    from matplotlib.colors import LinearSegmentedColormap
-
     # The ground is pale on white paper; what stands on it goes from blue over violet to amber.
     high = matplotlib.colormaps["plasma"](np.linspace(0.05, 0.85, 8))
     colors = [(0.0, "#e3e7ec"), (0.15, "#cfd6de"), *zip(np.linspace(0.24, 1.0, 8), high, strict=True)]
@@ -194,19 +233,19 @@ class LiveViewer:
     Args:
         name: name of the recording.
         path: file that is written without a screen, for viewers of the same version only.
-
-    Raises:
-        ValueError: rerun is not installed.
     """
 
     def __init__(self, name: str, path: Path) -> None:
-        self._rerun = _import_rerun()
-        self._recording = self._rerun.RecordingStream(f"dpmjax {name}")
+        import rerun
+
+        self._rerun, self._recording = rerun, rerun.RecordingStream(f"dpmjax {name}")
+        self._log = partial(rerun.log, recording=self._recording)
         self._T_world_keyframe = np.zeros((0, 4, 4))
-        if _has_screen():
-            self._rerun.spawn(recording=self._recording)
+        # A Linux machine without a display cannot open a window.
+        if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+            rerun.spawn(recording=self._recording)
         else:
-            self._rerun.save(path, recording=self._recording)
+            rerun.save(path, recording=self._recording)
 
     def show_scan(self, number: int, points: Float[np.ndarray, "n 3"], T_world_scan: Float[np.ndarray, "4 4"]) -> None:
         """Shows the newest scan.
@@ -220,25 +259,19 @@ class LiveViewer:
         self._log_pose("world/lidar", T_world_scan)
         self._log_points("world/lidar/points", points)
 
-    def show_map(
-        self,
-        T_world_keyframe: Float[np.ndarray, "k 4 4"],
-        newest: Float[np.ndarray, "n 3"],
-        loops: Float[np.ndarray, "m 2 3"],
-    ) -> None:
+    def show_map(self, T_world_keyframe: np.ndarray, newest: np.ndarray, loops: np.ndarray) -> None:
         """Shows the map after a new keyframe.
 
         Args:
-            T_world_keyframe: poses of all keyframes.
-            newest: points of the last keyframe, metres, in the frame of the lidar.
-            loops: positions of both ends of each accepted loop.
+            T_world_keyframe: (k, 4, 4) poses of all keyframes, at least one.
+            newest: (n, 3) points of the last keyframe, metres, in the frame of the lidar.
+            loops: (m, 2, 3) positions of both ends of each accepted loop.
         """
         before, self._T_world_keyframe = self._T_world_keyframe, T_world_keyframe
         for row, T in enumerate(T_world_keyframe):
             if row >= len(before) or not np.array_equal(before[row], T):
                 self._log_pose(f"world/keyframes/{row}", T)
-        if len(T_world_keyframe):
-            self._log_points(f"world/keyframes/{len(T_world_keyframe) - 1}/points", newest)
+        self._log_points(f"world/keyframes/{len(T_world_keyframe) - 1}/points", newest)
         lines = self._rerun.LineStrips3D
         self._log("world/trajectory", lines([T_world_keyframe[:, :3, 3]], colors=[_TRAJECTORY]))
         self._log("world/loops", lines(loops, colors=[_LOOP]))
@@ -252,19 +285,3 @@ class LiveViewer:
 
     def _log_points(self, entity: str, points: Float[np.ndarray, "n 3"]) -> None:
         self._log(entity, self._rerun.Points3D(points, colors=height_colors(points[:, 2]), radii=[_RADIUS_M]))
-
-    def _log(self, entity: str, shown: object) -> None:
-        self._rerun.log(entity, shown, recording=self._recording)
-
-
-def _has_screen() -> bool:
-    """Returns True where a window can be opened; False on a Linux machine without a display."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _import_rerun() -> ModuleType:
-    try:
-        import rerun
-    except ImportError as error:
-        raise ValueError("the live viewer needs rerun: pip install 'dpmjax[viewer]', or run without it") from error
-    return rerun
