@@ -9,9 +9,6 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dpmjax.io.files import import_for, natural_key, refusing
 from dpmjax.sequences import InputError, require
 
@@ -49,8 +46,14 @@ class Topic(NamedTuple):
         return self.kind.rpartition("/")[2]
 
 
-class _Place(NamedTuple):
-    """A message in a bag: time of its header, of its recording, and its number among those of the same time, ns."""
+class Place(NamedTuple):
+    """Place of a message in a bag.
+
+    Attributes:
+        stamp_ns: time of its header, or of the recording where the headers of its topic have none, ns since 1970.
+        recorded_ns: time of the recording, ns.
+        number: number among the messages that were recorded at this time.
+    """
 
     stamp_ns: int
     recorded_ns: int
@@ -96,13 +99,12 @@ class Bag:
         typesys = import_for(path, "rosbags.typesys", "ros")
         self.path = path
         self._lock = threading.Lock()
-        self._places: dict[str, list[_Place]] = {}
         with _refusing(path):
             # A bag without definitions of its types has the standard ones.
             types = typesys.get_typestore(typesys.Stores.LATEST)
             self._reader: Any = highlevel.AnyReader(_bag_files(path), default_typestore=types)
             self._reader.open()
-        weakref.finalize(self, _close, self._reader)
+        weakref.finalize(self, self._reader.close)
         with _refusing(path):
             topics = self._reader.topics.items()
             self.topics = [Topic(name, str(info.msgtype), int(info.msgcount)) for name, info in topics]
@@ -142,28 +144,12 @@ class Bag:
         require(len(fitting) == 1, self.path, f"{len(fitting)} topics of {what}: {names}", "name one with --topic")
         return fitting[0]
 
-    def stamps(self, topic: str) -> NDArray[np.int64]:
-        """Reads the times of the messages.
+    def read(self, topic: str, place: Place) -> Any:
+        """Reads a message.
 
         Args:
-            topic: topic of messages that begin with a header.
-
-        Returns:
-            (n,) nanoseconds since 1970, increasing: of the headers, or of the recording where these are not set.
-
-        Raises:
-            InputError: the bag is damaged.
-        """
-        if topic not in self._places:
-            self._places[topic] = self._find_places(topic)
-        return np.array([place.stamp_ns for place in self._places[topic]], np.int64)
-
-    def read(self, topic: str, index: int) -> Any:
-        """Reads a message by its number in `stamps`.
-
-        Args:
-            topic: topic of messages that begin with a header.
-            index: the number.
+            topic: its topic.
+            place: one of its `places`.
 
         Returns:
             The message of rosbags.
@@ -171,8 +157,6 @@ class Bag:
         Raises:
             InputError: the bag is damaged.
         """
-        self.stamps(topic)
-        place = self._places[topic][index]
         with self._lock, _refusing(self.path):
             found = list(self._messages(topic, start=place.recorded_ns, stop=place.recorded_ns + 1))
             connection, _, content = found[place.number]
@@ -197,9 +181,19 @@ class Bag:
     def _messages(self, topic: str, **times: int) -> Iterator[Any]:
         return self._reader.messages([each for each in self._reader.connections if each.topic == topic], **times)
 
-    def _find_places(self, topic: str) -> list[_Place]:
-        """Returns all messages in the order of the times of their headers."""
-        places: list[_Place] = []
+    def places(self, topic: str) -> list[Place]:
+        """Finds the messages of a topic.
+
+        Args:
+            topic: topic of messages that begin with a header.
+
+        Returns:
+            All messages in the order of the times of their headers.
+
+        Raises:
+            InputError: the bag is damaged.
+        """
+        places: list[Place] = []
         with self._lock, _refusing(self.path):
             seen: dict[int, int] = {}
             for _, recorded_ns, content in self._messages(topic):
@@ -208,7 +202,7 @@ class Bag:
                 # The time of the header follows a number (ROS 1), or the encoding (ROS 2).
                 order = ">" if self._reader.is2 and content[1] == 0 else "<"
                 seconds, nanoseconds = struct.unpack_from(f"{order}II", content, 4)
-                places.append(_Place(seconds * 10**9 + nanoseconds, recorded_ns, number))
+                places.append(Place(seconds * 10**9 + nanoseconds, recorded_ns, number))
         if any(place.stamp_ns <= 0 for place in places):
             places = [place._replace(stamp_ns=place.recorded_ns) for place in places]
         return sorted(places)
@@ -217,8 +211,3 @@ class Bag:
 def _refusing(path: Path) -> Any:
     """Turns all errors of rosbags on damaged bags into an `InputError`."""
     return refusing(path, "cannot be read as a bag of ROS ({kind}: {error})", _ADVICE, (Exception,))
-
-
-def _close(reader: Any) -> None:
-    if reader.stack is not None:
-        reader.close()

@@ -52,7 +52,7 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     found = f"coordinates up to {largest:g}"
     require(largest <= _LARGEST_LENGTH, path, found, "give metres, or pixels / 512")
     is_small = unit is not None or largest <= _LARGEST_STORED
-    require(is_small, path, f"{found}, too large for pixels / 512", "say --unit m if they are metres")
+    require(is_small, path, f"{found}, too large for pixels / 512", "name the unit m if they are metres")
     if unit != "m":
         points *= np.float32(_PIXELS_PER_UNIT)
     pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dpmjax.io.bags import is_bag
 from dpmjax.io.bin_columns import check_size, columns_of_drive
 from dpmjax.io.files import log_notes, natural_key
@@ -19,7 +22,7 @@ from dpmjax.io.lidar_datasets import (
     read_plain_folder,
     read_velodyne_points,
 )
-from dpmjax.io.lidar_file import read_point_times, read_timed_cloud, with_unit_doubt
+from dpmjax.io.lidar_file import read_point_times, read_timed_cloud, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
 from dpmjax.io.scan_bags import open_lidar_bag
@@ -32,8 +35,8 @@ _FORMATS = (
     "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
 )
 _CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
-# What a folder of a layout holds, the reader of the layout, and its folder of scans.
-_LAYOUTS: tuple[tuple[str, Callable[[Path], Drive3D], str], ...] = (
+# What a folder of a layout holds, the reader of the folder and of its scans, and the place of the scans.
+_LAYOUTS: tuple[tuple[str, Callable[[Path, Path], Drive3D], str], ...] = (
     ("generated/frames", read_kitti_carla, "generated/frames"),
     ("full_poses_lidar.txt", read_kitti_carla, "frames"),
     ("Ouster", read_mulran, "Ouster"),
@@ -78,11 +81,24 @@ def open_lidar_sequence(
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
     whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
     note = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
-    whole = replace(whole, notes=(*whole.notes, *([] if note is None else [note])))
-    log_notes(whole.notes)
+    notes = whole.notes if note is None else (*whole.notes, note)
+    log_notes(notes)
+    whole = replace(whole, read_scan=_with_unit_doubt(whole), notes=notes)
     part = whole.take(selection)
     require(part.num_scans > 0, path, f"{selection} chooses 0 of {whole.num_scans} scans", "choose others")
     return part
+
+
+def _with_unit_doubt(sequence: LidarSequence) -> Callable[[int], NDArray[np.float32]]:
+    """Returns the reader of the scans; it logs a doubt about the unit of the first one."""
+
+    def read(index: int) -> NDArray[np.float32]:
+        points = sequence.read_scan(index)
+        if index == 0 and (note := unit_note(points, sequence.sources[0])) is not None:
+            log_notes([note])
+        return points
+
+    return read
 
 
 def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
@@ -94,11 +110,10 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     if bin_columns is None:
         bin_columns, note = columns_of_drive(files)
         notes.append(note)
-
     return LidarSequence(
         drive.name,
         tuple(map(str, files)),
-        with_unit_doubt(lambda index: read_timed_cloud(files[index], bin_columns).points, files),
+        lambda index: read_timed_cloud(files[index], bin_columns).points,
         drive.T_world_lidar,
         drive.times,
         lambda index: read_point_times(files[index]),
@@ -200,7 +215,7 @@ def _read(path: Path, poses: Path | None) -> Drive3D:
     """Lists the drive in a folder; a given pose file replaces that of the data set."""
     layout = next((layout for layout in _LAYOUTS if (path / layout[0]).exists()), None)
     if layout is not None and poses is None:
-        return layout[1](path)
+        return layout[1](path, path / layout[2])
     files = scan_files(path)
     if files and files[0].suffix.lower() == ".npz" and layout is None and poses is None:
         return read_learned_folder(path)

@@ -109,7 +109,7 @@ def read_learned_folder(folder: Path) -> Drive3D:
     return drive._replace(T_world_lidar=check_poses(stacked, folder))
 
 
-def read_kitti_odometry(folder: Path) -> Drive3D:
+def read_kitti_odometry(folder: Path, scans: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry: velodyne/, times.txt, and poses.
 
     Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
@@ -120,7 +120,7 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    files = scan_files(folder / "velodyne")
+    files = scan_files(scans)
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
     in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
     drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
@@ -137,11 +137,10 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     return drive._replace(T_world_lidar=T, notes=notes)
 
 
-def read_velodyne_points(folder: Path) -> Drive3D:
+def read_velodyne_points(folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
-    files = scan_files(folder / "velodyne_points" / "data")
-    times = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
-    drive = Drive3D(folder.resolve().name, files, times=times)
+    files = scan_files(scans)
+    drive = Drive3D(folder.resolve().name, files, times=_read_stamps(scans.parent / "timestamps.txt", files))
     is_kitti_360 = folder.resolve().parent.name == "data_3d_raw"
     return _with_kitti_360_poses(drive, folder) if is_kitti_360 else _with_oxts_poses(drive, folder)
 
@@ -193,7 +192,7 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
     return _interpolate(drive, frames, (rows[:, 0], T_world_lidar), path)
 
 
-def read_kitti_carla(folder: Path) -> Drive3D:
+def read_kitti_carla(_folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
@@ -202,10 +201,9 @@ def read_kitti_carla(folder: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    home = folder / "generated" if (folder / "generated").is_dir() else folder
-    files = scan_files(home / "frames", (".ply",))
-    name = home.resolve().parent.name if home.resolve().name == "generated" else home.resolve().name
-    path = home / "full_poses_lidar.txt"
+    files, home = scan_files(scans, (".ply",)), scans.parent.resolve()
+    name = home.parent.name if home.name == "generated" else home.name
+    path = scans.parent / "full_poses_lidar.txt"
     if not path.is_file():
         return Drive3D(name, files)
     rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
@@ -215,7 +213,7 @@ def read_kitti_carla(folder: Path) -> Drive3D:
     return Drive3D(name, files, from_rows(rows[at, :12], path), rows[at, 12])
 
 
-def read_mulran(folder: Path) -> Drive3D:
+def read_mulran(folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame. Scans half a second or more outside of the poses are left out.
@@ -225,8 +223,7 @@ def read_mulran(folder: Path) -> Drive3D:
     """
     from scipy.spatial.transform import Rotation
 
-    home = folder / "Ouster" if (folder / "Ouster").is_dir() else folder / "sensor_data" / "Ouster"
-    files = scan_files(home, (".bin",))
+    files = scan_files(scans, (".bin",))
     stamps = np.array(_require_numbers(files), np.int64)
     times = (stamps - stamps[:1]).astype(np.float64) * 1e-9
     drive = Drive3D(folder.resolve().name, files, times=times)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -231,28 +230,6 @@ def _why_too_far(points: FloatArray, median: float) -> tuple[str, str]:
         return f"{found}, around one place far away: coordinates of a map, such as UTM", advice
     is_unit = median < 1000 * _FARTHEST_M
     return found, "convert millimetres or centimetres to metres" if is_unit else "check the number of columns"
-
-
-def with_unit_doubt(
-    read_scan: Callable[[int], NDArray[np.float32]], sources: Sequence[str | Path]
-) -> Callable[[int], NDArray[np.float32]]:
-    """Returns a reader of the scans of a drive that logs a doubt about the unit of the first scan.
-
-    Args:
-        read_scan: reads the points of a scan by its number.
-        sources: source of each scan, for the note.
-
-    Returns:
-        The reader.
-    """
-
-    def read(index: int) -> NDArray[np.float32]:
-        points = read_scan(index)
-        if index == 0 and (note := unit_note(points, sources[0])) is not None:
-            log_notes([note])
-        return points
-
-    return read
 
 
 def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:

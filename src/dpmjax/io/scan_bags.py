@@ -13,7 +13,7 @@ from dpmjax.io.array_files import to_float32
 from dpmjax.io.bags import LASER_SCAN, LIVOX_CLOUDS, MULTI_ECHO_SCAN, POINT_CLOUD, Bag
 from dpmjax.io.clouds import TimedCloud, cloud_of
 from dpmjax.io.files import refusing
-from dpmjax.io.lidar_file import check_scan, with_unit_doubt
+from dpmjax.io.lidar_file import check_scan
 from dpmjax.io.poses import homogeneous, interpolate_poses
 from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, has_angular_order, pad_scans
 
@@ -75,7 +75,7 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
             stamps.append(_stamp_of(message))
             scans.append(_ends_of(message, chosen.kind))
         if min(stamps) <= 0:
-            stamps = (bag.stamps(chosen.name).astype(np.float64) * 1e-9).tolist()
+            stamps = [place.stamp_ns * 1e-9 for place in bag.places(chosen.name)]
         order = np.argsort(stamps, kind="stable")
         times, frame = np.array(stamps)[order], frames[order[0]]
         edges = _transforms(bag)
@@ -195,17 +195,18 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
     """
     bag = Bag(path)
     chosen = bag.choose((POINT_CLOUD, *LIVOX_CLOUDS), topic, "point clouds")
-    times = bag.stamps(chosen.name).astype(np.float64) * 1e-9
-    sources = tuple(f"{path} {chosen.name} {index}" for index in range(len(times)))
+    places = bag.places(chosen.name)
+    times = np.array([place.stamp_ns for place in places], np.float64) * 1e-9
+    sources = tuple(f"{path} {chosen.name} {index}" for index in range(len(places)))
 
     def read(index: int) -> TimedCloud:
-        message = bag.read(chosen.name, index)
+        message = bag.read(chosen.name, places[index])
         with refusing(sources[index], "a broken message ({error})", "record the topic again", _KINDS):
             cloud = _cloud_of(message, chosen.kind)
         return check_scan(cloud, sources[index])
 
-    read_scan = with_unit_doubt(lambda index: read(index).points, sources)
-    return LidarSequence(path.resolve().stem, sources, read_scan, None, times, lambda index: read(index).times)
+    name = path.resolve().stem
+    return LidarSequence(name, sources, lambda i: read(i).points, None, times, lambda i: read(i).times)
 
 
 def _cloud_of(message: Any, kind: str) -> TimedCloud:
