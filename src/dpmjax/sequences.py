@@ -68,6 +68,21 @@ def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: st
         raise InputError(source, found, advice)
 
 
+def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
+    """Builds homogeneous matrices.
+
+    Args:
+        rotations: (..., 3, 3).
+        translations: (..., 3).
+
+    Returns:
+        (..., 4, 4).
+    """
+    matrices = np.tile(np.eye(4), (*translations.shape[:-1], 1, 1))
+    matrices[..., :3, :3], matrices[..., :3, 3] = rotations, translations
+    return matrices
+
+
 def _require_shapes(record: Any, shapes: dict[str, tuple[int, ...]]) -> None:
     """Raises a ValueError for the first field that is present and has another shape."""
     for name, shape in shapes.items():
@@ -255,7 +270,7 @@ class Camera:
         if min(self.width, self.height) < 1 or not min(self.fx, self.fy) > 0.0 or not np.isfinite(numbers).all():
             raise ValueError(f"camera: expected a size and focal lengths above 0, got {self}")
 
-    def rays(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
+    def rays(self, columns: NDArray[Any], rows: NDArray[Any]) -> FloatArray:
         """Computes directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
         x, y = np.meshgrid((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
         return np.stack([x, y, np.ones_like(x)], axis=-1)

@@ -11,10 +11,10 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.io.array_files import load_arrays
 from dpmjax.io.files import log_notes, natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
+from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
 from dpmjax.io.scan_names import POSE_FILES, match_rows, numbers_of, scan_files
-from dpmjax.sequences import FloatArray, InputError, Note, require
+from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0

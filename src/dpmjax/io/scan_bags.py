@@ -14,8 +14,8 @@ from dpmjax.io.bags import LASER_SCAN, LIVOX_CLOUDS, MULTI_ECHO_SCAN, POINT_CLOU
 from dpmjax.io.clouds import TimedCloud, cloud_of
 from dpmjax.io.files import refusing
 from dpmjax.io.lidar_file import check_scan
-from dpmjax.io.poses import homogeneous, interpolate_poses
-from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, has_angular_order, pad_scans
+from dpmjax.io.poses import interpolate_poses
+from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, has_angular_order, homogeneous, pad_scans
 
 _ODOMETRY, _TRANSFORMS = "nav_msgs/msg/Odometry", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 # sensor_msgs/PointField: the numbers of its data types.

@@ -11,7 +11,6 @@ from .motion import TimedPoses as TimedPoses
 from .motion import WalkConfig as WalkConfig
 from .motion import drive as drive
 from .motion import route_poses as route_poses
-from .motion import simulate_lidar_sequence as simulate_lidar_sequence
 from .motion import walk as walk
 from .raycast2d import cast_scans as cast_scans
 from .raycast2d import scan_world as scan_world
