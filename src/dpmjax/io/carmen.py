@@ -100,7 +100,7 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
     reference = None if is_raw and not lines["NEFF"] else poses
     wheels = None if are_equal and reference is not None else odometry
     name = Path(path).name.split(".")[0]
-    return _in_order_of_time(ScanSequence(name, points, mask, "m", True, reference, wheels, times), path)
+    return _in_order_of_time(ScanSequence(name, points, mask, "m", reference, wheels, times), path)
 
 
 def _end_points(scan: _Scan, limit: float) -> FloatArray:

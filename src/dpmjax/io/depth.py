@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.array_files import parse_mat, read_depth_png
-from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
+from dpmjax.io.files import natural_key, parse_mat, read_bytes, read_depth_png, read_lines, read_table, refusing
 from dpmjax.io.poses import check_poses
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 

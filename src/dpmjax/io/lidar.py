@@ -9,25 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.bags import is_bag
-from dpmjax.io.bin_columns import check_size, columns_of_drive
 from dpmjax.io.files import log_notes, natural_key
-from dpmjax.io.lidar_datasets import (
-    Drive3D,
-    find_pose_file,
-    read_kitti_carla,
-    read_kitti_odometry,
-    read_learned_folder,
-    read_mulran,
-    read_plain_folder,
-    read_velodyne_points,
-)
-from dpmjax.io.lidar_file import read_point_times, read_timed_cloud, unit_note
+from dpmjax.io.lidar_datasets import LAYOUTS, Drive3D, find_pose_file, read_learned_folder, read_plain_folder
+from dpmjax.io.lidar_file import check_size, columns_of_drive, read_point_times, read_timed_cloud, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
-from dpmjax.io.scan_bags import open_lidar_bag
+from dpmjax.io.scan_bags import is_bag, open_lidar_bag
 from dpmjax.io.scan_names import folder_note, scan_files
-from dpmjax.sequences import InputError, LidarSequence, Note, require
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
 
 _FORMATS = (
     "a KITTI sequence (velodyne/, calib.txt), a KITTI raw or KITTI-360 drive (velodyne_points/data), a MulRan folder "
@@ -35,15 +24,6 @@ _FORMATS = (
     "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
 )
 _CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
-# What a folder of a layout holds, the reader of the folder and of its scans, and the place of the scans.
-_LAYOUTS: tuple[tuple[str, Callable[[Path, Path], Drive3D], str], ...] = (
-    ("generated/frames", read_kitti_carla, "generated/frames"),
-    ("full_poses_lidar.txt", read_kitti_carla, "frames"),
-    ("Ouster", read_mulran, "Ouster"),
-    ("sensor_data/Ouster", read_mulran, "sensor_data/Ouster"),
-    ("velodyne_points", read_velodyne_points, "velodyne_points/data"),
-    ("velodyne", read_kitti_odometry, "velodyne"),
-)
 
 
 def open_lidar_sequence(
@@ -85,7 +65,7 @@ def open_lidar_sequence(
     log_notes(notes)
     whole = replace(whole, read_scan=_with_unit_doubt(whole), notes=notes)
     part = whole.take(selection)
-    require(part.num_scans > 0, path, f"{selection} chooses 0 of {whole.num_scans} scans", "choose others")
+    require(len(part) > 0, path, f"{selection} chooses 0 of {len(whole)} scans", "choose others")
     return part
 
 
@@ -110,15 +90,15 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     if bin_columns is None:
         bin_columns, note = columns_of_drive(files)
         notes.append(note)
-    return LidarSequence(
-        drive.name,
-        tuple(map(str, files)),
-        lambda index: read_timed_cloud(files[index], bin_columns).points,
-        drive.T_world_lidar,
-        drive.times,
-        lambda index: read_point_times(files[index]),
-        tuple(note for note in notes if note is not None),
-    )
+
+    def read_scan(index: int) -> NDArray[np.float32]:
+        return read_timed_cloud(files[index], bin_columns).points
+
+    def read_times(index: int) -> FloatArray | None:
+        return read_point_times(files[index])
+
+    sources, kept = tuple(map(str, files)), tuple(note for note in notes if note is not None)
+    return LidarSequence(drive.name, sources, read_scan, drive.T_world_lidar, drive.times, read_times, kept)
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
@@ -207,13 +187,13 @@ def _drives(path: Path) -> dict[str, Path]:
 
 def _is_drive(path: Path) -> bool:
     """Returns True for a folder of a known layout, or with scans in it or in data/."""
-    is_known = any((path / marker).exists() for marker, _, _ in _LAYOUTS)
+    is_known = any((path / marker).exists() for marker, _, _ in LAYOUTS)
     return is_known or bool(scan_files(path) or scan_files(path / "data"))
 
 
 def _read(path: Path, poses: Path | None) -> Drive3D:
     """Lists the drive in a folder; a given pose file replaces that of the data set."""
-    layout = next((layout for layout in _LAYOUTS if (path / layout[0]).exists()), None)
+    layout = next((layout for layout in LAYOUTS if (path / layout[0]).exists()), None)
     if layout is not None and poses is None:
         return layout[1](path, path / layout[2])
     files = scan_files(path)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import log_notes, natural_key, read_lines, read_table
+from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
 from dpmjax.io.scan_names import POSE_FILES, match_rows, numbers_of, scan_files
@@ -331,3 +331,14 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
     rotations = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
     return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))
+
+
+# What a folder of a layout holds, the reader of the folder and of its scans, and the place of the scans.
+LAYOUTS: tuple[tuple[str, Callable[[Path, Path], Drive3D], str], ...] = (
+    ("generated/frames", read_kitti_carla, "generated/frames"),
+    ("full_poses_lidar.txt", read_kitti_carla, "frames"),
+    ("Ouster", read_mulran, "Ouster"),
+    ("sensor_data/Ouster", read_mulran, "sensor_data/Ouster"),
+    ("velodyne_points", read_velodyne_points, "velodyne_points/data"),
+    ("velodyne", read_kitti_odometry, "velodyne"),
+)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.geometry import se2
-from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import read_lines, read_table, write_atomically
+from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
 from dpmjax.sequences import FloatArray, InputError, Unit, homogeneous, require
 
 _LAYOUTS = (

@@ -6,19 +6,18 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.io.array_files import load_arrays, to_float32
-from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.files import log_notes, read_bytes
+from dpmjax.io.files import load_arrays, log_notes, read_bytes, to_float32
 from dpmjax.io.poses import check_poses
-from dpmjax.io.scan_bags import read_scan_bag
-from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
+from dpmjax.io.scan_bags import is_bag, read_scan_bag
+from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
@@ -40,11 +39,7 @@ _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
 def read_sequence(
-    path: str | Path,
-    *,
-    selection: slice = slice(None),
-    unit: Unit | None = None,
-    topic: str | None = None,
+    path: str | Path, *, selection: slice = slice(None), unit: Unit | None = None, topic: str | None = None
 ) -> ScanSequence:
     """Reads a sequence of planar scans in any of the known formats.
 
@@ -212,17 +207,10 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
     stated = str(table.get("unit", "m"))
     require(stated in ("px", "m"), path, f"unit is {stated!r}", "say 'px' or 'm'")
-    return ScanSequence(
-        Path(path).stem,
-        stored,
-        mask,
-        unit or ("px" if stated == "px" else "m"),
-        has_angular_order(stored, mask),
-        _planar(table, "poses", len(points), path),
-        _planar(table, "odometry", len(points), path),
-        times.astype(np.float64) if "times" in table else None,
-        notes,
-    )
+    name, length_unit = Path(path).stem, unit or cast(Unit, stated)
+    seconds = times.astype(np.float64) if "times" in table else None
+    poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
+    return ScanSequence(name, stored, mask, length_unit, poses, odometry, seconds, notes)
 
 
 def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:

@@ -12,7 +12,7 @@ from dpmjax.checks import require_positive_fields
 from dpmjax.sequences import FloatArray, homogeneous
 from dpmjax.simulation.building import Building
 from dpmjax.simulation.town.make import Town
-from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, smooth, tangents
+from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, on_path, smooth, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
@@ -155,7 +155,7 @@ def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
-    found = at_way(np.column_stack([lane, tangents(lane)]), way)[:, 2:]
+    found = on_path(lane, way)[:, 2:]
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
 
 
