@@ -25,7 +25,7 @@ from dpmjax.cli import peak_rss_gb
 from dpmjax.geometry import build_pyramid
 from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
-from dpmjax.simulation import HDL64E, simulate_lidar_sequence
+from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
 
 KITTI = ("kitti_00", "kitti_07", "kitti_raw_0013")
 # Parts that run on the host, and the sum of parts that are compiled by then.
@@ -38,7 +38,7 @@ SCANS_IN_MAP = 8
 def make_scans(folder: Path, quick: bool) -> list[Row]:
     """Writes scans for the later stages and returns their sizes: a simulated one, one of KITTI if found."""
     sensor = HDL64E.with_azimuths(256) if quick else HDL64E
-    scans = {"town": simulate_lidar_sequence(0, sensor=sensor).read_scan(10)}
+    scans = {"town": simulate_scene(Scene(0, TownConfig(), DriveConfig(), sensor)).read_scan(10)}
     recorded = [path for name in KITTI if not quick and (path := DATA / "lidar_3d" / name).is_dir()]
     if recorded:
         scans["KITTI"] = open_lidar_sequence(recorded[0]).read_scan(0)

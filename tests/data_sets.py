@@ -9,9 +9,8 @@ from scipy.io import savemat
 
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, ScanSequence, write_kitti
-from dpmjax.io.clouds import parse_ply
+from dpmjax.io.clouds import parse_pcd, parse_ply
 from dpmjax.io.files import read_bytes
-from dpmjax.io.pcd import parse_pcd
 
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written drives have it in the lidar.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])

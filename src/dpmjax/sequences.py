@@ -68,6 +68,21 @@ def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: st
         raise InputError(source, found, advice)
 
 
+def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
+    """Builds homogeneous matrices.
+
+    Args:
+        rotations: (..., 3, 3).
+        translations: (..., 3).
+
+    Returns:
+        (..., 4, 4).
+    """
+    matrices = np.tile(np.eye(4), (*translations.shape[:-1], 1, 1))
+    matrices[..., :3, :3], matrices[..., :3, 3] = rotations, translations
+    return matrices
+
+
 def _require_shapes(record: Any, shapes: dict[str, tuple[int, ...]]) -> None:
     """Raises a ValueError for the first field that is present and has another shape."""
     for name, shape in shapes.items():
@@ -91,7 +106,6 @@ class ScanSequence:
         points: (n, b, 2) float32 beam end points in the sensor frame (x forward, y left), in `unit`; zero where masked.
         mask: (n, b) bool, True where the beam measured something.
         unit: unit of lengths.
-        is_organised: True where beams are ordered by angle: neighbours in the array are neighbours in the world.
         reference_poses: (n, 3) float64 x, y, heading of the sensor in the world (`unit`, radians), or None.
         odometry_poses: (n, 3) float64, raw odometry in its own world, or None where the source has none.
         times: (n,) float64 seconds, or None.
@@ -105,7 +119,6 @@ class ScanSequence:
     points: NDArray[np.float32]
     mask: BoolArray
     unit: Unit
-    is_organised: bool = True
     reference_poses: FloatArray | None = None
     odometry_poses: FloatArray | None = None
     times: FloatArray | None = None
@@ -122,6 +135,11 @@ class ScanSequence:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def is_organised(self) -> bool:
+        """True where beams are ordered by angle: neighbours in the array are neighbours in the world."""
+        return has_angular_order(self.points, self.mask)
 
     def take(self, selection: Selection) -> ScanSequence:
         """Selects scans with their poses and times; arrays are views where `selection` is a slice."""
@@ -255,7 +273,7 @@ class Camera:
         if min(self.width, self.height) < 1 or not min(self.fx, self.fy) > 0.0 or not np.isfinite(numbers).all():
             raise ValueError(f"camera: expected a size and focal lengths above 0, got {self}")
 
-    def rays(self, columns: FloatArray, rows: FloatArray) -> FloatArray:
+    def rays(self, columns: NDArray[Any], rows: NDArray[Any]) -> FloatArray:
         """Computes directions (h, w, 3) with z = 1 of the pixels at rows (h,) and columns (w,)."""
         x, y = np.meshgrid((columns - self.cx) / self.fx, (rows - self.cy) / self.fy)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -315,8 +333,8 @@ class LidarSequence:
         sources: source of each scan, in general a file.
         read_scan: read_scan(i) gives scan i as (n, 3) float32 points in the lidar's frame (x forward, y left, z up), m.
             A bad scan raises an InputError that names the file.
-        T_world_lidar: (num_scans, 4, 4) float64 reference poses, NaN for scans without one; or None.
-        times: (num_scans,) float64 s, or None.
+        T_world_lidar: (n, 4, 4) float64 reference poses, NaN for scans without one; or None.
+        times: (n,) float64 s, or None.
         read_times: read_times(i) gives the times of the points of scan i, (n,) float64 in the unit of its file, or None
             where the file has none; it raises the same errors. None: no scan has times.
         notes: decisions of the reader about the input, and doubts.
@@ -334,7 +352,7 @@ class LidarSequence:
     notes: tuple[Note, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
-        _require_shapes(self, {"T_world_lidar": (self.num_scans, 4, 4), "times": (self.num_scans,)})
+        _require_shapes(self, {"T_world_lidar": (len(self), 4, 4), "times": (len(self),)})
 
     def __getitem__(self, index: int) -> NDArray[np.float32]:
         if not -len(self) <= index < len(self):
@@ -346,14 +364,9 @@ class LidarSequence:
 
     @property
     def has_reference(self) -> BoolArray:
-        """(num_scans,) True for scans with a reference pose."""
+        """(n,) True for scans with a reference pose."""
         T = self.T_world_lidar
         return np.zeros(len(self), bool) if T is None else np.asarray(np.isfinite(T.reshape(-1, 16)).all(axis=1))
-
-    @property
-    def num_scans(self) -> int:
-        """Number of scans, the bad ones too."""
-        return len(self.sources)
 
     def __len__(self) -> int:
         return len(self.sources)
@@ -367,7 +380,7 @@ class LidarSequence:
 
     def take(self, selection: Selection) -> LidarSequence:
         """Selects scans with their poses and times, in the same world; nothing is read."""
-        numbers = [int(i) for i in np.arange(self.num_scans)[selection]]
+        numbers = [int(i) for i in np.arange(len(self))[selection]]
         sources, chosen = tuple(self.sources[i] for i in numbers), _select(self, ("T_world_lidar", "times"), selection)
         read_times = self.read_times
         return replace(

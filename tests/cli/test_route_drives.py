@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from dpmjax.cli.drives import STEP_M, DriveOptions, find_sources, keep_scans, open_drive, route_drive
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, write_kitti, write_tum
-from dpmjax.simulation import motion
+from dpmjax.simulation.town import scan
 from dpmjax.types import PointCloud
 
 # Axes of a camera that looks ahead: x right, y down, z forward.
@@ -37,7 +37,7 @@ def without_rays(monkeypatch, tmp_path) -> Path:
     def scan_town(primitives, pose, time, **_) -> PointCloud:
         return PointCloud(jnp.asarray(pose[None, :3, 3], jnp.float32), jnp.ones(1, bool))
 
-    monkeypatch.setattr(motion, "scan_town", scan_town)
+    monkeypatch.setattr(scan, "scan_town", scan_town)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -108,8 +108,8 @@ def test_a_scan_is_simulated_once_and_rounded(tmp_path) -> None:
     assert np.abs(scans[1] - points - 1).max() <= 0.51 * STEP_M
     # The first and the last scan tell whether kept scans are those of the drive.
     cast.clear()
-    for index, scan in enumerate(scans):
-        np.testing.assert_array_equal(keep_scans(drive_of(0.0), tmp_path).read_scan(index), scan)
+    for index, kept in enumerate(scans):
+        np.testing.assert_array_equal(keep_scans(drive_of(0.0), tmp_path).read_scan(index), kept)
     assert 1 not in cast
     assert keep_scans(drive_of(0.5), tmp_path).read_scan(1)[0, 0] == pytest.approx(scans[1][0, 0] + 0.5, abs=STEP_M)
 

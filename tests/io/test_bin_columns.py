@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError, open_lidar_sequence, read_lidar_file, require_whole_files
-from dpmjax.io.bin_columns import find_columns
+from dpmjax.io.lidar_file import find_columns
 
 NUM = 1200
 

@@ -45,7 +45,7 @@ def rows(poses):
 
 
 def assert_same(sequence, clouds, poses):
-    assert sequence.num_scans == len(clouds)
+    assert len(sequence) == len(clouds)
     for index, cloud in enumerate(clouds):
         np.testing.assert_allclose(sequence.read_scan(index), cloud, rtol=1e-6)
     if poses is None:
@@ -363,10 +363,10 @@ REAL = {"hilti_room": 177, "kitti_00": 4, "kitti_07": 4, "kitti_raw_0013": 144, 
 @pytest.mark.parametrize("name", REAL)
 def test_real_drives_are_opened(real_data, name):
     sequence = open_lidar_sequence(real_data / "lidar_3d" / name)
-    assert sequence.num_scans == REAL[name]
+    assert len(sequence) == REAL[name]
     assert sequence.T_world_lidar is not None
     assert sequence.times is not None
-    points = sequence.read_scan(sequence.num_scans - 1)
+    points = sequence.read_scan(len(sequence) - 1)
     assert points.dtype == np.float32
     assert len(points) > 3000
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from dpmjax.io import InputError
-from dpmjax.io.array_files import parse_mat
+from dpmjax.io.files import parse_mat
 
 VALUES = {
     "pose": np.arange(12.0).reshape(4, 3),

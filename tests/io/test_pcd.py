@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError, read_lidar_file
+from dpmjax.io.clouds import unpack_lzf
 from dpmjax.io.lidar_file import read_point_times
-from dpmjax.io.pcd import unpack_lzf
 from tests.data_sets import read_pcd
 
 NUM = 500

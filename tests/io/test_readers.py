@@ -173,14 +173,6 @@ def test_choices_that_leave_nothing_are_refused(tmp_path, choice):
         read_sequence(path, selection=choice)
 
 
-def test_limit_masks_far_beams_of_every_format(tmp_path):
-    (tmp_path / "a.log").write_text(LOG)
-    assert (read_sequence(tmp_path / "a.log", max_range=2.5).mask == (np.arange(NUM_BEAMS) != 2)).all()
-    assert read_sequence(save(tmp_path, points=POINTS), selection=slice(2), max_range=7).mask.all()
-    with pytest.raises(InputError, match="no valid beam"):
-        read_sequence(save(tmp_path, points=POINTS), max_range=7)
-
-
 def test_log_with_every_beam_at_maximum_range_is_refused(tmp_path):
     (tmp_path / "a.log").write_text(LOG.replace(RANGES, 20 * " 81.91"))
     with pytest.raises(InputError, match="maximum range"):

@@ -15,7 +15,8 @@ from dpmjax.io import (
     write_poses_npy,
     write_tum,
 )
-from dpmjax.io.poses import homogeneous, planar_to_homogeneous, read_stamped_poses
+from dpmjax.io.poses import planar_to_homogeneous, read_stamped_poses
+from dpmjax.sequences import homogeneous
 from tests.optional import import_or_skip
 
 POSES = np.column_stack([np.random.default_rng(0).uniform(-500, 500, (9, 2)), np.linspace(-3.1, 3.1, 9)])

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dpmjax.simulation.raycast2d import beam_angles, cast_rays, scan_world
+from dpmjax.simulation.walk2d import scan_world
+from dpmjax.simulation.world2d import beam_angles, cast_rays
 
 EXACT = 1e-9  # float64 products of coordinates up to 1e3.
 FLOAT32 = 1e-4  # The same stored as float32.

@@ -15,13 +15,14 @@ from dpmjax.simulation import (
     VLP16,
     DriveConfig,
     LidarSensor,
+    Scene,
     TownConfig,
     drive,
     make_town,
     motion,
     route_poses,
     scan_town,
-    simulate_lidar_sequence,
+    simulate_scene,
 )
 from dpmjax.simulation.town.terrain import with_equal_passes
 from tests.data_sets import write_kitti_sequence
@@ -177,10 +178,10 @@ def test_traffic_moves(town):
 
 def test_a_simulated_sequence_is_written_and_read_as_kitti(tmp_path):
     driving = DriveConfig(length_m=3.0)
-    sequence = simulate_lidar_sequence(3, SHORT, driving=driving, sensor=SENSOR)
+    sequence = simulate_scene(Scene(3, SHORT, driving, SENSOR))
     write_kitti_sequence(tmp_path, "05", sequence)
     again = open_lidar_sequence(tmp_path, sequence="05")
-    assert again.num_scans == sequence.num_scans > 2
+    assert len(again) == len(sequence) > 2
     np.testing.assert_allclose(again.times, sequence.times, atol=1e-6)
     relative = np.linalg.inv(sequence.T_world_lidar[0]) @ sequence.T_world_lidar
     np.testing.assert_allclose(again.T_world_lidar, relative, atol=1e-6)

@@ -9,8 +9,8 @@ from scipy.ndimage import label
 from scipy.stats import kstest
 
 from dpmjax.simulation import World, make_world, simulate_sequence, simulate_trajectory
-from dpmjax.simulation.raycast2d import beam_angles, cast_rays
-from dpmjax.simulation.trajectory2d import simulate_odometry, simulate_people, stop_at_people
+from dpmjax.simulation.walk2d import simulate_odometry, simulate_people, stop_at_people
+from dpmjax.simulation.world2d import beam_angles, cast_rays
 
 WORLDS = [0, 1, 2]
 NAMED = ["grove", "grove-4", "crowd"]

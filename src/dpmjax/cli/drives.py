@@ -142,7 +142,8 @@ def route_drive(path: Path, seed: int) -> LidarSequence:
     T_world_lidar[:, :3, 3] -= T_world_lidar[0, :3, 3]  # float32 holds no centimetres at the coordinates of a country
     driving = simulation.DriveConfig(ROUTE_SPEED_M_S, ROUTE_RATE_HZ, max_turn_deg_s=ROUTE_TURN_DEG_S)
     try:
-        drive = simulation.simulate_lidar_sequence(seed, driving=driving, trajectory=T_world_lidar)
+        scene = simulation.Scene(seed, simulation.TownConfig(), driving, simulation.HDL64E)
+        drive = simulation.simulate_scene(scene, trajectory=T_world_lidar)
     except ValueError as error:
         raise InputError(path, str(error), "give the poses of a drive, in metres") from error
     sources = tuple(f"{path}, simulated scan {number}" for number in range(len(drive)))

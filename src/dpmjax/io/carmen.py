@@ -55,19 +55,18 @@ class _Scan(NamedTuple):
     time: float
 
 
-def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> ScanSequence:
+def read_carmen_log(path: str | Path) -> ScanSequence:
     """Reads a CARMEN log: its FLASER lines, or its ROBOTLASER1 lines where there is no FLASER line.
 
     Args:
         path: `.log`, `.clf` or their `.gz`.
-        max_range: readings of this many metres or more are masked as no echo. None takes the largest reading of the
-            log, less 0.1 m, if that reading is beyond 7.9 m, and masks no long reading otherwise. Readings of zero and
-            below are always masked.
 
     Returns:
-        The scans in metres; scans with fewer beams than the longest are padded with masked beams. Poses are those of
-        the laser; the corrected ones are the reference. No times where the log's stand still. Lines of another moment
-        are in the order of time; the reference of such a scan follows from the one before by the odometry.
+        The scans in metres; scans with fewer beams than the longest are padded with masked beams. Masked as no echo
+        are readings of zero and below, and those within 0.1 m of the largest reading of the log, if that is beyond
+        7.9 m. Poses are those of the laser; the corrected ones are the reference. No times where the log's stand still.
+        Lines of another moment are in the order of time; the reference of such a scan follows from the one before by
+        the odometry.
 
     Raises:
         InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
@@ -87,8 +86,7 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
         _log.warning("%s: only its FLASER lines are read, its ROBOTLASER1 lines are left out", path)
     scans = [parse(words, f"{path}:{number}") for number, words in found]
     largest = max(float(scan.ranges.max()) for scan in scans)
-    limit = largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf
-    limit = min(limit if max_range is None else max_range, _LONGEST_RANGE_M)
+    limit = min(largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf, _LONGEST_RANGE_M)
     points, mask = pad_scans([_end_points(scan, limit) for scan in scans])
     times = np.array([scan.time for scan in scans])
     poses, odometry = np.array([scan.pose for scan in scans]), np.array([scan.odometry for scan in scans])
@@ -102,7 +100,7 @@ def read_carmen_log(path: str | Path, *, max_range: float | None = None) -> Scan
     reference = None if is_raw and not lines["NEFF"] else poses
     wheels = None if are_equal and reference is not None else odometry
     name = Path(path).name.split(".")[0]
-    return _in_order_of_time(ScanSequence(name, points, mask, "m", True, reference, wheels, times), path)
+    return _in_order_of_time(ScanSequence(name, points, mask, "m", reference, wheels, times), path)
 
 
 def _end_points(scan: _Scan, limit: float) -> FloatArray:

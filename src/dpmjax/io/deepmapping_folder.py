@@ -11,10 +11,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from dpmjax.io.array_files import parse_mat
-from dpmjax.io.files import natural_key, read_bytes, refusing
-from dpmjax.io.pcd import parse_pcd
-from dpmjax.sequences import FloatArray, ScanSequence, Unit, has_angular_order, pad_scans, require
+from dpmjax.io.clouds import parse_pcd
+from dpmjax.io.files import natural_key, parse_mat, read_bytes, refusing
+from dpmjax.sequences import FloatArray, ScanSequence, Unit, pad_scans, require
 
 _PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
@@ -52,12 +51,12 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     found = f"coordinates up to {largest:g}"
     require(largest <= _LARGEST_LENGTH, path, found, "give metres, or pixels / 512")
     is_small = unit is not None or largest <= _LARGEST_STORED
-    require(is_small, path, f"{found}, too large for pixels / 512", "say --unit m if they are metres")
+    require(is_small, path, f"{found}, too large for pixels / 512", "name the unit m if they are metres")
     if unit != "m":
         points *= np.float32(_PIXELS_PER_UNIT)
     pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
     reference = None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names))
-    return ScanSequence(Path(path).stem, points, mask, unit or "px", has_angular_order(points, mask), reference)
+    return ScanSequence(Path(path).stem, points, mask, unit or "px", reference)
 
 
 def _list_files(path: Path) -> dict[str, bytes]:

@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.array_files import parse_mat, read_depth_png
-from dpmjax.io.files import natural_key, read_bytes, read_lines, read_table, refusing
-from dpmjax.io.poses import check_poses, homogeneous
+from dpmjax.io.files import natural_key, parse_mat, read_bytes, read_depth_png, read_lines, read_table, refusing
+from dpmjax.io.poses import check_poses
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
 
 _log = logging.getLogger(__name__)
@@ -52,10 +51,9 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
     require(folder.is_dir(), folder, "no such folder", "give a folder of NAME.depth.png files")
     images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
     require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give at least two")
-    intrinsics = next(iter(sorted(folder.glob("*intrinsics*.txt"))), None)
-    if intrinsics is None:
-        raise InputError(folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
-    matrix = _read_matrix(intrinsics, (3, 3))
+    named = sorted(folder.glob("*intrinsics*.txt"))
+    require(len(named) > 0, folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
+    intrinsics, matrix = named[0], _read_matrix(named[0], (3, 3))
     poses = [image.with_name(image.name.replace(".depth.png", ".pose.txt")) for image in images]
     missing = [pose.name for pose in poses if not pose.is_file()]
     found = f"no {next(iter(missing), None)} ({len(missing)} missing)"
@@ -148,7 +146,7 @@ def back_project(
     rows, columns = camera.sample_pixels(height, width)
     depth = np.asarray(depth_m, np.float64)[np.ix_(rows, columns)]
     mask = np.isfinite(depth) & (depth > 0.0) & (depth <= max_depth_m)
-    points = camera.rays(columns.astype(np.float64), rows.astype(np.float64)) * np.where(mask, depth, 0.0)[..., None]
+    points = camera.rays(columns, rows) * np.where(mask, depth, 0.0)[..., None]
     return points.astype(np.float32), mask
 
 
@@ -219,7 +217,9 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
             R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64).reshape(-1)
             if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
                 continue  # not placed by the reconstruction
-            poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
+            T_world_camera = np.eye(4)
+            T_world_camera[:3, :3], T_world_camera[:3, 3] = R.T, -R.T @ t * scale_m
+            poses[str(entry["image_name"])] = T_world_camera
     return poses
 
 

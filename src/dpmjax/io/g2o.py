@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import is_number, read_lines, refusing, write_atomically
-from dpmjax.io.poses import homogeneous
 from dpmjax.pose_graph.chordal import spanning_tree_poses
 from dpmjax.pose_graph.graph import Edges, PoseGraph, is_semidefinite, nearest_semidefinite
-from dpmjax.sequences import FloatArray, InputError, require
+from dpmjax.sequences import FloatArray, InputError, homogeneous, require
 
 
 class _Tag(NamedTuple):
@@ -67,11 +66,9 @@ _LARGEST_NUMBER = 1e75  # Squared and weighted errors of larger numbers overflow
 _READ = "give VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO)"
 # Advice for other tags, by parts of their names.
 _OTHER_TAGS = {
-    (
-        "SWITCH",
-        "MAXMIX",
-        "DCS",
-    ): "switchable and mixture edges are not read: give plain edges, a robust kernel lets wrong ones go",
+    ("SWITCH", "MAXMIX", "DCS"): (
+        "switchable and mixture edges are not read: give plain edges, a robust kernel lets wrong ones go"
+    ),
     ("PRIOR",): "priors of single poses are not read: leave them out, and fix nodes with FIX",
     ("XY", "LANDMARK", "POINT", "LINE", "PLANE", "BEARING", "CAM"): (
         "landmarks are not read: leave their lines out; poses and edges between poses are optimised"
@@ -107,13 +104,9 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
     else:
         ids = np.unique([node for line in edge_lines for node in line.nodes])
     row_of = {int(node): row for row, node in enumerate(ids)}
-    for number, node in fixed:
+    for number, node in [*fixed, *((line.number, node) for line in edge_lines for node in line.nodes)]:
         require(node in row_of, f"{path}: line {number}", f"node {node} has no vertex", "add its VERTEX line")
     size = _TAGS[lines[0].tag].tangent_size
-    for end in (0, 1):
-        for line in edge_lines:
-            found = f"node {line.nodes[end]} has no vertex"
-            require(line.nodes[end] in row_of, f"{path}: line {line.number}", found, "add its VERTEX line")
     target, source = np.array([[row_of[node] for node in line.nodes] for line in edge_lines], np.int64).reshape(-1, 2).T
     measurements, information = _poses(path, edge_lines, size), _information(path, edge_lines, size, nearest_psd)
     edges, poses = Edges(source, target, measurements, information), _poses(path, vertices, size)

@@ -6,25 +6,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from dpmjax.io.bags import is_bag
-from dpmjax.io.bin_columns import check_size, columns_of_drive
+import numpy as np
+from numpy.typing import NDArray
+
 from dpmjax.io.files import log_notes, natural_key
-from dpmjax.io.lidar_datasets import (
-    Drive3D,
-    find_pose_file,
-    read_kitti_carla,
-    read_kitti_odometry,
-    read_learned_folder,
-    read_mulran,
-    read_plain_folder,
-    read_velodyne_points,
-)
-from dpmjax.io.lidar_file import read_point_times, read_timed_cloud, with_unit_doubt
+from dpmjax.io.lidar_datasets import LAYOUTS, Drive3D, find_pose_file, read_learned_folder, read_plain_folder
+from dpmjax.io.lidar_file import check_size, columns_of_drive, read_point_times, read_timed_cloud, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference
-from dpmjax.io.scan_bags import open_lidar_bag
+from dpmjax.io.scan_bags import is_bag, open_lidar_bag
 from dpmjax.io.scan_names import folder_note, scan_files
-from dpmjax.sequences import InputError, LidarSequence, Note, require
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
 
 _FORMATS = (
     "a KITTI sequence (velodyne/, calib.txt), a KITTI raw or KITTI-360 drive (velodyne_points/data), a MulRan folder "
@@ -32,15 +24,6 @@ _FORMATS = (
     "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
 )
 _CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
-# What a folder of a layout holds, the reader of the layout, and its folder of scans.
-_LAYOUTS: tuple[tuple[str, Callable[[Path], Drive3D], str], ...] = (
-    ("generated/frames", read_kitti_carla, "generated/frames"),
-    ("full_poses_lidar.txt", read_kitti_carla, "frames"),
-    ("Ouster", read_mulran, "Ouster"),
-    ("sensor_data/Ouster", read_mulran, "sensor_data/Ouster"),
-    ("velodyne_points", read_velodyne_points, "velodyne_points/data"),
-    ("velodyne", read_kitti_odometry, "velodyne"),
-)
 
 
 def open_lidar_sequence(
@@ -78,11 +61,24 @@ def open_lidar_sequence(
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
     whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
     note = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
-    whole = replace(whole, notes=(*whole.notes, *([] if note is None else [note])))
-    log_notes(whole.notes)
+    notes = whole.notes if note is None else (*whole.notes, note)
+    log_notes(notes)
+    whole = replace(whole, read_scan=_with_unit_doubt(whole), notes=notes)
     part = whole.take(selection)
-    require(part.num_scans > 0, path, f"{selection} chooses 0 of {whole.num_scans} scans", "choose others")
+    require(len(part) > 0, path, f"{selection} chooses 0 of {len(whole)} scans", "choose others")
     return part
+
+
+def _with_unit_doubt(sequence: LidarSequence) -> Callable[[int], NDArray[np.float32]]:
+    """Returns the reader of the scans; it logs a doubt about the unit of the first one."""
+
+    def read(index: int) -> NDArray[np.float32]:
+        points = sequence.read_scan(index)
+        if index == 0 and (note := unit_note(points, sequence.sources[0])) is not None:
+            log_notes([note])
+        return points
+
+    return read
 
 
 def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
@@ -95,15 +91,14 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
         bin_columns, note = columns_of_drive(files)
         notes.append(note)
 
-    return LidarSequence(
-        drive.name,
-        tuple(map(str, files)),
-        with_unit_doubt(lambda index: read_timed_cloud(files[index], bin_columns).points, files),
-        drive.T_world_lidar,
-        drive.times,
-        lambda index: read_point_times(files[index]),
-        tuple(note for note in notes if note is not None),
-    )
+    def read_scan(index: int) -> NDArray[np.float32]:
+        return read_timed_cloud(files[index], bin_columns).points
+
+    def read_times(index: int) -> FloatArray | None:
+        return read_point_times(files[index])
+
+    sources, kept = tuple(map(str, files)), tuple(note for note in notes if note is not None)
+    return LidarSequence(drive.name, sources, read_scan, drive.T_world_lidar, drive.times, read_times, kept)
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
@@ -192,15 +187,15 @@ def _drives(path: Path) -> dict[str, Path]:
 
 def _is_drive(path: Path) -> bool:
     """Returns True for a folder of a known layout, or with scans in it or in data/."""
-    is_known = any((path / marker).exists() for marker, _, _ in _LAYOUTS)
+    is_known = any((path / marker).exists() for marker, _, _ in LAYOUTS)
     return is_known or bool(scan_files(path) or scan_files(path / "data"))
 
 
 def _read(path: Path, poses: Path | None) -> Drive3D:
     """Lists the drive in a folder; a given pose file replaces that of the data set."""
-    layout = next((layout for layout in _LAYOUTS if (path / layout[0]).exists()), None)
+    layout = next((layout for layout in LAYOUTS if (path / layout[0]).exists()), None)
     if layout is not None and poses is None:
-        return layout[1](path)
+        return layout[1](path, path / layout[2])
     files = scan_files(path)
     if files and files[0].suffix.lower() == ".npz" and layout is None and poses is None:
         return read_learned_folder(path)

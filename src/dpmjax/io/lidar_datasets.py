@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import log_notes, natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, homogeneous, interpolate_poses, read_stamped_poses
+from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
+from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
 from dpmjax.io.scan_names import POSE_FILES, match_rows, numbers_of, scan_files
-from dpmjax.sequences import FloatArray, InputError, Note, require
+from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
@@ -109,7 +109,7 @@ def read_learned_folder(folder: Path) -> Drive3D:
     return drive._replace(T_world_lidar=check_poses(stacked, folder))
 
 
-def read_kitti_odometry(folder: Path) -> Drive3D:
+def read_kitti_odometry(folder: Path, scans: Path) -> Drive3D:
     """Lists a sequence of KITTI odometry: velodyne/, times.txt, and poses.
 
     Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
@@ -120,7 +120,7 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    files = scan_files(folder / "velodyne")
+    files = scan_files(scans)
     in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
     in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
     drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
@@ -137,11 +137,10 @@ def read_kitti_odometry(folder: Path) -> Drive3D:
     return drive._replace(T_world_lidar=T, notes=notes)
 
 
-def read_velodyne_points(folder: Path) -> Drive3D:
+def read_velodyne_points(folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
-    files = scan_files(folder / "velodyne_points" / "data")
-    times = _read_stamps(folder / "velodyne_points" / "timestamps.txt", files)
-    drive = Drive3D(folder.resolve().name, files, times=times)
+    files = scan_files(scans)
+    drive = Drive3D(folder.resolve().name, files, times=_read_stamps(scans.parent / "timestamps.txt", files))
     is_kitti_360 = folder.resolve().parent.name == "data_3d_raw"
     return _with_kitti_360_poses(drive, folder) if is_kitti_360 else _with_oxts_poses(drive, folder)
 
@@ -193,7 +192,7 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
     return _interpolate(drive, frames, (rows[:, 0], T_world_lidar), path)
 
 
-def read_kitti_carla(folder: Path) -> Drive3D:
+def read_kitti_carla(_folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
@@ -202,10 +201,9 @@ def read_kitti_carla(folder: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    home = folder / "generated" if (folder / "generated").is_dir() else folder
-    files = scan_files(home / "frames", (".ply",))
-    name = home.resolve().parent.name if home.resolve().name == "generated" else home.resolve().name
-    path = home / "full_poses_lidar.txt"
+    files, home = scan_files(scans, (".ply",)), scans.parent.resolve()
+    name = home.parent.name if home.name == "generated" else home.name
+    path = scans.parent / "full_poses_lidar.txt"
     if not path.is_file():
         return Drive3D(name, files)
     rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
@@ -215,7 +213,7 @@ def read_kitti_carla(folder: Path) -> Drive3D:
     return Drive3D(name, files, from_rows(rows[at, :12], path), rows[at, 12])
 
 
-def read_mulran(folder: Path) -> Drive3D:
+def read_mulran(folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame. Scans half a second or more outside of the poses are left out.
@@ -225,8 +223,7 @@ def read_mulran(folder: Path) -> Drive3D:
     """
     from scipy.spatial.transform import Rotation
 
-    home = folder / "Ouster" if (folder / "Ouster").is_dir() else folder / "sensor_data" / "Ouster"
-    files = scan_files(home, (".bin",))
+    files = scan_files(scans, (".bin",))
     stamps = np.array(_require_numbers(files), np.int64)
     times = (stamps - stamps[:1]).astype(np.float64) * 1e-9
     drive = Drive3D(folder.resolve().name, files, times=times)
@@ -334,3 +331,14 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
     rotations = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
     return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))
+
+
+# What a folder of a layout holds, the reader of the folder and of its scans, and the place of the scans.
+LAYOUTS: tuple[tuple[str, Callable[[Path, Path], Drive3D], str], ...] = (
+    ("generated/frames", read_kitti_carla, "generated/frames"),
+    ("full_poses_lidar.txt", read_kitti_carla, "frames"),
+    ("Ouster", read_mulran, "Ouster"),
+    ("sensor_data/Ouster", read_mulran, "sensor_data/Ouster"),
+    ("velodyne_points", read_velodyne_points, "velodyne_points/data"),
+    ("velodyne", read_kitti_odometry, "velodyne"),
+)

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.geometry import se2
-from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import read_lines, read_table, write_atomically
-from dpmjax.sequences import FloatArray, InputError, Unit, require
+from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
+from dpmjax.sequences import FloatArray, InputError, Unit, homogeneous, require
 
 _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), EuRoC (with its line of names), KITTI (12 numbers a row), or .npy of "
@@ -170,21 +169,6 @@ def write_poses_npy(path: str | Path, poses: ArrayLike) -> Path:
     return write_atomically(path, buffer.getvalue())
 
 
-def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
-    """Builds homogeneous matrices.
-
-    Args:
-        rotations: (..., 3, 3).
-        translations: (..., 3).
-
-    Returns:
-        (..., 4, 4).
-    """
-    matrices = np.tile(np.eye(4), (*translations.shape[:-1], 1, 1))
-    matrices[..., :3, :3], matrices[..., :3, 3] = rotations, translations
-    return matrices
-
-
 def planar_to_homogeneous(poses: FloatArray) -> FloatArray:
     """Converts planar poses to homogeneous matrices in space.
 
@@ -194,8 +178,8 @@ def planar_to_homogeneous(poses: FloatArray) -> FloatArray:
     Returns:
         (n, 4, 4) `T_world_scan`, z up.
     """
-    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
-    matrices[:, :2, :2], matrices[:, :2, 3] = se2.rotation(poses[:, 2]), poses[:, :2]
+    matrices = homogeneous(np.eye(3), np.pad(poses[:, :2], ((0, 0), (0, 1))))
+    matrices[:, :2, :2] = se2.rotation(poses[:, 2])
     return matrices
 
 

@@ -6,19 +6,18 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.io.array_files import load_arrays, to_float32
-from dpmjax.io.bags import is_bag
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.files import log_notes, read_bytes
+from dpmjax.io.files import load_arrays, log_notes, read_bytes, to_float32
 from dpmjax.io.poses import check_poses
-from dpmjax.io.scan_bags import read_scan_bag
-from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, has_angular_order, require
+from dpmjax.io.scan_bags import is_bag, read_scan_bag
+from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
@@ -40,12 +39,7 @@ _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
 def read_sequence(
-    path: str | Path,
-    *,
-    selection: slice = slice(None),
-    unit: Unit | None = None,
-    max_range: float | None = None,
-    topic: str | None = None,
+    path: str | Path, *, selection: slice = slice(None), unit: Unit | None = None, topic: str | None = None
 ) -> ScanSequence:
     """Reads a sequence of planar scans in any of the known formats.
 
@@ -55,12 +49,11 @@ def read_sequence(
         selection: start, stop and stride in scans.
         unit: unit of the file's lengths where the file does not state it; None takes PCD files as pixels / 512 and
             arrays as metres. CARMEN logs are in metres.
-        max_range: beams of this length or more (in the sequence's unit) are masked; None leaves it to the reader, and
-            masks the beams of the largest range where many have exactly this one.
         topic: topic of planar scans of a bag; None: the only one.
 
     Returns:
-        The sequence: at least two scans of at least 17 beams, each with at least one valid beam.
+        The sequence: at least two scans of at least 17 beams, each with at least one valid beam. Beams of the largest
+        range are masked where many have exactly this one.
 
     Raises:
         InputError: one line with the file, the finding and the advice. The file is missing, of an unknown format or
@@ -72,9 +65,7 @@ def read_sequence(
     chosen = f"start {start}, stop {stop}, stride {stride}"
     is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
-    require(max_range is None or max_range > 0, path, f"max_range is {max_range}", "give a positive length")
-    whole = _read(path, unit, max_range, topic)
-    whole = _without_maxima(whole, path) if max_range is None else _limit(whole, max_range)
+    whole = _without_maxima(_read(path, unit, topic), path)
     sequence = _without_constant_odometry(whole, path).take(slice(start, stop, stride))
     found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
     require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
@@ -86,7 +77,7 @@ def read_sequence(
     return sequence
 
 
-def _read(path: Path, unit: Unit | None, max_range: float | None, topic: str | None) -> ScanSequence:
+def _read(path: Path, unit: Unit | None, topic: str | None) -> ScanSequence:
     require(path.exists(), path, "no such file or folder", "check the path")
     kind = _detect(path)
     require(topic is None or kind == "bag", path, "no bag of ROS", "leave the topic out")
@@ -95,7 +86,7 @@ def _read(path: Path, unit: Unit | None, max_range: float | None, topic: str | N
     if kind == "arrays":
         return read_arrays(path, unit=unit)
     require(unit != "px", path, f"a {kind} is in metres, not px", "leave the unit out")
-    return read_scan_bag(path, topic) if kind == "bag" else read_carmen_log(path, max_range=max_range)
+    return read_scan_bag(path, topic) if kind == "bag" else read_carmen_log(path)
 
 
 def _detect(path: Path) -> str:
@@ -119,12 +110,6 @@ def _detect(path: Path) -> str:
     return "CARMEN log"
 
 
-def _limit(sequence: ScanSequence, max_range: float) -> ScanSequence:
-    """Masks the beams of `max_range` and more."""
-    mask = sequence.mask & (np.linalg.norm(sequence.points, axis=2) < max_range)
-    return replace(sequence, mask=mask, points=np.where(mask[..., None], sequence.points, np.float32(0)))
-
-
 def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     """Masks the beams at the largest range, where many have exactly this range, the code for no echo."""
     if not sequence.mask.any():
@@ -137,7 +122,9 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     if not is_code or (sequence.mask & ~is_maximum).any(axis=1).mean() < _LEAST_OTHERS:
         return sequence
     found = f"{100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
-    return replace(_limit(sequence, limit), notes=(*sequence.notes, Note(f"{path}: {found}")))
+    mask = sequence.mask & (np.linalg.norm(sequence.points, axis=2) < limit)
+    points = np.where(mask[..., None], sequence.points, np.float32(0))
+    return replace(sequence, mask=mask, points=points, notes=(*sequence.notes, Note(f"{path}: {found}")))
 
 
 def _without_constant_odometry(sequence: ScanSequence, path: Path) -> ScanSequence:
@@ -155,7 +142,7 @@ def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) ->
     require(num_beams >= _LEAST_BEAMS, path, f"scans of {num_beams} beams", advice)
     empty = np.flatnonzero(~sequence.mask.any(axis=1))
     found = "every beam of every scan is invalid or at maximum range"
-    require(len(empty) < len(sequence), path, found, "check ranges and --max-range")
+    require(len(empty) < len(sequence), path, found, "check the ranges")
     if len(empty):
         first = start + stride * empty[0]
         found = f"{len(empty)} of {len(sequence)} scans have no valid beam, the first is scan {first}"
@@ -220,17 +207,10 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
     stated = str(table.get("unit", "m"))
     require(stated in ("px", "m"), path, f"unit is {stated!r}", "say 'px' or 'm'")
-    return ScanSequence(
-        Path(path).stem,
-        stored,
-        mask,
-        unit or ("px" if stated == "px" else "m"),
-        has_angular_order(stored, mask),
-        _planar(table, "poses", len(points), path),
-        _planar(table, "odometry", len(points), path),
-        times.astype(np.float64) if "times" in table else None,
-        notes,
-    )
+    name, length_unit = Path(path).stem, unit or cast(Unit, stated)
+    seconds = times.astype(np.float64) if "times" in table else None
+    poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
+    return ScanSequence(name, stored, mask, length_unit, poses, odometry, seconds, notes)
 
 
 def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:

@@ -15,8 +15,7 @@ from typing import get_args
 
 import numpy as np
 
-from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import refusing, write_atomically
+from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import Arrays, Precision, pack_map, unpack_map
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import SlamConfig

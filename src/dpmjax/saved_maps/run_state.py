@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dpmjax.io.array_files import load_arrays
-from dpmjax.io.files import refusing, write_atomically
+from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_file import map_arrays, map_of_arrays
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.front_end import FrontEndState, ScanReport

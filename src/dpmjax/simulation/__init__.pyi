@@ -11,11 +11,7 @@ from .motion import TimedPoses as TimedPoses
 from .motion import WalkConfig as WalkConfig
 from .motion import drive as drive
 from .motion import route_poses as route_poses
-from .motion import simulate_lidar_sequence as simulate_lidar_sequence
 from .motion import walk as walk
-from .raycast2d import cast_scans as cast_scans
-from .raycast2d import scan_world as scan_world
-from .raycast2d import simulate_sequence as simulate_sequence
 from .scenes import TRAINING_MIXTURE as TRAINING_MIXTURE
 from .scenes import Scene as Scene
 from .scenes import SceneMixture as SceneMixture
@@ -35,7 +31,10 @@ from .town.scan import SOLID_STATE as SOLID_STATE
 from .town.scan import VLP16 as VLP16
 from .town.scan import LidarSensor as LidarSensor
 from .town.scan import scan_town as scan_town
-from .trajectory2d import simulate_odometry as simulate_odometry
-from .trajectory2d import simulate_trajectory as simulate_trajectory
+from .walk2d import scan_world as scan_world
+from .walk2d import simulate_odometry as simulate_odometry
+from .walk2d import simulate_sequence as simulate_sequence
+from .walk2d import simulate_trajectory as simulate_trajectory
 from .world2d import World as World
+from .world2d import cast_scans as cast_scans
 from .world2d import make_world as make_world

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dpmjax.checks import require_fields
-from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray, homogeneous
 from dpmjax.types import AnyArray
 
 _CAMERA_HEIGHT_M, _ROOM_HEIGHT_M, _WALL_M, _DOOR_M = 1.1, 2.6, 0.12, 0.95
@@ -265,7 +265,7 @@ def simulate_depth_sequence(
     rng = np.random.default_rng([seed, 11])
     T_world_camera = _planar_to_matrices(_wide_walk(home, num_views, config, rng))
     rows, columns = ACTIVE_VISION.sample_pixels(config.height, config.width)
-    rays = ACTIVE_VISION.rays(columns.astype(np.float64), rows.astype(np.float64))
+    rays = ACTIVE_VISION.rays(columns, rows)
     # One capacity for all apartments, so that the caster compiles once.
     spare = -len(home.centres) % 32
     boxes = (np.pad(home.centres, ((0, spare), (0, 0))), np.pad(home.half_sizes, ((0, spare), (0, 0))))
@@ -326,7 +326,6 @@ def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.rand
 def _planar_to_matrices(poses: FloatArray) -> FloatArray:
     """Converts x, z and the angle about y to T_world_camera (n, 4, 4)."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
+    T = homogeneous(np.eye(3), np.insert(poses[:, :2], 1, 0.0, axis=1))
     T[:, 0, 0], T[:, 0, 2], T[:, 2, 0], T[:, 2, 2] = cos, sin, -sin, cos
-    T[:, 0, 3], T[:, 2, 3] = poses[:, 0], poses[:, 1]
     return T

@@ -18,6 +18,7 @@ from dpmjax.simulation.town.primitives import CELL_M, Ground, RoadUsers, TownPri
 _Put = Callable[[Collection, np.random.Generator, Place], None]
 KINDS = ("office", "hall", "flat", "corridor", "tunnel", "garage", "stairs")
 _THICKNESS_M = 0.12
+_DOOR_M = 2.1  # Height of a door.
 _CLEARANCE_M = 0.45  # Nothing stands nearer than this to the route.
 _PILLAR_CLEARANCE_M = 0.2
 _MARGIN_M = 20.0
@@ -112,12 +113,12 @@ def _walls(into: Collection, rng: np.random.Generator, room: Room, doors: list[D
     for axis in (0, 1):
         for at, inwards in ((room.low[axis], 1), (room.high[axis], -1)):
             here = [door for door in doors if door.axis == axis and abs(door.place[axis] - at) < 0.01]
-            cuts = sorted((door.place[1 - axis], door.width, door.height) for door in here)
+            cuts = sorted((door.place[1 - axis], door.width) for door in here)
             depth = 0.08 if not cuts and rng.random() < 0.5 else 0.0
             start, across = room.low[1 - axis], at + 0.5 * inwards * _THICKNESS_M
-            for middle, width, height in cuts:
+            for middle, width in cuts:
                 _wall(into, axis, across, (start, middle - 0.5 * width), (-0.5, room.height), depth)
-                _wall(into, axis, across, (middle - 0.5 * width, middle + 0.5 * width), (height, room.height), 0.0)
+                _wall(into, axis, across, (middle - 0.5 * width, middle + 0.5 * width), (_DOOR_M, room.height), 0.0)
                 start = middle + 0.5 * width
             _wall(into, axis, across, (start, room.high[1 - axis]), (-0.5, room.height), depth)
 

@@ -43,14 +43,12 @@ class Door:
         place: x and y of the middle of the opening, m.
         axis: direction of passage, 0 along x, 1 along y.
         width: width of the opening, m.
-        height: height of the opening, m.
     """
 
     rooms: tuple[int, int]
     place: tuple[float, float]
     axis: int
     width: float
-    height: float
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,8 @@ def make_plan(rng: np.random.Generator, kind: str) -> Plan:
             end = length if length - x - wide < 2.5 else x + wide
             near, far = 0.5 * width * side, (0.5 * width + depth) * side
             room = Room((x, min(near, far)), (end, max(near, far)), height + float(rng.choice([0.0, 0.0, 0.4])))
-            doors.append(_door(rng, (0, len(rooms)), (float(rng.uniform(x + 0.8, end - 0.8)), near), 1, (0.85, 1.4)))
+            place = float(rng.uniform(x + 0.8, end - 0.8)), near
+            doors.append(Door((0, len(rooms)), place, 1, rng.uniform(0.85, 1.4)))
             rooms.append(room)
             x = end
     return Plan(tuple(rooms), tuple(doors))
@@ -127,12 +126,12 @@ def _row_of_halls(rng: np.random.Generator) -> Plan:
         end, half = x + rng.uniform(10, 35), 0.5 * rng.uniform(9, 26)
         rooms.append(Room((x, -half), (end, half), height * float(rng.uniform(0.8, 1.0))))
         if index:
-            doors.append(_door(rng, (index - 1, index), (x, 0.0), 0, (2.0, 4.0)))
+            doors.append(Door((index - 1, index), (x, 0.0), 0, rng.uniform(2.0, 4.0)))
         x = end
     for number, hall in enumerate(tuple(rooms)):
         low, wide, top = hall.low[0] + rng.uniform(0, 3), rng.uniform(4, 8), hall.high[1]
         room = Room((low, top), (low + wide, top + rng.uniform(3, 8)), rng.uniform(2.5, 3.5))
-        doors.append(_door(rng, (number, len(rooms)), (low + 0.5 * wide, top), 1, (0.9, 1.8)))
+        doors.append(Door((number, len(rooms)), (low + 0.5 * wide, top), 1, rng.uniform(0.9, 1.8)))
         rooms.append(room)
     return Plan(tuple(rooms), tuple(doors))
 
@@ -156,15 +155,9 @@ def _long_corridor(rng: np.random.Generator, *, is_tunnel: bool, stretch: float)
     for x in np.arange(4, length - 10, length / 3)[: rng.integers(4)] + rng.uniform(0, 6):
         side, wide = int(rng.choice([-1, 1])), rng.uniform(3, 6)
         near, far = 0.5 * width * side, (0.5 * width + rng.uniform(3, 6)) * side
-        doors.append(_door(rng, (0, len(rooms)), (float(x + 0.5 * wide), near), 1, (0.85, 1.4)))
+        doors.append(Door((0, len(rooms)), (float(x + 0.5 * wide), near), 1, rng.uniform(0.85, 1.4)))
         rooms.append(Room((x, min(near, far)), (x + wide, max(near, far)), height))
     return Plan(tuple(rooms), tuple(doors))
-
-
-def _door(
-    rng: np.random.Generator, rooms: tuple[int, int], place: tuple[float, float], axis: int, width: tuple[float, float]
-) -> Door:
-    return Door(rooms, place, axis, float(rng.uniform(*width)), 2.1)
 
 
 def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArray:

@@ -1,22 +1,18 @@
-"""Motion of the lidar: drives along the route of a town, walks through a building, and the scans that it takes."""
+"""Motion of the lidar: drives along the route of a town, walks through a building."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.checks import require_positive_fields
-from dpmjax.sequences import FloatArray, LidarSequence
+from dpmjax.sequences import FloatArray, homogeneous
 from dpmjax.simulation.building import Building
-from dpmjax.simulation.town.make import Town, TownConfig, make_town
-from dpmjax.simulation.town.primitives import TownPrimitives
-from dpmjax.simulation.town.scan import HDL64E, LidarSensor, scan_town
-from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, smooth, tangents
+from dpmjax.simulation.town.make import Town
+from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, on_path, smooth, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
@@ -73,35 +69,6 @@ class TimedPoses(NamedTuple):
     times: FloatArray
 
 
-def simulate_lidar_sequence(
-    seed: int,
-    config: TownConfig = TownConfig(),  # noqa: B008 (frozen)
-    *,
-    driving: DriveConfig | None = None,
-    sensor: LidarSensor = HDL64E,
-    trajectory: ArrayLike | None = None,
-) -> LidarSequence:
-    """Simulates a drive through a new town; a scan is simulated when it is read.
-
-    Args:
-        seed: seed of the town, the drive and the noise.
-        config: settings of the town.
-        driving: settings of the drive; None takes the default with the sensor's own height.
-        sensor: the lidar.
-        trajectory: (n, 4, 4) `T_world_lidar` of a real drive to lay the street along, see `make_town`.
-
-    Returns:
-        The sequence, with exact poses and times. The world is the town's.
-
-    Raises:
-        ValueError: see `make_town`.
-    """
-    town = make_town(seed, config, trajectory=trajectory)
-    driving = driving or DriveConfig(sensor_height_m=sensor.height_m)
-    way = drive(town, driving, seed=seed)
-    return scan_along(town.name, town.primitives, way, seed=seed, sensor=sensor)
-
-
 def route_poses(
     rng: np.random.Generator, kind: str, length_m: float, *, block_m: float = 100.0, step_m: float = 1.0
 ) -> FloatArray:
@@ -119,50 +86,21 @@ def route_poses(
     """
     lane = lane_of(make_streets(rng, kind, length_m, block_m), is_reversed=False)
     way = np.arange(0.0, arc_lengths(lane)[-1], step_m)
-    x, y, *forward = at_way(np.column_stack([lane, tangents(lane)]), way).T
-    cos, sin = np.array(forward) / np.linalg.norm(forward, axis=0)
-    T = np.tile(np.eye(4), (len(way), 1, 1))
+    cos, sin = _directions(lane, way).T
+    T = homogeneous(np.eye(3), np.pad(at_way(lane, way), ((0, 0), (0, 1))))
     T[:, :2, :2] = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
-    T[:, 0, 3], T[:, 1, 3] = x, y
     return T
 
 
-def scan_along(
-    name: str,
-    primitives: TownPrimitives,
-    way: TimedPoses,
-    *,
-    seed: int,
-    sensor: LidarSensor,
-    is_moving: bool = False,
-) -> LidarSequence:
-    """Returns the scans at given poses in a world; each is simulated when it is read.
+def turn_motions(way: TimedPoses) -> FloatArray:
+    """Computes the motion of the lidar during each of its turns, at the velocity to the next pose.
 
     Args:
-        name: name of the sequence.
-        primitives: the world.
         way: poses and times.
-        seed: seed of the noise.
-        sensor: the lidar.
-        is_moving: True where the lidar moves during its turn, at the velocity to the next pose.
 
     Returns:
-        The sequence.
+        (n, 6) twists (m, radians) in the lidar's own frame; the last one is repeated.
     """
-    motions = _motions(way) if is_moving else np.zeros((len(way.times), 6))
-
-    def read_scan(index: int) -> NDArray[np.float32]:
-        key = jax.random.fold_in(jax.random.key(seed), index)
-        pose, time, motion = way.T_world_lidar[index], way.times[index], motions[index]
-        cloud = scan_town(primitives, pose, time, key=key, sensor=sensor, motion=motion)
-        return np.asarray(cloud.points)[np.asarray(cloud.mask)]
-
-    sources = tuple(f"{name}, scan {index}" for index in range(len(way.times)))
-    return LidarSequence(name, sources, read_scan, way.T_world_lidar, way.times)
-
-
-def _motions(way: TimedPoses) -> FloatArray:
-    """Computes twists (n, 6) of the sensor during a turn towards the next pose; the last one is repeated."""
     poses = way.T_world_lidar
     if len(poses) < 2:
         return np.zeros((len(poses), 6))
@@ -217,7 +155,7 @@ def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
-    found = at_way(np.column_stack([lane, tangents(lane)]), way)[:, 2:]
+    found = on_path(lane, way)[:, 2:]
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
 
 
@@ -242,11 +180,8 @@ def _poses(
     sideways = np.column_stack([left, bank])
     up = np.cross(forward, sideways)
     up /= np.linalg.norm(up, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (len(places), 1, 1))
-    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = forward, np.cross(up, forward), up
-    poses[:, :2, 3] = places
-    poses[:, 2, 3] = height(places) + config.sensor_height_m
-    return poses
+    turns = np.stack([forward, np.cross(up, forward), up], axis=-1)
+    return homogeneous(turns, np.column_stack([places, height(places) + config.sensor_height_m]))
 
 
 @dataclass(frozen=True)
@@ -292,12 +227,10 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     facing = at_way(np.column_stack([route, along]), way + _LOOK_AHEAD_M)[:, 2:]
     yaw = np.arctan2(facing[:, 1], facing[:, 0]) + np.radians(look_deg) * _slow_sway(rng, times)
     tilt = np.radians(config.tilt_deg) * np.column_stack([_slow_sway(rng, times), _slow_sway(rng, times)])
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix()
-    poses[:, :2, 3] = at_way(route, way)
-    steps = np.sin(2 * np.pi * _STEPS_PER_S * times) + _SINK * _slow_sway(rng, times)
-    poses[:, 2, 3] = building.plan.floor_at(poses[:, 0, 3]) + config.height_m + bob_m * steps
-    return TimedPoses(poses, times)
+    turns = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix()
+    places, steps = at_way(route, way), np.sin(2 * np.pi * _STEPS_PER_S * times) + _SINK * _slow_sway(rng, times)
+    heights = building.plan.floor_at(places[:, 0]) + config.height_m + bob_m * steps
+    return TimedPoses(homogeneous(turns, np.column_stack([places, heights])), times)
 
 
 def _slow_sway(rng: np.random.Generator, times: FloatArray) -> FloatArray:

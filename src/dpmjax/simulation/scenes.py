@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TypeVar, cast
 
+import jax
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import require_one_of, require_positive_fields
 from dpmjax.sequences import LidarSequence
 from dpmjax.simulation.building import KINDS as INDOOR_KINDS
-from dpmjax.simulation.building import BuildingConfig, make_building
-from dpmjax.simulation.motion import DriveConfig, WalkConfig, drive, scan_along, walk
+from dpmjax.simulation.building import Building, BuildingConfig, make_building
+from dpmjax.simulation.motion import DriveConfig, WalkConfig, drive, turn_motions, walk
+from dpmjax.simulation.town import scan
 from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
-from dpmjax.simulation.town.make import TownConfig, make_town
+from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, SOLID_STATE, VLP16, LidarSensor
 
 _SCENE_STREAM = 8170
@@ -157,34 +158,37 @@ def _choice(rng: np.random.Generator, entries: tuple[tuple[_Entry, float], ...])
     return entries[rng.choice(len(entries), p=weights / weights.sum())][0]
 
 
-def simulate_scene(scene: Scene) -> LidarSequence:
+def simulate_scene(scene: Scene, *, trajectory: ArrayLike | None = None) -> LidarSequence:
     """Builds a scene; a scan is simulated when it is read.
 
     Args:
         scene: scene from `draw_scene`, or made by hand.
+        trajectory: (n, 4, 4) `T_world_lidar` of a real drive to lay the street of a town along, see `make_town`.
 
     Returns:
-        The sequence, with exact poses and times.
+        The sequence, with exact poses and times. The world is that of the place.
     """
+    place: Building | Town
     if isinstance(scene.place, BuildingConfig):
-        building = make_building(scene.seed, scene.place)
-        name, bodies = building.name, building.primitives
-        way = walk(building, cast(WalkConfig, scene.motion), seed=scene.seed)
+        place = make_building(scene.seed, scene.place)
+        way = walk(place, cast(WalkConfig, scene.motion), seed=scene.seed)
     else:
-        town = make_town(scene.seed, scene.place)
-        name, bodies = town.name, town.primitives
-        way = drive(town, cast(DriveConfig, scene.motion), seed=scene.seed)
+        place = make_town(scene.seed, scene.place, trajectory=trajectory)
+        way = drive(place, cast(DriveConfig, scene.motion), seed=scene.seed)
     sensors = [sensor for sensor in (scene.sensor, scene.other_sensor) if sensor is not None]
-    name = f"{name}-{'+'.join(sensor.name for sensor in sensors)}"
-    scan = partial(scan_along, name, bodies, way, seed=scene.seed, is_moving=scene.is_moving)
-    sequences = [scan(sensor=sensor) for sensor in sensors]
-    poses = way.T_world_lidar.copy()
-    poses[:, :3, 3] *= scene.scale
+    name = f"{place.name}-{'+'.join(sensor.name for sensor in sensors)}"
+    motions = turn_motions(way) if scene.is_moving else np.zeros((len(way.times), 6))
 
     def read_scan(index: int) -> NDArray[np.float32]:
-        return np.float32(scene.scale) * sequences[index % len(sequences)].read_scan(index)
+        key, pose = jax.random.fold_in(jax.random.key(scene.seed), index), way.T_world_lidar[index]
+        sensor, motion = sensors[index % len(sensors)], motions[index]
+        cloud = scan.scan_town(place.primitives, pose, way.times[index], key=key, sensor=sensor, motion=motion)
+        return np.float32(scene.scale) * np.asarray(cloud.points)[np.asarray(cloud.mask)]
 
-    return replace(sequences[0], read_scan=read_scan, T_world_lidar=poses)
+    poses = way.T_world_lidar.copy()
+    poses[:, :3, 3] *= scene.scale
+    sources = tuple(f"{name}, scan {index}" for index in range(len(poses)))
+    return LidarSequence(name, sources, read_scan, poses, way.times)
 
 
 def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[LidarSequence]:

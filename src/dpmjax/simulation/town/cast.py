@@ -57,15 +57,11 @@ class NearWorld(NamedTuple):
     """Bodies and ground near the sensor.
 
     Attributes:
-        boxes: nearest boxes, those of the traffic among them.
-        cylinders: nearest cylinders.
-        spheroids: nearest spheroids.
+        kinds: nearest boxes, those of the traffic among them, nearest cylinders, and nearest spheroids.
         ground: a square of ground, its origin relative to the sensor; heights are those of the world.
     """
 
-    boxes: NearBodies
-    cylinders: NearBodies
-    spheroids: NearBodies
+    kinds: tuple[NearBodies, ...]
     ground: Ground
 
 
@@ -98,10 +94,8 @@ def near_world(
     """
     boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
     kinds = zip((boxes, town.cylinders, town.spheroids), _NUM_NEAR, strict=True)
-    boxes, cylinders, spheroids = (
-        _nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds
-    )
-    return NearWorld(boxes, cylinders, spheroids, _near_ground(town.ground, start))
+    near = (_nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds)
+    return NearWorld(tuple(near), _near_ground(town.ground, start))
 
 
 def _near_ground(ground: Ground, start: Float[Array, " 3"]) -> Ground:
@@ -245,16 +239,15 @@ def cast_turn(near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *
     turns = jnp.einsum("ij,sjk->sik", turn, rays.T_lidar_sector[:, :3, :3], precision=highest)
     offsets = jnp.einsum("ij,sj->si", turn, rays.T_lidar_sector[:, :3, 3], precision=highest)
     directions = jnp.einsum("sij,sgcbj->sgcbi", turns, rays.directions, precision=highest)
-    kinds = (near.boxes, near.cylinders, near.spheroids)
     way = jnp.linalg.norm(offsets, axis=-1).max()
     lists = tuple(
         _sector_lists(kind, T_world_lidar, rays.azimuths, capacity, way)
-        for kind, capacity in zip(kinds, _NUM_IN_SECTOR, strict=True)
+        for kind, capacity in zip(near.kinds, _NUM_IN_SECTOR, strict=True)
     )
     repeated = jax.tree.map(lambda x: jnp.repeat(x, directions.shape[1], axis=0), (offsets, lists))
     directions, depths = (x.reshape(-1, *x.shape[2:]) for x in (directions, rays.depths))
     bands = _Band(directions, depths, *repeated)
-    bodies = jax.tree.map(lambda *x: jnp.concatenate(x), *(kind.bodies for kind in kinds))
+    bodies = jax.tree.map(lambda *x: jnp.concatenate(x), *(kind.bodies for kind in near.kinds))
 
     def cast_band(band: _Band) -> Hits:
         return _cast_band(near, bodies, T_world_lidar[2, 3], band, max_range)
@@ -271,11 +264,10 @@ def _cast_band(near: NearWorld, bodies: Bodies, height: Float[Array, ""], band: 
     rows = jnp.where(is_down, _ON_GROUND, _ON_NOTHING)
     found = _Found(jnp.where(is_down, down, max_range), rows, band.depths)
     first_row = 0
-    kinds = (near.boxes, near.cylinders, near.spheroids)
-    for kind, lists, cross in zip(kinds, band.lists, _KINDS, strict=True):
+    for kind, lists, cross in zip(near.kinds, band.lists, _KINDS, strict=True):
         found = _meet_bodies(found, kind, lists, band, cross, first_row)
         first_row += len(kind.distances)
-    return _describe(found, bodies, band, len(near.boxes.distances))
+    return _describe(found, bodies, band, len(near.kinds[0].distances))
 
 
 def _meet_bodies(

@@ -135,11 +135,6 @@ def padded(rows: FloatArray, capacity: int) -> jax.Array:
     return jnp.asarray(whole)
 
 
-def mask_of(count: int, capacity: int) -> jax.Array:
-    """Returns True for the first `count` of `capacity` entries."""
-    return jnp.asarray(np.arange(capacity) < count)
-
-
 def pack_bodies(table: FloatArray, surface: int) -> Bodies:
     """Makes bodies of one kind from rows.
 
@@ -154,7 +149,7 @@ def pack_bodies(table: FloatArray, surface: int) -> Bodies:
     rows = padded(table, capacity_for(len(table)))
     headings = padded(np.column_stack([np.cos(table[:, 6]), np.sin(table[:, 6])]), len(rows))
     surfaces = jnp.where((rows[:, 7] > 0) & (surface == SOLID), SOFT, surface)
-    mask = mask_of(len(table), len(rows))
+    mask = jnp.arange(len(rows)) < len(table)
     return Bodies(rows[:, :3], rows[:, 3:6], headings, rows[:, 7], rows[:, 8], surfaces, mask)
 
 

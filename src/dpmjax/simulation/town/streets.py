@@ -204,6 +204,19 @@ def at_way(path: FloatArray, way: FloatArray) -> FloatArray:
     return np.column_stack([np.interp(way, lengths, column) for column in path.T])
 
 
+def on_path(path: FloatArray, way: FloatArray) -> FloatArray:
+    """Interpolates points of a path and its directions there linearly at given path lengths.
+
+    Args:
+        path: (k, 2) points; consecutive ones differ.
+        way: (m,) path lengths, m, clipped to the path.
+
+    Returns:
+        (m, 4) x, y and the direction, of a length of 1 or a little less.
+    """
+    return at_way(np.column_stack([path, tangents(path)]), way)
+
+
 def resample(path: FloatArray, step: float) -> FloatArray:
     """Resamples a path at (nearly) equal steps, with both ends.
 
@@ -231,18 +244,18 @@ def tangents(path: FloatArray) -> FloatArray:
     return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
 
 
-def shift_left(path: FloatArray, distance: float | FloatArray) -> FloatArray:
+def shift_left(path: FloatArray, distance: float) -> FloatArray:
     """Shifts a path to its left.
 
     Args:
         path: (k, 2) points.
-        distance: distance in m, one for all points or one for each; negative to the right.
+        distance: m; negative to the right.
 
     Returns:
         (k, 2).
     """
     along = tangents(path)
-    return path[:, :2] + np.broadcast_to(distance, len(path))[:, None] * np.column_stack([-along[:, 1], along[:, 0]])
+    return path[:, :2] + distance * np.column_stack([-along[:, 1], along[:, 0]])
 
 
 def smooth(path: FloatArray, sigma: float, *, is_closed: bool) -> FloatArray:

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 
 from dpmjax.sequences import BoolArray, FloatArray
-from dpmjax.simulation.town.kinds import KINDS, Kind
+from dpmjax.simulation.town.kinds import Kind
 from dpmjax.simulation.town.objects import Place, Size
 from dpmjax.simulation.town.primitives import CELL_M
 from dpmjax.simulation.town.streets import Streets, arc_lengths, resample
@@ -48,9 +48,7 @@ class Terrain:
         return map_coordinates(self.heights, at[:, ::-1].T, order=1, mode="nearest")
 
 
-def make_terrain(
-    rng: np.random.Generator, streets: Streets, support: FloatArray | None, kind: Kind = KINDS["suburb"]
-) -> Terrain:
+def make_terrain(rng: np.random.Generator, streets: Streets, support: FloatArray | None, kind: Kind) -> Terrain:
     """Makes the ground.
 
     Args:

@@ -1,16 +1,19 @@
-"""Walks of the robot and of people through a planar world, with the step statistics of DeepMapping section 4.1.
+"""Walks of the robot and of people through a planar world, and scans on the way (DeepMapping section 4.1).
 
 The lidar has a view of 360 degrees, so the robot may move in any direction. Steps follow the route, and the heading
-turns by an independent uniform angle, so that the statistics of the paper hold exactly.
+turns by an independent uniform angle, so that the step statistics of the paper hold exactly.
 """
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.sequences import BoolArray, FloatArray, World, largest_region
+from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World, largest_region
+from dpmjax.simulation.world2d import beam_angles, cast_scans, make_world
 
 # Section 4.1: headings of consecutive scans differ by a uniform angle within plus or minus this, and translations have
 # this mean; steps are uniform between 0.6 and 1.4 of it.
@@ -20,6 +23,7 @@ _LEG_PX = 260.0  # Wanted length of a leg to a new place; after two legs the rob
 _CELL_PX = 8  # Raster of the route planner.
 _PLAN_MARGIN_PX = 8.0  # Additional clearance of routes.
 _LOOKAHEAD_PX = 36.0
+_PERSON_PX = 11.0  # Radius of a person; people nearer to the sensor than two of it are left out of the scan.
 
 
 def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generator) -> FloatArray:
@@ -186,11 +190,6 @@ def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray) -> bool
     return bool((clearance[samples[:, 1], samples[:, 0]] >= _CLEARANCE_PX + 0.25).all())
 
 
-_RADIUS_PX = 11.0
-# People nearer to the sensor than this are left out of the scan.
-_LEAST_DISTANCE_PX = 2.0 * _RADIUS_PX
-
-
 def simulate_people(world: World, num_scans: int, *, rng: np.random.Generator) -> FloatArray:
     """Simulates the walks of the people of a world, with the speed and the rules of the robot.
 
@@ -225,7 +224,92 @@ def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, pe
         along = np.einsum("nbk,nk->nb", beams, to_person)
         distance = np.linalg.norm(to_person, axis=-1)[:, None]
         # Squared half chord of the beam in the disc; negative without a hit.
-        half_chord = _RADIUS_PX**2 - (distance**2 - along**2)
-        is_met = (half_chord > 0) & (along > 0) & (distance > _LEAST_DISTANCE_PX)
+        half_chord = _PERSON_PX**2 - (distance**2 - along**2)
+        is_met = (half_chord > 0) & (along > 0) & (distance > 2.0 * _PERSON_PX)
         ranges = np.where(is_met, np.minimum(ranges, along - np.sqrt(np.maximum(half_chord, 0.0))), ranges)
     return ranges
+
+
+def scan_world(
+    is_obstacle: BoolArray,
+    poses: ArrayLike,
+    *,
+    num_beams: int = 256,
+    max_range: float | None = None,
+    range_noise_px: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> tuple[NDArray[np.float32], BoolArray]:
+    """Takes a 360-degree scan at every pose (DeepMapping section 4.1).
+
+    Args:
+        is_obstacle: (h, w), True where a pixel is solid.
+        poses: (n, 3) x, y (px) and heading (radians) of the sensor in the world.
+        num_beams: beams per scan.
+        max_range: beams longer than this (px) are masked; None for an unlimited sensor, whose free beams end at the
+            border.
+        range_noise_px: standard deviation of Gaussian noise on the ranges; ranges never become negative.
+        rng: source of the noise; needed where there is noise.
+
+    Returns:
+        points: (n, num_beams, 2) float32 in the sensor frame, px; zero where masked.
+        mask: (n, num_beams) bool, True for valid beams.
+
+    Raises:
+        ValueError: a pose lies in an obstacle or outside of the image; or there is noise but no `rng`.
+    """
+    if range_noise_px > 0 and rng is None:
+        raise ValueError("range_noise_px needs an rng")
+    ranges = cast_scans(is_obstacle, poses, num_beams=num_beams)
+    mask = np.ones(ranges.shape, bool) if max_range is None else ranges <= max_range
+    return np.where(mask[..., None], _measured_points(ranges, range_noise_px, rng), np.float32(0.0)), mask
+
+
+def _measured_points(ranges: FloatArray, range_noise_px: float, rng: np.random.Generator | None) -> NDArray[np.float32]:
+    """Computes beam end points (n, b, 2) in the sensor frame, with range noise."""
+    angles = beam_angles(ranges.shape[1])
+    if rng is not None and range_noise_px > 0:
+        ranges = np.maximum(ranges + rng.normal(0.0, range_noise_px, ranges.shape), 0.0)
+    points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.asarray(points, np.float32)
+
+
+def simulate_sequence(
+    world: int | str | World = 0,
+    num_scans: int = 256,
+    *,
+    num_beams: int = 256,
+    range_noise_px: float = 0.0,
+    seed: int = 0,
+    with_odometry: bool = False,
+) -> ScanSequence:
+    """Simulates a drive through a planar world (DeepMapping section 4.1).
+
+    Walk, noise, odometry and people have separate random streams: a seed gives the same walk with and without noise.
+
+    Args:
+        world: index or name for `make_world`, or a world. The people of a world walk while it is scanned.
+        num_scans: number of scans; the paper has 128 and 256.
+        num_beams: beams per scan over 360 degrees.
+        range_noise_px: standard deviation of Gaussian noise on the ranges, px.
+        seed: seed of walk and noise.
+        with_odometry: True to simulate wheel odometry, too.
+
+    Returns:
+        The sequence in px, organised, with the true poses in the world's frame as reference.
+
+    Raises:
+        ValueError: an argument out of its range, or a world too narrow to move in.
+    """
+    if num_scans < 2:
+        raise ValueError(f"num_scans must be at least 2, got {num_scans}")
+    scene = world if isinstance(world, World) else make_world(world)
+    # The name is part of the seed, so that walks through two worlds are independent.
+    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(4))
+    walk_rng, noise_rng, odometry_rng, people_rng = map(np.random.default_rng, streams)
+    poses = simulate_trajectory(scene, num_scans, rng=walk_rng)
+    ranges = cast_scans(scene.is_obstacle, poses, num_beams=num_beams)
+    people = simulate_people(scene, num_scans, rng=people_rng)
+    ranges = stop_at_people(ranges, poses, beam_angles(num_beams), people)
+    points, mask = _measured_points(ranges, range_noise_px, noise_rng), np.ones(ranges.shape, bool)
+    odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
+    return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
