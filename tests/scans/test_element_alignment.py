@@ -1,4 +1,4 @@
-"""Laws of the alignment of surface elements: the motion of the surfaces, masks, jit, vmap, derivative."""
+"""Laws of the alignment of surface elements: the motion of the surfaces, masks, too few pairs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se3
-from dpmjax.scans.element_alignment import align_elements, align_elements_on_host
+from dpmjax.scans.element_alignment import align_elements
 from dpmjax.scans.surfaces import scan_surface
 from dpmjax.types import SurfaceElements
 from tests.scans.surface_scenes import motion, seen_from, street
@@ -36,12 +36,9 @@ def error_m_deg(T: np.ndarray) -> tuple[float, float]:
 
 def test_two_views_of_one_surface_are_aligned() -> None:
     """The views share no point; the oracle is the motion with which they were made."""
-    found = align_elements(SOURCE, TARGET, GUESS)
-    error_m, error_deg = error_m_deg(found.T_target_source)
+    error_m, error_deg = error_m_deg(align_elements(SOURCE, TARGET, GUESS))
     assert error_m < 0.02
     assert error_deg < 0.1
-    assert found.rmse < 0.03
-    assert 100 < found.num_pairs <= 600
 
 
 def test_the_same_elements_are_aligned_to_rounding() -> None:
@@ -52,23 +49,13 @@ def test_the_same_elements_are_aligned_to_rounding() -> None:
         SOURCE.planarity,
         SOURCE.mask,
     )
-    for align in (align_elements, align_elements_on_host):
-        np.testing.assert_allclose(align(SOURCE, moved, np.eye(4)).T_target_source, T_b_a, atol=2e-5)
+    np.testing.assert_allclose(align_elements(SOURCE, moved, np.eye(4)), T_b_a, atol=2e-5)
 
 
-@pytest.mark.parametrize("is_symmetric", [True, False])
-def test_trees_and_exhaustive_search_give_one_motion(is_symmetric: bool) -> None:
-    ours = align_elements(SOURCE, TARGET, GUESS, is_symmetric=is_symmetric)
-    host = align_elements_on_host(SOURCE, TARGET, GUESS, is_symmetric=is_symmetric)
-    np.testing.assert_allclose(ours.T_target_source, host.T_target_source, atol=2e-4)
-    np.testing.assert_allclose(ours.rmse, host.rmse, rtol=1e-2)
-    assert abs(int(ours.num_pairs) - int(host.num_pairs)) <= 2
-
-
-def test_the_symmetric_motion_back_is_the_inverse() -> None:
-    there = align_elements_on_host(SOURCE, TARGET, GUESS)
-    back = align_elements_on_host(TARGET, SOURCE, np.linalg.inv(GUESS))
-    np.testing.assert_allclose(there.T_target_source @ back.T_target_source, np.eye(4), atol=2e-3)
+def test_the_motion_back_is_the_inverse() -> None:
+    there = align_elements(SOURCE, TARGET, GUESS)
+    back = align_elements(TARGET, SOURCE, np.linalg.inv(GUESS))
+    np.testing.assert_allclose(there @ back, np.eye(4), atol=2e-3)
 
 
 def test_masked_and_uneven_elements_count_for_nothing() -> None:
@@ -77,35 +64,14 @@ def test_masked_and_uneven_elements_count_for_nothing() -> None:
     )
     uneven = elements(7, T_WORLD_A, 40).replace(planarity=jnp.full(40, 0.05))
     padded = jax.tree.map(lambda *parts: jnp.concatenate(parts), SOURCE, junk, uneven)
-    for align in (align_elements, align_elements_on_host):
-        expected, found = align(SOURCE, TARGET, GUESS), align(padded, TARGET, GUESS)
-        np.testing.assert_allclose(found.T_target_source, expected.T_target_source, atol=1e-5)
-        assert found.num_pairs == expected.num_pairs
+    expected, found = align_elements(SOURCE, TARGET, GUESS), align_elements(padded, TARGET, GUESS)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_starts_are_aligned_side_by_side() -> None:
-    starts = jnp.asarray(np.stack([GUESS, T_B_A @ motion(-3, (-0.6, 0.3, 0))]), jnp.float32)
-    many = jax.vmap(align_elements, (None, None, 0))(SOURCE, TARGET, starts)
-    for row, start in enumerate(starts):
-        expected = align_elements(SOURCE, TARGET, start)
-        np.testing.assert_allclose(many.T_target_source[row], expected.T_target_source, atol=1e-5)
-
-
-def test_pairs_are_aligned_side_by_side() -> None:
-    sources, targets = (jax.tree.map(lambda *x: jnp.stack(x), *pair) for pair in ((SOURCE, TARGET), (TARGET, SOURCE)))
-    starts = jnp.asarray(np.stack([GUESS, np.linalg.inv(GUESS)]), jnp.float32)
-    many = jax.vmap(align_elements)(sources, targets, starts)
-    expected = align_elements(TARGET, SOURCE, starts[1])
-    np.testing.assert_allclose(many.T_target_source[1], expected.T_target_source, atol=1e-5)
-
-
-@pytest.mark.parametrize("num", [0, 10])
+@pytest.mark.parametrize("num", [0, 5])
 def test_too_few_pairs_leave_the_motion(num: int) -> None:
-    few = SOURCE.replace(mask=jnp.arange(300) < num)
-    for align in (align_elements, align_elements_on_host):
-        found = align(few, TARGET, GUESS, is_symmetric=False)
-        np.testing.assert_allclose(found.T_target_source, GUESS, atol=1e-6)
-        assert np.isinf(found.rmse)
+    few, fewer = (side.replace(mask=jnp.arange(300) < num) for side in (SOURCE, TARGET))
+    np.testing.assert_array_equal(align_elements(few, fewer, GUESS), GUESS)
 
 
 def test_what_no_plane_holds_stays() -> None:
@@ -118,34 +84,6 @@ def test_what_no_plane_holds_stays() -> None:
         return SurfaceElements(jnp.asarray(positions), jnp.asarray(up), jnp.ones(300), jnp.ones(300, bool))
 
     start = motion(3, (0.5, -0.4, 0.3))
-    found = np.asarray(align_elements(plain(), plain(), start).T_target_source)
+    found = align_elements(plain(), plain(), start)
     np.testing.assert_allclose(found[:2, 3], start[:2, 3], atol=2e-3)
     np.testing.assert_allclose(found[2, 3], 0, atol=1e-4)
-
-
-def test_the_derivative_is_that_of_the_solution() -> None:
-    """If the target moves, the motion moves with it: the derivative by a translation of the target is one."""
-
-    def solution(shift: jax.Array) -> jax.Array:
-        return align_elements(SOURCE, TARGET.replace(positions=TARGET.positions + shift), GUESS).T_target_source[:3, 3]
-
-    derivative = jax.jacobian(solution)(jnp.zeros(3))
-    np.testing.assert_allclose(derivative, np.eye(3), atol=2e-2)
-
-
-def test_the_derivative_is_finite_where_nothing_is_there() -> None:
-    def loss(positions: jax.Array, target: SurfaceElements) -> jax.Array:
-        found = align_elements(SOURCE.replace(positions=positions), target, GUESS)
-        return jnp.sum(found.T_target_source**2) + jnp.where(jnp.isfinite(found.rmse), found.rmse, 0)
-
-    empty = TARGET.replace(mask=jnp.zeros(300, bool))
-    for target in (TARGET, empty, SOURCE):
-        assert np.isfinite(jax.grad(loss)(SOURCE.positions, target)).all()
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    align_elements(SOURCE, TARGET, jnp.asarray(GUESS, jnp.float32))
-    other = jax.tree.map(lambda leaf: leaf, TARGET.replace(planarity=TARGET.planarity / 2))
-    T = jnp.asarray(T_B_A, jnp.float32)
-    with assert_compiles_nothing():
-        align_elements(SOURCE, other, T)

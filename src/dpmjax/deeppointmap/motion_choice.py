@@ -13,21 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.deeppointmap.verification import (
-    PLANE_DISTANCE_M,
-    MeasuredScan,
-    VerificationConfig,
-    compare_scans,
-    verify_motions,
-)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
 from dpmjax.geometry import rigid
-from dpmjax.scans.surface_alignment import (
-    AlignmentConfig,
-    AlignmentLevel,
-    align_surfaces,
-    align_surfaces_from,
-    pair_with_planes,
-)
+from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces, nearest_planes
 from dpmjax.scans.view_correlation import T_level_lidar, correlate_views
 from dpmjax.scans.weak_directions import (
     WallAxis,
@@ -128,7 +116,7 @@ def choose_motion(
     if is_weak := weak_share(*axes) < config.max_weak_share:
         starts = sliding_motions(*axes, SLIDING_STEP_M)
         num_slid = len(starts)
-        slid = _moved(scans, starts, COARSE)
+        slid = align_surfaces(source.surface, target.surface, starts, COARSE)
         order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
         finalists += _aligned(scans, [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE, config)
     motions = [*finalists, *remaining]
@@ -151,16 +139,10 @@ def _aligned(
     alignment: AlignmentConfig,
     config: VerificationConfig,
 ) -> list[VerifiedMotion]:
-    T = _moved(scans, np.stack([candidate.T_target_source for candidate in candidates]), alignment)
+    starts = np.stack([candidate.T_target_source for candidate in candidates])
+    T = align_surfaces(scans[0].surface, scans[1].surface, starts, alignment)
     verified = verify_motions(*scans, T, config)
     return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
-
-
-def _moved(
-    scans: tuple[MeasuredScan, MeasuredScan], starts: Float[np.ndarray, "s 4 4"], alignment: AlignmentConfig
-) -> Float[np.ndarray, "s 4 4"]:
-    found = align_surfaces_from(scans[0].surface, scans[1].surface, starts, alignment)
-    return np.stack([one.T_target_source for one in found])
 
 
 def _facing_elements(
@@ -214,11 +196,10 @@ def refine_motion(
     Returns:
         The refined motion and its verification.
     """
-    start = motion.T_target_source
-    T = align_surfaces(source.surface, target.surface, start, REFINEMENT).T_target_source
-    found = verify_motions(source, target, T[None], config)[0]
+    T = align_surfaces(source.surface, target.surface, motion.T_target_source[None], REFINEMENT)
+    found = verify_motions(source, target, T, config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
-    return VerifiedMotion(motion.row, T, found._replace(**kept))
+    return VerifiedMotion(motion.row, T[0], found._replace(**kept))
 
 
 def weak_direction_of(
@@ -237,9 +218,8 @@ def weak_direction_of(
     """
     # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
     level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
-    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
-    up = T_level_lidar(target.surface)[2, :3]
-    return weakest_direction(pairs, T_target_source, up, max_residual_m=PLANE_DISTANCE_M)
+    planes = nearest_planes(source.surface, target.surface, T_target_source[None], level)
+    return weakest_direction(planes.pairs, T_target_source, T_level_lidar(target.surface)[2, :3])
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:

@@ -146,8 +146,8 @@ def compact_scan(cloud: DescriptorCloud, image: RangeImage) -> CompactScan:
 
 
 def round_features(
-    features: Float[np.ndarray, "m c"],
-) -> tuple[Int8[np.ndarray, "m c"], Float[np.ndarray, " m"]]:
+    features: Float[np.ndarray, "*k m c"],
+) -> tuple[Int8[np.ndarray, "*k m c"], Float[np.ndarray, "*k m"]]:
     """Rounds the features of each descriptor to 127 steps of their largest absolute value.
 
     Args:
@@ -156,8 +156,8 @@ def round_features(
     Returns:
         The features in steps, and the steps.
     """
-    steps = np.maximum(np.abs(features).max(axis=1, initial=0), 1e-12).astype(np.float32) / np.float32(MAX_CODE)
-    return np.rint(features / steps[:, None]).astype(np.int8), steps
+    steps = np.maximum(np.abs(features).max(axis=-1, initial=0), 1e-12).astype(np.float32) / np.float32(MAX_CODE)
+    return np.rint(features / steps[..., None]).astype(np.int8), steps
 
 
 def round_directions(directions: Float[np.ndarray, "m 2"]) -> Int8[np.ndarray, " m"]:

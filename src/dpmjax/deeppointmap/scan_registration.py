@@ -30,7 +30,7 @@ from dpmjax.deeppointmap.prepared_scans import (
 )
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
-from dpmjax.scans.element_alignment import align_elements_on_host
+from dpmjax.scans.element_alignment import align_elements
 from dpmjax.scans.weak_directions import WeakDirection
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
@@ -267,8 +267,7 @@ def _refined(
     # number of planes.
     T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
-        aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
-        T_target_source = np.array(aligned.T_target_source)
+        T_target_source = align_elements(source.elements, target.elements, T_target_source)
     T_target_source[:3, 3] /= scale
     return _RegisteredMotion(0, T_target_source)
 

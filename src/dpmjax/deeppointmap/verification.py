@@ -28,12 +28,6 @@ SPARSE_SHARE = 0.5
 # Surfaces whose normals are nearer to the vertical are level.
 LEVEL_COSINE = 0.8
 
-# Largest distance of a point from a plane that it meets.
-PLANE_DISTANCE_M = 0.15
-
-# Least cosine between the normals of a point and of a plane that it meets.
-MIN_COSINE = 0.7
-
 
 @dataclass(frozen=True)
 class EvidenceWeights:
@@ -176,13 +170,8 @@ def compare_scans(
     """
     level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
     planes = nearest_planes(scan.surface, other.surface, T_other_scan, level)
-    meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M)
-    meets &= planes.cosines > MIN_COSINE
-    view = view_points(other.image, planes.points.reshape(-1, 3))
     is_level = np.abs(scan.surface.normals[scan.surface.samples[: config.num_samples], 2]) > LEVEL_COSINE
-    return ComparedScan(
-        meets, view.is_visible.reshape(meets.shape), view.is_contradicted.reshape(meets.shape), is_level
-    )
+    return ComparedScan(planes.meets, *view_points(other.image, planes.points), is_level)
 
 
 def evidence_shares(

@@ -38,8 +38,8 @@ class View(NamedTuple):
         is_contradicted: True where the point lies clearly in front of all that was measured in this direction.
     """
 
-    is_visible: Bool[np.ndarray, " n"]
-    is_contradicted: Bool[np.ndarray, " n"]
+    is_visible: Bool[np.ndarray, "*n"]
+    is_contradicted: Bool[np.ndarray, "*n"]
 
 
 def range_image(points: Float[np.ndarray, "n 3"]) -> RangeImage:
@@ -60,7 +60,7 @@ def range_image(points: Float[np.ndarray, "n 3"]) -> RangeImage:
     return RangeImage(nearest, farthest)
 
 
-def view_points(image: RangeImage, points: Float[np.ndarray, "n 3"]) -> View:
+def view_points(image: RangeImage, points: Float[np.ndarray, "*n 3"]) -> View:
     """Compares points with the ranges that the lidar of an image has measured in their directions.
 
     Args:
@@ -77,9 +77,9 @@ def view_points(image: RangeImage, points: Float[np.ndarray, "n 3"]) -> View:
     return View(is_measured & (ranges <= farthest + margin), is_measured & (ranges < nearest - margin))
 
 
-def _project(points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+def _project(points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the pixel and the range of each point."""
-    x, y, z = points.T
+    x, y, z = np.moveaxis(points, -1, 0)
     flat = np.hypot(x, y)
     column = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * NUM_COLUMNS).astype(np.int64) % NUM_COLUMNS
     row = np.floor((np.arctan2(z, flat) / np.pi + 0.5) * NUM_ROWS).astype(np.int64)

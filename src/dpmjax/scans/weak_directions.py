@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import PlanePairs
+from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, PlanePairs
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 
@@ -53,20 +53,17 @@ class WeakDirection(NamedTuple):
     sigma_m: float
 
 
-def plane_information(
-    pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"], *, max_residual_m: float
-) -> Float[np.ndarray, "6 6"]:
+def plane_information(pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     """Computes the normal equations of point-to-plane residuals.
 
     Args:
-        pairs: pairs under the motion.
+        pairs: pairs under the motion; those farther apart than `PLANE_DISTANCE_M` meet no plane.
         T_target_source: the motion.
-        max_residual_m: pairs with a larger residual meet no plane.
 
     Returns:
         Inverse covariance in the tangent of the source, translation first.
     """
-    is_used = np.abs(pairs.residuals) < max_residual_m
+    is_used = np.abs(pairs.residuals) < PLANE_DISTANCE_M
     if is_used.sum() < 6:
         return UNKNOWN.copy()
     normals = pairs.normals[is_used] @ T_target_source[:3, :3]
@@ -78,11 +75,7 @@ def plane_information(
 
 
 def weakest_direction(
-    pairs: PlanePairs,
-    T_target_source: Float[np.ndarray, "4 4"],
-    up: Float[np.ndarray, "3"],
-    *,
-    max_residual_m: float,
+    pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"], up: Float[np.ndarray, "3"]
 ) -> WeakDirection:
     """Finds the horizontal direction in which the translation is least certain, for any rotation.
 
@@ -92,14 +85,13 @@ def weakest_direction(
         pairs: pairs under the motion.
         T_target_source: the motion.
         up: unit vector in the target frame.
-        max_residual_m: pairs with a larger residual meet no plane.
 
     Returns:
         The direction and the standard deviation along it.
     """
 
     def covariance_in_target(some: PlanePairs) -> Float[np.ndarray, "3 3"]:
-        inverse = np.linalg.inv(plane_information(some, T_target_source, max_residual_m=max_residual_m))
+        inverse = np.linalg.inv(plane_information(some, T_target_source))
         return T_target_source[:3, :3] @ inverse[:3, :3] @ T_target_source[:3, :3].T
 
     horizontal = np.linalg.svd(up[None])[2][1:]

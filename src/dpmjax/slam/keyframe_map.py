@@ -239,7 +239,7 @@ def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius
 
 
 def _joined(num_nodes: int, edges: Iterable[Sequence[Any]]) -> sp.csr_array:
-    ends = np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2).T
+    ends = _ends(edges)
     return sp.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (num_nodes, num_nodes)).tocsr()
 
 
@@ -282,11 +282,18 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     Returns:
         The graph.
     """
-    ends = np.array([edge[:2] for edge in slam_map.edges], np.int64).reshape(-1, 2).T
-    T_target_source = np.array([edge.T_target_source for edge in slam_map.edges]).reshape(-1, 4, 4)
-    information = np.array([edge.information for edge in slam_map.edges]).reshape(-1, 6, 6)
-    edges = Edges(ends[0], ends[1], T_target_source, information)
-    return PoseGraph.create(slam_map.T_world_keyframe, edges, ids=slam_map.column("scan"))
+    return PoseGraph.create(slam_map.T_world_keyframe, edge_arrays(slam_map.edges), ids=slam_map.column("scan"))
+
+
+def edge_arrays(edges: Sequence[MapEdge]) -> Edges:
+    """Returns the ends, motions and information of edges as stacked arrays."""
+    source, target = _ends(edges)
+    T_target_source = np.array([edge.T_target_source for edge in edges]).reshape(-1, 4, 4)
+    return Edges(source, target, T_target_source, np.array([edge.information for edge in edges]).reshape(-1, 6, 6))
+
+
+def _ends(edges: Iterable[Sequence[Any]]) -> Int[np.ndarray, "2 e"]:
+    return np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2).T
 
 
 def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, "6 6"]:

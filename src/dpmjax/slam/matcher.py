@@ -18,8 +18,7 @@ from dpmjax.deeppointmap.motion_choice import REFINEMENT
 from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
 from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
-from dpmjax.deeppointmap.verification import PLANE_DISTANCE_M
-from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, pair_with_planes
+from dpmjax.scans.surface_alignment import AlignmentLevel, align_surfaces, nearest_planes
 from dpmjax.scans.surfaces import Surface
 from dpmjax.scans.weak_directions import plane_information
 from dpmjax.slam.interfaces import Match, Proposal, ThinnedScan
@@ -118,11 +117,10 @@ class NetworkMatcher:
     def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
         scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
-        aligned = align_surfaces(scan, union, np.asarray(found.T_target_source, np.float64), REFINEMENT)
-        T = aligned.T_target_source
+        T = align_surfaces(scan, union, np.asarray(found.T_target_source)[None], REFINEMENT)
         level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        information = plane_information(pair_with_planes(scan, union, T, level), T, max_residual_m=PLANE_DISTANCE_M)
-        return Match(T, float(found.confidence), float(found.rmse), found.verification, information)
+        information = plane_information(nearest_planes(scan, union, T, level).pairs, T[0])
+        return Match(T[0], float(found.confidence), float(found.rmse), found.verification, information)
 
 
 def _surface(submap: Submap) -> Surface:

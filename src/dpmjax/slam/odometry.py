@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.encoding import thin_scan
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.verification import MIN_COSINE, PLANE_DISTANCE_M, MeasuredScan
+from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.range_images import range_image, view_points
-from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces_from, nearest_planes
+from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces, nearest_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig
@@ -124,10 +124,7 @@ class SurfaceGeometry:
             The pose under which most elements meet planes and fewest lie in free space.
         """
         surface = scan.measured.surface
-        coarse = [
-            found.T_target_source
-            for found in align_surfaces_from(surface, local_map.surface, T_map_scan, self.config.wide)
-        ]
+        coarse = list(align_surfaces(surface, local_map.surface, T_map_scan, self.config.wide))
         coarse.sort(key=lambda T: -_matched_share(surface, self._planes(local_map, surface, T, NUM_SAMPLES // 3)))
         return max(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])), key=lambda found: found.score)
 
@@ -156,14 +153,13 @@ class SurfaceGeometry:
         return found
 
     def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Float[np.ndarray, "s 4 4"]) -> list[Alignment]:
-        found = align_surfaces_from(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
-        return [self._scored(local_map, scan.measured, each.T_target_source) for each in found]
+        found = align_surfaces(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
+        return [self._scored(local_map, scan.measured, T) for T in found]
 
     def _scored(self, local_map: LocalMap, measured: MeasuredScan, T: Pose) -> Alignment:
         planes = self._planes(local_map, measured.surface, T, NUM_SAMPLES)
         matched, contradicted = _matched_share(measured.surface, planes), _contradicted_share(local_map, measured, T)
-        information = plane_information(planes.pairs, T, max_residual_m=PLANE_DISTANCE_M)
-        information = with_least_covariance(information, FLOOR_M, FLOOR_RAD)
+        information = with_least_covariance(plane_information(planes.pairs, T), FLOOR_M, FLOOR_RAD)
         return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
 
     def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
@@ -188,10 +184,10 @@ def _matched_share(surface: Surface, planes: NearestPlanes) -> float:
 
     Ground meets ground under any motion: without the mean it would outweigh the walls.
     """
-    meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M) & (planes.cosines > MIN_COSINE)
-    direction = np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)
+    meets = planes.meets[0]
+    direction = np.argmax(np.abs(surface.normals[surface.samples[: len(meets)]]), axis=1)
     counts = np.bincount(direction, minlength=3)
-    shares = np.bincount(direction, weights=meets[0], minlength=3) / np.maximum(counts, 1)
+    shares = np.bincount(direction, weights=meets, minlength=3) / np.maximum(counts, 1)
     # A direction of few elements counts less, because its share is uncertain.
     return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
 
