@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import rigid
-from dpmjax.scans.compact import compact_elements
+from dpmjax.deeppointmap.prepared_scans import compact_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe

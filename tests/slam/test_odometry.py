@@ -11,7 +11,7 @@ from dpmjax import model_preset
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.compact import compact_elements, compact_image
+from dpmjax.deeppointmap.prepared_scans import compact_elements, compact_image
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
 from dpmjax.slam.keyframe_map import Keyframe, add_keyframe, diagonal_information
 from dpmjax.slam.local_map import local_map_of

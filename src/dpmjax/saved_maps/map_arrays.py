@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.compact import MAX_COMPONENT, CompactElements, CompactImage
+from dpmjax.deeppointmap.prepared_scans import MAX_COMPONENT, CompactElements, CompactImage
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin, edge_arrays
 
 Precision = Literal["float32", "int8"]

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.scans.compact import expand_elements
+from dpmjax.deeppointmap.prepared_scans import expand_elements
 from dpmjax.slam.config import SlamConfig
 
 # Largest distance of the keyframes of a submap (DeepPointMap's published configuration).

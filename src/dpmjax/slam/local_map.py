@@ -15,7 +15,7 @@ from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.compact import expand_elements
+from dpmjax.deeppointmap.prepared_scans import expand_elements
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframe_map import KeyframeMap, Pose, nearest_in_graph
