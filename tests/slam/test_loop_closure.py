@@ -8,13 +8,20 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans.surface_alignment import PlanePairs
-from dpmjax.scans.weak_directions import plane_information, with_least_covariance
+from dpmjax.scans.weak_directions import diagonal_information, plane_information, with_least_covariance
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
-from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, most_similar, nearest_pairs, pooled_vector
-from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, submap_around
+from dpmjax.slam.loop_closure import (
+    MAX_AGAIN,
+    MIN_PATH_SHARE,
+    find_loop_candidates,
+    most_similar,
+    nearest_pairs,
+    search_again,
+)
 from dpmjax.slam.loops import Loop, LoopState, are_consistent
 from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.model_methods import pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 

@@ -15,18 +15,9 @@ from jaxtyping import Bool, Float
 
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
 from dpmjax.geometry import rigid
-from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces, nearest_planes
-from dpmjax.scans.view_correlation import T_level_lidar, correlate_views
-from dpmjax.scans.weak_directions import (
-    WallAxis,
-    WeakDirection,
-    facing_surface,
-    facing_weights,
-    sliding_motions,
-    wall_axis,
-    weak_share,
-    weakest_direction,
-)
+from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
+from dpmjax.scans.view_correlation import correlate_views
+from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
 from dpmjax.types import Verification
 
 # Alignment of each hypothesis.
@@ -155,10 +146,10 @@ def _facing_elements(
     settings, counts = replace(config, num_samples=NUM_FACING), []
     motions = T_target_source, rigid.inverse(T_target_source)
     for scan, other, axis, T_other_scan in zip(scans, scans[::-1], axes, motions, strict=True):
-        surface = facing_surface(scan.surface, axis.axis)
+        surface, weights = facing_samples(scan.surface, axis.axis, MAX_FACING)
         side = compare_scans(scan._replace(surface=surface), other, T_other_scan, settings)
         values = side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible
-        counts.append(values @ facing_weights(surface, axis.axis, MAX_FACING)[:NUM_FACING])
+        counts.append(values @ weights[:NUM_FACING])
     return np.mean(counts, axis=0)
 
 
@@ -200,26 +191,6 @@ def refine_motion(
     found = verify_motions(source, target, T, config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
     return VerifiedMotion(motion.row, T[0], found._replace(**kept))
-
-
-def weak_direction_of(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
-) -> WeakDirection:
-    """Finds the horizontal direction in which a motion is least certain, by all source elements that meet planes.
-
-    Args:
-        source: a scan.
-        target: the second scan.
-        T_target_source: the motion.
-        config: tolerances.
-
-    Returns:
-        The direction in the target frame, and the standard deviation of the translation along it.
-    """
-    # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
-    level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
-    planes = nearest_planes(source.surface, target.surface, T_target_source[None], level)
-    return weakest_direction(planes.pairs, T_target_source, T_level_lidar(target.surface)[2, :3])
 
 
 def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:

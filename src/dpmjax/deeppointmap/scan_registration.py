@@ -18,7 +18,7 @@ from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import encode, scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, weak_direction_of
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.prepared_scans import (
     NUM_THREADS,
     PreparedScan,
@@ -31,7 +31,7 @@ from dpmjax.deeppointmap.prepared_scans import (
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements
-from dpmjax.scans.weak_directions import WeakDirection
+from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
 from dpmjax.types import DescriptorCloud, Registration, Verification
 
 # Number of surface elements of a scan that is refined against a cloud.
@@ -255,7 +255,7 @@ def _verified(
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
-    weak = weak_direction_of(source, target, T, config)
+    weak = weakest_direction(source.surface, target.surface, T, config.plane_radius_m)
     return _RegisteredMotion(chosen.row, T, chosen.verification, final.verification, weak)
 
 

@@ -17,14 +17,13 @@ from jaxtyping import Float, Int
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.interfaces import SlamMethods
+from dpmjax.slam.interfaces import AnyScan, SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts, joined_maps, take_keyframes, with_origin
-from dpmjax.slam.loop_candidates import similar_keyframes
-from dpmjax.slam.loop_closure import examine_candidates, is_resting
+from dpmjax.slam.loop_closure import examine_candidates, is_resting, similar_keyframes
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.scan_input import AnyScan
-from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
+from dpmjax.slam.model_methods import as_methods
+from dpmjax.slam.system import SlamResult, place_scans, run_slam
 
 # Three float32 numbers.
 BYTES_A_POINT = 12

@@ -16,7 +16,7 @@ from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.keyframe_map import MapOrigin, Pose, Submap
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import PointCloud, Verification
+from dpmjax.types import AnyArray, PointCloud, Verification
 
 
 class ThinnedScan(NamedTuple):
@@ -217,3 +217,34 @@ class SlamMethods(NamedTuple):
     def origin(self) -> MapOrigin:
         """The origin that maps of these methods note."""
         return MapOrigin(self.matcher.fingerprint, self.config, self.weights)
+
+
+class TimedScan(NamedTuple):
+    """A raw scan with the time of each point, to be deskewed by the predicted motion.
+
+    Attributes:
+        points: (n, 3) metres, each in the frame of the lidar at its own moment.
+        offsets: (n,) times since the scan's pose, as shares of the time between scans; see `scans.deskew`.
+    """
+
+    points: Float[AnyArray, "n 3"]
+    offsets: Float[AnyArray, " n"]
+
+
+AnyScan = Float[AnyArray, "_n 3"] | TimedScan
+
+
+class PreparedInput(NamedTuple):
+    """A scan after the work that needs no map.
+
+    Attributes:
+        num_points: number of points of the raw scan.
+        thinned: the thinned scan; None if it is empty.
+        T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
+        compact: the encoded scan; None where it was not encoded.
+    """
+
+    num_points: int
+    thinned: ThinnedScan | None
+    T_turn: Pose | None = None
+    compact: CompactScan | None = None

@@ -19,8 +19,8 @@ from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
 from dpmjax.slam.interfaces import Match, SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, Pose, Submap, submap_around, with_origin
-from dpmjax.slam.loop_candidates import most_similar
-from dpmjax.slam.system import make_methods
+from dpmjax.slam.loop_closure import most_similar
+from dpmjax.slam.model_methods import make_methods
 from dpmjax.types import AnyArray
 
 # Largest sum of probabilities of a second place, as a share of the sum of the best place.
