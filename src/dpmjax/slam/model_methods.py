@@ -34,7 +34,7 @@ from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan
-from dpmjax.slam.keyframe_map import Pose, Submap
+from dpmjax.slam.keyframe_map import KeyframeMap, Pose, Submap
 from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframe
 from dpmjax.types import DescriptorCloud, Registration
 
@@ -360,6 +360,13 @@ def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str
     """
     config = config or SlamConfig()
     return SlamMethods(NetworkMatcher(model), SurfaceGeometry(model.config, config.odometry), config, weights)
+
+
+def methods_for(model: Model | SlamMethods, slam_map: KeyframeMap) -> SlamMethods:
+    """Returns given methods unchanged, and makes the methods of a model with the settings of a map."""
+    if isinstance(model, SlamMethods):
+        return model
+    return make_methods(model, None if slam_map.origin is None else slam_map.origin.config)
 
 
 def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:

@@ -20,7 +20,7 @@ from dpmjax.scans.corrections import deskew
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
-from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
+from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, ThinnedScan, TimedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, Pose, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
@@ -206,13 +206,18 @@ def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = Non
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    points = scan.points if isinstance(scan, TimedScan) else scan
-    if len(np.shape(points)) != 2 or np.shape(points)[1] != 3:
-        raise ValueError(f"scan: expected shape (n, 3), got {np.shape(points)}")
-    thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
+    thinned, compact = thin_input(methods, scan, T_turn), None
     if thinned is not None and methods.config.odometry.proposer == "network":
         compact = methods.matcher.encode(thinned)
-    return PreparedInput(len(points), thinned, T_turn, compact)
+    return PreparedInput(len(scan.points if isinstance(scan, TimedScan) else scan), thinned, T_turn, compact)
+
+
+def thin_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> ThinnedScan | None:
+    """Thins a scan; see `prepare_input`."""
+    shape = np.shape(scan.points if isinstance(scan, TimedScan) else scan)
+    if len(shape) != 2 or shape[1] != 3:
+        raise ValueError(f"scan: expected shape (n, 3), got {shape}")
+    return methods.geometry.thin(corrected_points(scan, T_turn))
 
 
 def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
