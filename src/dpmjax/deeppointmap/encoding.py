@@ -14,7 +14,7 @@ from jaxtyping import Float
 from dpmjax.checks import require_positive, require_some
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.scans.preprocess import first_of_each_voxel, preprocess_scan_on_host
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
 

@@ -20,7 +20,7 @@ from dpmjax.checks import require_shape
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
 from dpmjax.types import DescriptorCloud, PointPyramid

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, Int8, Int16, UInt8
 from dpmjax.deeppointmap.encoding import pyramid_of_scan, valid_points
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.verification import MeasuredScan, measure_scan
-from dpmjax.scans.range_images import RangeImage
-from dpmjax.scans.surfaces import surface_of_elements
+from dpmjax.scans.surfaces import RangeImage, surface_of_elements
 from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, SurfaceElements
 
 MAX_COORDINATE = np.iinfo(np.int16).max

@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scans.range_images import RangeImage, range_image, view_points
 from dpmjax.scans.surface_alignment import AlignmentLevel, nearest_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
+from dpmjax.scans.surfaces import RangeImage, Surface, SurfaceConfig, range_image, scan_surface, view_points
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
 from dpmjax.types import Verification
 

@@ -28,9 +28,8 @@ from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.range_images import range_image, view_points
 from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces, nearest_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, surface_at
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan

@@ -24,9 +24,8 @@ from jaxtyping import Float, Int
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
-from dpmjax.deeppointmap.training.data_pipeline import SampleMaker
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
-from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drives
+from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray
