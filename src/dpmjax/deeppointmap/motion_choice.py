@@ -18,7 +18,7 @@ from dpmjax.geometry import rigid
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
 from dpmjax.scans.view_correlation import correlate_views
 from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
-from dpmjax.types import Verification
+from dpmjax.types import Pose, Poses, Verification
 
 # Alignment of each hypothesis.
 COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
@@ -73,12 +73,12 @@ class VerifiedMotion(NamedTuple):
     """
 
     row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
+    T_target_source: Pose
     verification: Verification
 
 
 def choose_motion(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> VerifiedMotion:
     """Chooses the hypothesis under which two scans agree best.
 
@@ -139,7 +139,7 @@ def _aligned(
 def _facing_elements(
     scans: tuple[MeasuredScan, MeasuredScan],
     axes: tuple[WallAxis, WallAxis],
-    T_target_source: Float[np.ndarray, "s 4 4"],
+    T_target_source: Poses,
     config: VerificationConfig,
 ) -> Float[np.ndarray, " s"]:
     """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
@@ -155,11 +155,11 @@ def _facing_elements(
 
 class _Candidate(NamedTuple):
     row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
+    T_target_source: Pose
 
 
 def _candidates(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> Iterator[list[_Candidate]]:
     """Yields hypotheses in batches; from the second batch on, they alternate with motions of the correlated views."""
     hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
@@ -193,7 +193,7 @@ def refine_motion(
     return VerifiedMotion(motion.row, T[0], found._replace(**kept))
 
 
-def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:
+def _is_apart(T: Poses, T_other: Pose) -> Bool[np.ndarray, " s"]:
     """Returns True for motions to another place than that of `T_other`; only these compete with it."""
     difference = rigid.inverse(T_other) @ T
     cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2

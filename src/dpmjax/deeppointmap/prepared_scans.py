@@ -9,19 +9,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Int16, UInt8
 
-from dpmjax.deeppointmap.encoding import pyramid_of_scan, valid_points
+from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan, valid_points
 from dpmjax.deeppointmap.model import Model, encode_pyramid
-from dpmjax.deeppointmap.verification import MeasuredScan, measure_scan
+from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, measure_scan
 from dpmjax.scans.surfaces import RangeImage, surface_of_elements
-from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, SurfaceElements
+from dpmjax.types import DescriptorCloud, RawScan, SurfaceElements
 
 MAX_COORDINATE = np.iinfo(np.int16).max
 MAX_COMPONENT = np.iinfo(np.int8).max
 MAX_CODE = np.iinfo(np.uint8).max
 # Ranges of the codes, 2.3 % apart.
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 150.0
-
-NUM_THREADS = 2
 
 
 class PreparedScan(NamedTuple):
@@ -37,9 +35,6 @@ class PreparedScan(NamedTuple):
     measured: MeasuredScan
     scale: float = 1.0
 
-
-# Points in metres, in the frame of the lidar.
-RawScan = PointCloud | Float[AnyArray, "_n 3"]
 
 # A raw scan, a prepared scan, or descriptors of a scan or of a map.
 ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
@@ -90,6 +85,34 @@ def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0)
             measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification))
             clouds.append(encode_pyramid(model, pyramid))
         return [PreparedScan(cloud, future.result(), scale) for cloud, future in zip(clouds, measured, strict=True)]
+
+
+def prepare_each(
+    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
+) -> dict[int, DescriptorCloud | PreparedScan]:
+    """Prepares each scan object of pairs once; surfaces are measured only where both sides of a pair are scans.
+
+    Args:
+        model: encoder and configuration.
+        pairs: source and target of each.
+        scale: see `encode`.
+        num_elements: see `encode`, for a scan that is registered with a cloud.
+
+    Returns:
+        Prepared scans, or descriptors, by the id of each object.
+    """
+    raw: dict[int, RawScan] = {}
+    ready: dict[int, DescriptorCloud | PreparedScan] = {}
+    for pair in pairs:
+        is_verified = not any(isinstance(scan, DescriptorCloud) for scan in pair)
+        for scan in pair:
+            if isinstance(scan, DescriptorCloud | PreparedScan):
+                ready[id(scan)] = scan
+            elif is_verified:
+                raw[id(scan)] = scan
+            elif id(scan) not in ready:
+                ready[id(scan)] = encode(model, scan, scale=scale, num_elements=num_elements)
+    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values()), scale=scale), strict=True))}
 
 
 class CompactElements(NamedTuple):
@@ -158,12 +181,9 @@ def expand_elements(compact: CompactElements) -> SurfaceElements:
     """
     normals = compact.normals.astype(np.float32)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return SurfaceElements(
-        positions=(compact.positions * compact.unit_m).astype(np.float32),
-        normals=normals / np.maximum(lengths, 1),
-        planarity=compact.planarity.astype(np.float32) / MAX_CODE,
-        mask=np.asarray(compact.mask),
-    )
+    positions = (compact.positions * compact.unit_m).astype(np.float32)
+    planarity = compact.planarity.astype(np.float32) / MAX_CODE
+    return SurfaceElements(positions, normals / np.maximum(lengths, 1), planarity, compact.mask)
 
 
 def compact_image(image: RangeImage) -> CompactImage:
@@ -232,8 +252,7 @@ class CompactScan(NamedTuple):
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32)
         features = self.features * self.feature_steps[:, None]
         # `DescriptorCloud` is typed for arrays of JAX, but these stay on the host.
-        parts: tuple[Any, ...] = (elements.positions, features, elements.mask, directions)
-        parts += elements.normals, elements.planarity
+        parts: Any = elements.positions, features, elements.mask, directions, elements.normals, elements.planarity
         return DescriptorCloud(*parts)
 
 

@@ -18,7 +18,7 @@ from dpmjax.geometry import rigid
 from dpmjax.scans.surface_alignment import AlignmentLevel, nearest_planes
 from dpmjax.scans.surfaces import RangeImage, Surface, SurfaceConfig, range_image, scan_surface, view_points
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
-from dpmjax.types import Verification
+from dpmjax.types import Poses, Verification
 
 # A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
 # are near those of the source, so its own points are compared with the planes of the source.
@@ -26,6 +26,9 @@ SPARSE_SHARE = 0.5
 
 # Surfaces whose normals are nearer to the vertical are level.
 LEVEL_COSINE = 0.8
+
+# Number of threads that measure and verify scans while JAX encodes and matches others.
+NUM_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -
 
 
 def verify_motions(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> list[Verification]:
     """Compares two scans under several motions.
 
@@ -154,7 +157,7 @@ class ComparedScan(NamedTuple):
 
 
 def compare_scans(
-    scan: MeasuredScan, other: MeasuredScan, T_other_scan: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    scan: MeasuredScan, other: MeasuredScan, T_other_scan: Poses, config: VerificationConfig
 ) -> ComparedScan:
     """Compares the samples of one scan with a second scan.
 
@@ -174,7 +177,7 @@ def compare_scans(
 
 
 def evidence_shares(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> Float[np.ndarray, "s 6"]:
     """Computes the shares that `EvidenceWeights` weighs.
 
@@ -194,7 +197,7 @@ def evidence_shares(
 
 
 def _both_sides(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> tuple[ComparedScan, ComparedScan]:
     return (
         compare_scans(source, target, T_target_source, config),

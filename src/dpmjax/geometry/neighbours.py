@@ -100,22 +100,16 @@ def _k_nearest(queries: jax.Array, points: jax.Array, mask: jax.Array, *, k: int
     difference = jnp.where(is_found[..., None], queries[:, None] - points[indices], 0)
     squared = jnp.where(is_found, jnp.sum(difference**2, axis=-1), jnp.inf)
     padding = ((0, 0), (0, k - num_found))
-    return Neighbours(
-        indices=jnp.pad(indices, padding),
-        squared_distances=jnp.pad(squared, padding, constant_values=jnp.inf),
-        mask=jnp.pad(is_found, padding),
-    )
+    squared = jnp.pad(squared, padding, constant_values=jnp.inf)
+    return Neighbours(jnp.pad(indices, padding), squared, jnp.pad(is_found, padding))
 
 
 @functools.partial(jax.jit, static_argnames="k")
 def _radius_search(queries: jax.Array, points: jax.Array, mask: jax.Array, radius: jax.Array, *, k: int) -> Neighbours:
     near = _k_nearest(queries, points, mask, k=k)
     is_within = near.mask & (near.squared_distances <= radius**2)
-    return Neighbours(
-        indices=jnp.where(is_within, near.indices, 0),
-        squared_distances=jnp.where(is_within, near.squared_distances, jnp.inf),
-        mask=is_within,
-    )
+    squared = jnp.where(is_within, near.squared_distances, jnp.inf)
+    return Neighbours(jnp.where(is_within, near.indices, 0), squared, is_within)
 
 
 def _loop_over_points(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,14 +119,8 @@ def _build_pyramid(points: jax.Array, mask: jax.Array, *, config: PyramidConfig)
         is_there = jnp.arange(stage.num_points) < num_valid
         chosen = jnp.where(is_there, chosen, 0)
         positions = jnp.where(is_there[:, None], before.positions[chosen], 0)
-        levels.append(
-            PyramidLevel(
-                positions=positions,
-                mask=is_there,
-                sample_indices=chosen,
-                neighbours=_neighbours_of_stage(positions, is_there, before, stage),
-            )
-        )
+        neighbours = _neighbours_of_stage(positions, is_there, before, stage)
+        levels.append(PyramidLevel(positions, is_there, chosen, neighbours))
     steps = range(config.num_interpolations)
     return PointPyramid(tuple(levels), tuple(_interpolate(levels[-2 - step], levels[-1 - step]) for step in steps))
 
@@ -266,6 +259,10 @@ def _sample_by_buckets(points: Float[np.ndarray, "n 3"], num_samples: int) -> In
     return chosen[1:] - 1 if is_right else None
 
 
+# Rows of the nearest points of each query, and their distances.
+_Found = tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k"]]
+
+
 class _Searchable:
     """A tree of the valid points of a level, and the row of each in the padded level."""
 
@@ -285,12 +282,7 @@ class _Searchable:
             exact = np.sqrt(np.sum((queries[rows, None] - points) ** 2, axis=-1))
             indices[rows] = np.argsort(exact, axis=1, kind="stable")[:, : indices.shape[1]]
             distances[rows] = np.take_along_axis(exact, indices[rows], axis=1)
-        return _Found(self.rows[indices[:, :num_found]], distances[:, :num_found])
-
-
-class _Found(NamedTuple):
-    rows: Int[np.ndarray, "m k"]
-    distances: Float[np.ndarray, "m k"]
+        return self.rows[indices[:, :num_found]], distances[:, :num_found]
 
 
 def _level(
@@ -300,27 +292,21 @@ def _level(
     positions = _padded(points, num_rows)
     neighbours = [np.zeros((num_rows, stage.num_neighbours), np.int32) for _ in stage.radii]
     if num_valid > 0:
-        for block, (radius, found) in enumerate(zip(stage.radii, searches, strict=True)):
-            is_within = found.distances <= radius * RADIUS_SLACK
-            neighbours[block][:num_valid] = found.rows[:, :1]
-            neighbours[block][:num_valid, : found.rows.shape[1]] = np.where(is_within, found.rows, found.rows[:, :1])
-    return PyramidLevel(
-        positions=positions,
-        mask=np.arange(num_rows) < num_valid,
-        sample_indices=_padded(chosen, num_rows),
-        neighbours=tuple(neighbours),
-    )
+        for block, radius, (rows, distances) in zip(neighbours, stage.radii, searches, strict=True):
+            block[:num_valid] = rows[:, :1]
+            block[:num_valid, : rows.shape[1]] = np.where(distances <= radius * RADIUS_SLACK, rows, rows[:, :1])
+    mask = np.arange(num_rows) < num_valid
+    return PyramidLevel(positions, mask, _padded(chosen, num_rows), tuple(neighbours))
 
 
 def _interpolate_on_host(fine_level: PyramidLevel, fine: _Searchable, coarse: _Searchable) -> Interpolation:
     num_rows = len(fine_level.mask)
     indices, weights = np.zeros((num_rows, 3), np.int32), np.zeros((num_rows, 3), np.float32)
     if len(coarse.rows) > 0:
-        found = coarse.nearest(fine.tree.points, 3)
-        inverse = 1 / (found.distances**2 + WEIGHT_EPSILON)
-        num_found = found.rows.shape[1]
-        indices[fine.rows, :num_found] = found.rows
-        weights[fine.rows, :num_found] = inverse / inverse.sum(axis=1, keepdims=True)
+        rows, distances = coarse.nearest(fine.tree.points, 3)
+        inverse = 1 / (distances**2 + WEIGHT_EPSILON)
+        indices[fine.rows, : rows.shape[1]] = rows
+        weights[fine.rows, : rows.shape[1]] = inverse / inverse.sum(axis=1, keepdims=True)
     return Interpolation(indices, weights)
 
 

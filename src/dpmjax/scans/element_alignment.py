@@ -16,16 +16,14 @@ from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.planes import geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surface_alignment import MIN_PAIRS, PAIR_COSINE, is_converged
 from dpmjax.scans.surfaces import MIN_FLATNESS
-from dpmjax.types import AnyArray, SurfaceElements
+from dpmjax.types import AnyArray, Pose, SurfaceElements
 
 # Radius of the pairs, width of the kernel in metres, and largest number of steps. Elements are metres apart and their
 # planes are large, so the kernel shrinks, but the radius hardly. The last step is taken in any case.
 LEVELS = ((3.0, 0.5, 3), (2.0, 0.33, 2), (2.0, 0.2, 3), (2.0, 0.1, 4), (2.0, 0.1, 1))
 
 
-def align_elements(
-    source: SurfaceElements, target: SurfaceElements, T_target_source: Float[AnyArray, "4 4"]
-) -> Float[np.ndarray, "4 4"]:
+def align_elements(source: SurfaceElements, target: SurfaceElements, T_target_source: Float[AnyArray, "4 4"]) -> Pose:
     """Aligns two sets of surface elements from a first guess, by the distances of points to planes.
 
     Each element of the source is moved onto the plane of the nearest element of the target (Chen and Medioni 1992), and
@@ -88,7 +86,7 @@ def _search(side: SurfaceElements) -> _Search:
     return _Search(rows, HostTree(np.asarray(side.positions)[rows]))
 
 
-def _moved(T_new_old: Float[np.ndarray, "4 4"], side: SurfaceElements) -> SurfaceElements:
+def _moved(T_new_old: Pose, side: SurfaceElements) -> SurfaceElements:
     positions, normals = ((T_new_old[:3, :3] * some[:, None, :]).sum(axis=2) for some in (side.positions, side.normals))
     return SurfaceElements(positions + T_new_old[:3, 3], normals, side.planarity, side.mask)
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_count, require_positive
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
+from dpmjax.types import Poses
 
 # A level ends after a step that turns less, radians, and is shorter, metres.
 CONVERGED_RAD = 1e-4
@@ -142,11 +143,8 @@ class NearestPlanes(NamedTuple):
 
 
 def align_surfaces(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "s 4 4"],
-    config: AlignmentConfig = AlignmentConfig(),
-) -> Float[np.ndarray, "s 4 4"]:
+    source: Surface, target: Surface, T_target_source: Poses, config: AlignmentConfig = AlignmentConfig()
+) -> Poses:
     """Aligns two surfaces by the distances of points to planes (Chen and Medioni 1992), with a robust kernel.
 
     The alignments from all first guesses proceed in step: all of them look up their neighbours together.
@@ -182,12 +180,7 @@ def align_surfaces(
     return T
 
 
-def nearest_planes(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "s 4 4"],
-    level: AlignmentLevel,
-) -> NearestPlanes:
+def nearest_planes(source: Surface, target: Surface, T_target_source: Poses, level: AlignmentLevel) -> NearestPlanes:
     """Finds the planes of the target nearest to the first samples of the source, under several motions.
 
     Args:

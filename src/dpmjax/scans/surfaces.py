@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from dpmjax.checks import require_count, require_positive_fields
+from dpmjax.checks import as_host_points, require_count, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.planes import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
@@ -95,9 +95,7 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    points = as_host_points("points", points)
     with np.errstate(invalid="ignore", over="ignore"):
         squared = np.sum(points.astype(np.float64) ** 2, axis=1)
         is_within = (squared >= config.min_range_m**2) & (squared <= config.max_range_m**2)

@@ -17,6 +17,7 @@ from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, AlignmentLevel, PlanePairs, nearest_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
+from dpmjax.types import Information, Pose, Poses
 
 # Number of independent pairs with the information of all pairs, because residuals are correlated.
 NUM_INDEPENDENT = 200
@@ -50,7 +51,7 @@ class WeakDirection(NamedTuple):
     sigma_m: float
 
 
-def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, "6 6"]:
+def diagonal_information(sigma_m: float, sigma_rad: float) -> Information:
     """Makes the information of a motion whose six errors are independent.
 
     Args:
@@ -67,7 +68,7 @@ def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, 
 UNKNOWN = diagonal_information(10.0, 1.0)
 
 
-def plane_information(pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
     """Computes the normal equations of point-to-plane residuals.
 
     Args:
@@ -88,9 +89,7 @@ def plane_information(pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4
     return np.asarray(system + UNKNOWN)
 
 
-def weakest_direction(
-    source: Surface, target: Surface, T_target_source: Float[np.ndarray, "4 4"], radius_m: float
-) -> WeakDirection:
+def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, radius_m: float) -> WeakDirection:
     """Finds the horizontal direction in which the translation of a motion is least certain, for any rotation.
 
     Normals across that direction have small components along it by noise alone; these do not count.
@@ -120,9 +119,7 @@ def weakest_direction(
     return WeakDirection(direction, float(np.sqrt(direction @ covariance_in_target(held) @ direction)))
 
 
-def with_least_covariance(
-    information: Float[np.ndarray, "6 6"], sigma_m: float, sigma_rad: float
-) -> Float[np.ndarray, "6 6"]:
+def with_least_covariance(information: Information, sigma_m: float, sigma_rad: float) -> Information:
     """Adds a constant diagonal covariance, which bounds the covariance of a pose from below.
 
     Args:
@@ -149,7 +146,7 @@ class WallAxis(NamedTuple):
         extent_m: horizontal range of nine in ten voxels.
     """
 
-    T_level_lidar: Float[np.ndarray, "4 4"]
+    T_level_lidar: Pose
     yaw: float
     information: Float[np.ndarray, "2"]
     profile: Float[np.ndarray, " b"]
@@ -202,7 +199,7 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
     return float(along / (along + across))
 
 
-def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[np.ndarray, "s 4 4"]:
+def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Poses:
     """Makes motions that align the walls of both scans across the axis, for both headings, at regular shifts along it.
 
     Args:

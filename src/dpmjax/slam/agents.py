@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
@@ -24,6 +24,7 @@ from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods, methods_for
 from dpmjax.slam.system import SlamResult, place_scans, run_slam
+from dpmjax.types import Pose, Poses
 
 # Three float32 numbers.
 BYTES_A_POINT = 12
@@ -82,7 +83,7 @@ class AgentsResult(NamedTuple):
         traffic: bytes that each agent sends.
     """
 
-    T_world_scan: tuple[Float[np.ndarray, "_n 4 4"], ...]
+    T_world_scan: tuple[Poses, ...]
     component: tuple[int, ...]
     joined: JoinedMaps
     agents: tuple[SlamResult, ...]
@@ -260,7 +261,7 @@ def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
 
 def _in_own_frames(
     joined: KeyframeMap, map_of_row: np.ndarray, components: Sequence[int], maps: Sequence[KeyframeMap]
-) -> Float[np.ndarray, "k 4 4"]:
+) -> Poses:
     """Moves each component, so that the first keyframe of its first map stays where it was."""
     T_world = joined.T_world_keyframe.copy()
     component_of_row = np.array(components)[map_of_row]
@@ -286,10 +287,10 @@ def _num_bytes(record: object) -> int:
     return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(record))
 
 
-def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Float[np.ndarray, "_n 4 4"], ...]:
+def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:
     """Computes the poses of all scans; the first scan of a component's first agent is its origin."""
-    found: list[Float[np.ndarray, "_n 4 4"]] = []
-    origins: dict[int, Float[np.ndarray, "4 4"]] = {}
+    found: list[Poses] = []
+    origins: dict[int, Pose] = {}
     for number, agent in enumerate(agents):
         T_world_keyframe = joined.slam_map.T_world_keyframe[joined.map_of_keyframe == number]
         T_agent_scan = place_scans(T_world_keyframe, agent.reports)

@@ -9,15 +9,15 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.scans.weak_directions import diagonal_information
 from dpmjax.slam.interfaces import Alignment, PreparedInput, SlamMethods, ThinnedScan
-from dpmjax.slam.keyframe_map import Keyframe, KeyframeMap, MapEdge, Pose, add_keyframe, with_origin
+from dpmjax.slam.keyframe_map import Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
+from dpmjax.types import Information, Pose
 
 # Turn between keyframes at a smaller distance.
 KEYFRAME_RAD = 0.6
@@ -179,7 +179,7 @@ def place_scan(
 class _Located(NamedTuple):
     # The pose and why it was accepted; its information in the tangent of the scan; the scan, if it was encoded.
     report: ScanReport
-    information: Float[np.ndarray, "6 6"]
+    information: Information
     compact: CompactScan | None = None
 
 

@@ -18,11 +18,11 @@ from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
 from dpmjax.slam.config import SlamConfig
+from dpmjax.types import Information, Pose, Poses
 
 # Largest distance of the keyframes of a submap (DeepPointMap's published configuration).
 SUBMAP_RADIUS_M = 20.0
 
-Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
 
 
@@ -60,7 +60,7 @@ class MapEdge(NamedTuple):
     source: int
     target: int
     T_target_source: Pose
-    information: Float[np.ndarray, "6 6"]
+    information: Information
     kind: EdgeKind
 
 
@@ -94,7 +94,7 @@ class KeyframeMap:
     """
 
     keyframes: tuple[Keyframe, ...] = ()
-    T_world_keyframe: Float[np.ndarray, "k 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    T_world_keyframe: Poses = field(default_factory=lambda: np.zeros((0, 4, 4)))
     vectors: Float[np.ndarray, "k c"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     edges: tuple[MapEdge, ...] = ()
     origin: MapOrigin | None = None
@@ -124,7 +124,7 @@ class Submap(NamedTuple):
     """
 
     scans: tuple[CompactScan, ...]
-    T_submap_keyframe: Float[np.ndarray, "n 4 4"]
+    T_submap_keyframe: Poses
 
 
 def add_keyframe(
@@ -359,7 +359,7 @@ def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k
     return MapEdge(row_of[source], row_of[target], T, information, edge.kind)
 
 
-def _moved_information(information: Float[np.ndarray, "6 6"], T_old_new: Float[np.ndarray, "4 4"]) -> np.ndarray:
+def _moved_information(information: Information, T_old_new: Pose) -> np.ndarray:
     """Moves an information matrix from the tangent of the old frame to that of the new one."""
     R, t = T_old_new[:3, :3], T_old_new[:3, 3]
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])

@@ -17,8 +17,8 @@ from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig
-from dpmjax.slam.keyframe_map import KeyframeMap, Pose, nearest_in_graph
-from dpmjax.types import AnyArray
+from dpmjax.slam.keyframe_map import KeyframeMap, nearest_in_graph
+from dpmjax.types import AnyArray, Pose
 
 # Smallest distance between the last scans, as a share of the extent.
 RECENT_SHARE = 0.08

@@ -18,11 +18,11 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframe_map import KeyframeMap, Pose, Submap, submap_around, with_origin
+from dpmjax.slam.keyframe_map import KeyframeMap, Submap, submap_around, with_origin
 from dpmjax.slam.loop_closure import most_similar
 from dpmjax.slam.model_methods import methods_for
-from dpmjax.slam.system import thin_input
-from dpmjax.types import AnyArray
+from dpmjax.slam.system import corrected_points
+from dpmjax.types import AnyArray, Pose
 
 # Largest sum of probabilities of a second place, as a share of the sum of the best place.
 MAX_RIVAL_SHARE = 0.5
@@ -178,7 +178,7 @@ class _Search(NamedTuple):
 
     def localized(self, scan: Float[AnyArray, "_n 3"]) -> Localization:
         """Registers the scan with keyframes until the place is clear, or none is left."""
-        thinned = thin_input(self.methods, scan)
+        thinned = self.methods.geometry.thin(corrected_points(scan, None))
         if thinned is None:
             return Localization("empty", None, 0.0, None, "too few points")
         compact, extent_m = self.methods.matcher.encode(thinned), thinned.extent_m

@@ -10,14 +10,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.scans.weak_directions import diagonal_information, with_least_covariance
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, Pose
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge
+from dpmjax.types import Information, Pose
 
 # Standard deviations of a registration by descriptors alone: translation and rotation.
 DESCRIPTOR_SIGMA_M, DESCRIPTOR_SIGMA_RAD = 0.2, 0.02
@@ -83,7 +83,7 @@ class Loop(NamedTuple):
     probability: float | None = None
     rmse: float | None = None
     T_target_source: Pose | None = None
-    information: Float[np.ndarray, "6 6"] | None = None
+    information: Information | None = None
 
     @property
     def edge(self) -> MapEdge:
@@ -149,14 +149,8 @@ def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClos
     information = DESCRIPTOR_INFORMATION
     if match.information is not None:
         information = with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)
-    status = _status(slam_map, loop, match, config)
-    return loop._replace(
-        status=status,
-        probability=match.probability,
-        rmse=match.rmse,
-        T_target_source=match.T_target_source,
-        information=information,
-    )
+    registered = match.probability, match.rmse, match.T_target_source, information
+    return Loop(*loop[:3], _status(slam_map, loop, match, config), loop.overlap, *registered)
 
 
 def _status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:

@@ -33,9 +33,9 @@ from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_a
 from dpmjax.scans.weak_directions import plane_information, with_least_covariance
 from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan
-from dpmjax.slam.keyframe_map import KeyframeMap, Pose, Submap
+from dpmjax.slam.keyframe_map import KeyframeMap, Submap
 from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframe
-from dpmjax.types import DescriptorCloud, Registration
+from dpmjax.types import DescriptorCloud, Pose, Poses, Registration
 
 # Turns about the x and y axes among the further starts.
 TILTS_DEG = (-8.0, 8.0)
@@ -127,7 +127,7 @@ class SurfaceGeometry:
         """
         return self._aligned(local_map, scan, T_map_scan[None])[0]
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Float[np.ndarray, "s 4 4"]) -> Alignment:
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Poses) -> Alignment:
         """Aligns all first guesses coarsely and the best of them finely; see `Geometry`.
 
         Args:
@@ -143,7 +143,7 @@ class SurfaceGeometry:
         coarse.sort(key=lambda T: -_matched_share(surface, self._planes(local_map, surface, T, NUM_SAMPLES // 3)))
         return max(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])), key=lambda found: found.score)
 
-    def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
+    def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
 
         Args:
@@ -167,7 +167,7 @@ class SurfaceGeometry:
         found[:, :3, :3], found[:, :3, 3] = (np.array(parts) for parts in zip(*motions, strict=True))
         return found
 
-    def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Float[np.ndarray, "s 4 4"]) -> list[Alignment]:
+    def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Poses) -> list[Alignment]:
         found = align_surfaces(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
         return [self._scored(local_map, scan.measured, T) for T in found]
 

@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from dpmjax.checks import as_host_points
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
@@ -20,12 +21,13 @@ from dpmjax.scans.corrections import deskew
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
-from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, ThinnedScan, TimedScan
-from dpmjax.slam.keyframe_map import KeyframeMap, Pose, as_pose_graph
+from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
+from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods
+from dpmjax.types import Pose, Poses
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -59,13 +61,13 @@ class SlamResult(NamedTuple):
         T_odometry_scan: (n, 4, 4) every scan by odometry alone, without any loop.
     """
 
-    T_world_scan: Float[np.ndarray, "n 4 4"]
+    T_world_scan: Poses
     keyframes: np.ndarray
     loops: tuple[Loop, ...]
     graph: PoseGraph | None
     reports: tuple[ScanReport, ...]
     state: SlamState
-    T_odometry_scan: Float[np.ndarray, "n 4 4"]
+    T_odometry_scan: Poses
 
     @property
     def map(self) -> KeyframeMap:
@@ -141,9 +143,7 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     )
 
 
-def place_scans(
-    T_world_keyframe: Float[np.ndarray, "k 4 4"], reports: Sequence[ScanReport]
-) -> Float[np.ndarray, "n 4 4"]:
+def place_scans(T_world_keyframe: Poses, reports: Sequence[ScanReport]) -> Poses:
     """Computes the world pose of each scan from the pose of its keyframe.
 
     Args:
@@ -206,18 +206,10 @@ def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = Non
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    thinned, compact = thin_input(methods, scan, T_turn), None
+    thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
     if thinned is not None and methods.config.odometry.proposer == "network":
         compact = methods.matcher.encode(thinned)
     return PreparedInput(len(scan.points if isinstance(scan, TimedScan) else scan), thinned, T_turn, compact)
-
-
-def thin_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> ThinnedScan | None:
-    """Thins a scan; see `prepare_input`."""
-    shape = np.shape(scan.points if isinstance(scan, TimedScan) else scan)
-    if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"scan: expected shape (n, 3), got {shape}")
-    return methods.geometry.thin(corrected_points(scan, T_turn))
 
 
 def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
@@ -229,8 +221,11 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
 
     Returns:
         The points.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
     """
-    points = np.asarray(scan.points if isinstance(scan, TimedScan) else scan)
+    points = as_host_points("scan", scan.points if isinstance(scan, TimedScan) else scan)
     is_finite = np.isfinite(points).all(axis=1)
     if not isinstance(scan, TimedScan) or T_turn is None:
         return points[is_finite]

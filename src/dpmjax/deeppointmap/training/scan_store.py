@@ -22,7 +22,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
@@ -40,7 +40,7 @@ from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type, sampled_p
 from dpmjax.scans.augment import SPARSE_POINTS, AugmentConfig, augment_scan, random_motions_on_host
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import PointCloud
+from dpmjax.types import PointCloud, Poses
 
 LOGGER = logging.getLogger("dpmjax.training")
 PUBLISHED = SamplingConfig()
@@ -61,7 +61,7 @@ class PreparedDrive(NamedTuple):
         bad: reason for each bad scan; bad scans count as empty.
     """
 
-    T_world_lidar: Float[np.ndarray, "n 4 4"]
+    T_world_lidar: Poses
     pyramids: np.ndarray | Path
     bad: dict[str, str]
 
@@ -301,13 +301,7 @@ class SampleMaker:
     """Makes the batch of any step; a context manager that ends its thread."""
 
     def __init__(
-        self,
-        store: ScanStore,
-        config: TrainingConfig,
-        *,
-        seed: int,
-        num_samples: int = 1,
-        first_sample: int = 0,
+        self, store: ScanStore, config: TrainingConfig, *, seed: int, num_samples: int = 1, first_sample: int = 0
     ) -> None:
         """Starts the thread.
 
