@@ -6,12 +6,11 @@ are rounded to one step. Coded surface elements are rounded to centimetres. Ragg
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Float, Int8
 from numpy.typing import NDArray
 
 from dpmjax.deeppointmap.prepared_scans import MAX_COMPONENT, CompactElements, CompactImage, CompactScan, round_features
@@ -128,14 +127,15 @@ def _pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     if precision == "int8":
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
     padded = [_of_length(scan.elements, num_elements) for scan in scans]
-    elements = CompactElements(*map(np.stack, zip(*padded, strict=True)))
+    elements = [np.stack(parts) for parts in zip(*padded, strict=True)]
     features, steps, directions = (np.stack([scan[field] for scan in scans]) for field in (1, 2, 3))
     arrays = {"directions": directions, **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1)}
     if precision == "int8":
         exact = (features * steps[..., None]).reshape(-1, features.shape[-1])
         return arrays | _encode_features(exact) | _encode_elements(elements)
-    named = {f"element_{name}": array for name, array in elements._asdict().items()}
-    return arrays | {"features": features, "feature_steps": steps, **named}
+    named = zip(CompactElements._fields, elements, strict=True)
+    arrays |= {"features": features, "feature_steps": steps}
+    return arrays | {f"element_{name}": array for name, array in named}
 
 
 def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
@@ -145,18 +145,17 @@ def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
     if k == 0 or len(mask) != k or m > n:
         raise ValueError(f"element_mask: expected rows of {k} keyframes with {m} descriptors or more, got {mask.shape}")
     if precision == "int8":
-        elements = _decode_elements(arrays, mask)
+        elements = _decode_elements(arrays, k, n)
         features, steps = round_features(_decode_features(arrays, k * m).reshape(k, m, -1))
     else:
-        elements = CompactElements(
-            _take(arrays, "element_unit_m", k),
+        elements = (
+            _take(arrays, "element_unit_m", k).tolist(),
             _take(arrays, "element_positions", k, n, 3, kind="i"),
             _take(arrays, "element_normals", k, n, 3, kind="i"),
             _take(arrays, "element_planarity", k, n, kind="u"),
-            mask,
         )
         features, steps = _take(arrays, "features", k, m, None, kind="i"), _take(arrays, "feature_steps", k, m)
-    elements_of_scans = itertools.starmap(CompactElements, zip(*elements, strict=True))
+    elements_of_scans = map(CompactElements, *elements, mask)
     return list(map(CompactScan, elements_of_scans, features, steps, directions, _unpack_images(arrays, k)))
 
 
@@ -206,35 +205,30 @@ def _unit_vectors(stored: NDArray[Any]) -> Float[np.ndarray, "k c"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1)
 
 
-def _encode_elements(elements: CompactElements) -> Arrays:
+def _encode_elements(elements: Sequence[NDArray[Any]]) -> Arrays:
     """Rounds positions to 2 cm, normals to two octahedral coordinates (Meyer et al. 2010), planarity to 16 steps."""
     unit_m, positions, normals, planarity, mask = elements
     upward = normals * np.where(normals[..., 2:] < 0, -1.0, 1.0)
     flat = upward[..., :2] / np.maximum(np.abs(upward).sum(axis=-1, keepdims=True), 1)
+    positions = np.rint(positions.swapaxes(1, 2) * (unit_m / POSITION_STEP_M)[:, None, None])
     return {
-        "element_positions": np.rint(positions.swapaxes(1, 2) * (unit_m / POSITION_STEP_M)[:, None, None]).astype(
-            np.int16
-        ),
+        "element_positions": positions.astype(np.int16),
         "element_normals": np.rint(flat.swapaxes(1, 2) * MAX_COMPONENT).astype(np.int8),
         "element_planarity": np.rint(planarity / PLANARITY_STEP).astype(np.uint8),
         "element_mask": mask,
     }
 
 
-def _decode_elements(arrays: Arrays, mask: Bool[np.ndarray, "k n"]) -> CompactElements:
-    k, n = mask.shape
+def _decode_elements(arrays: Arrays, k: int, n: int) -> tuple[Any, ...]:
+    """Returns the units, positions, normals and planarities of k scans, as in `CompactElements`."""
     positions = _take(arrays, "element_positions", k, 3, n, kind="i").astype(np.int16)
     planarity = _take(arrays, "element_planarity", k, n, kind="u").astype(np.int64)
     x, y = _take(arrays, "element_normals", k, 2, n, kind="i").swapaxes(0, 1) / MAX_COMPONENT
     normals = np.stack([x, y, np.maximum(1 - (np.abs(x) + np.abs(y)), 0)], axis=-1)
     normals = np.rint(normals / np.linalg.norm(normals, axis=-1, keepdims=True) * MAX_COMPONENT)
-    return CompactElements(
-        np.full(k, POSITION_STEP_M),
-        positions.swapaxes(1, 2),
-        np.where(planarity[..., None] > 0, normals, 0).astype(np.int8),
-        np.minimum(planarity * PLANARITY_STEP, 255).astype(np.uint8),
-        mask,
-    )
+    normals = np.where(planarity[..., None] > 0, normals, 0).astype(np.int8)
+    planarity = np.minimum(planarity * PLANARITY_STEP, 255).astype(np.uint8)
+    return [POSITION_STEP_M] * k, positions.swapaxes(1, 2), normals, planarity
 
 
 def _pack_images(scans: Sequence[CompactScan], step: int) -> Arrays:
