@@ -154,7 +154,7 @@ def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
             _take(arrays, "element_normals", k, n, 3, kind="i"),
             _take(arrays, "element_planarity", k, n, kind="u"),
         )
-        features, steps = _take(arrays, "features", k, m, None, kind="i"), _take(arrays, "feature_steps", k, m)
+        steps, features = _take(arrays, "feature_steps", k, m), _take(arrays, "features", k, m, None, kind="i")
     elements_of_scans = map(CompactElements, *elements, mask)
     return list(map(CompactScan, elements_of_scans, features, steps, directions, _unpack_images(arrays, k)))
 
