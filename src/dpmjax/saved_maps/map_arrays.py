@@ -128,7 +128,8 @@ def _pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
     padded = [_of_length(scan.elements, num_elements) for scan in scans]
     elements = [np.stack(parts) for parts in zip(*padded, strict=True)]
-    features, steps, directions = (np.stack([scan[field] for scan in scans]) for field in (1, 2, 3))
+    names = "features", "feature_steps", "directions"
+    features, steps, directions = (np.stack([getattr(scan, name) for scan in scans]) for name in names)
     arrays = {"directions": directions, **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1)}
     if precision == "int8":
         exact = (features * steps[..., None]).reshape(-1, features.shape[-1])

@@ -45,10 +45,10 @@ def align_elements(source: SurfaceElements, target: SurfaceElements, T_target_so
     for radius_m, kernel_m, num_steps in LEVELS:
         for _ in range(num_steps):
             moved = _moved(T, source)
-            pairs = _pairs(moved, target, trees[1].near(moved.positions, radius_m), sign=1)
+            there = _pairs(moved, target, trees[1].near(moved.positions, radius_m), sign=1)
             found = trees[0].near(_moved(rigid.inverse(T), target).positions, radius_m)
-            pairs = [np.concatenate(parts) for parts in zip(pairs, _pairs(target, moved, found, sign=-1), strict=True)]
-            points, normals, residuals, weights = pairs
+            back = _pairs(target, moved, found, sign=-1)
+            points, normals, residuals, weights = map(np.concatenate, zip(there, back, strict=True))
             if (weights > 0).sum() < MIN_PAIRS:
                 return T
             step = step_to_planes(points, normals, residuals, weights * geman_mcclure(residuals, kernel_m))
@@ -73,11 +73,11 @@ class _Search(NamedTuple):
     rows: Int[np.ndarray, " v"]
     tree: HostTree
 
-    def near(self, queries: np.ndarray, radius_m: float) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    def near(self, queries: AnyArray, radius_m: float) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
         """Returns the row of the nearest plane of each query, and True where it is near enough."""
         if len(self.rows) == 0:
             return np.zeros(len(queries), np.int64), np.zeros(len(queries), bool)
-        found, distances = self.tree.nearest(queries, 1)
+        found, distances = self.tree.nearest(np.asarray(queries), 1)
         return self.rows[found[:, 0]], distances[:, 0] < radius_m
 
 

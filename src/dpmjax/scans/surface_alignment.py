@@ -73,11 +73,7 @@ class AlignmentConfig:
         levels: coarse to fine.
     """
 
-    levels: tuple[AlignmentLevel, ...] = (
-        AlignmentLevel(3.0, 1500, 6),
-        AlignmentLevel(1.0, 4000, 8),
-        AlignmentLevel(0.4, 8000, 10),
-    )
+    levels: tuple[AlignmentLevel, ...]
 
     def __post_init__(self) -> None:
         if not self.levels:
@@ -142,9 +138,7 @@ class NearestPlanes(NamedTuple):
         return self.is_paired & (np.abs(self.residuals) < PLANE_DISTANCE_M) & (self.cosines > MIN_COSINE)
 
 
-def align_surfaces(
-    source: Surface, target: Surface, T_target_source: Poses, config: AlignmentConfig = AlignmentConfig()
-) -> Poses:
+def align_surfaces(source: Surface, target: Surface, T_target_source: Poses, config: AlignmentConfig) -> Poses:
     """Aligns two surfaces by the distances of points to planes (Chen and Medioni 1992), with a robust kernel.
 
     The alignments from all first guesses proceed in step: all of them look up their neighbours together.

@@ -149,8 +149,8 @@ def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClos
     information = DESCRIPTOR_INFORMATION
     if match.information is not None:
         information = with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)
-    registered = match.probability, match.rmse, match.T_target_source, information
-    return Loop(*loop[:3], _status(slam_map, loop, match, config), loop.overlap, *registered)
+    status = _status(slam_map, loop, match, config)
+    return Loop(*loop[:3], status, loop.overlap, match.probability, match.rmse, match.T_target_source, information)
 
 
 def _status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
