@@ -88,7 +88,7 @@ def _pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
         "edge_rows": np.stack([edges.source, edges.target], axis=1).astype(np.int32),
         "edge_kind": np.array([KINDS.index(edge.kind) for edge in slam_map.edges], np.uint8),
         "edge_T": edges.measurements[:, :3].astype(dtype),
-        "edge_information": edges.information[:, *TRIANGLE].astype(dtype),
+        "edge_information": edges.information[:, *TRIANGLE].astype(dtype, order="C"),
     }
 
 
