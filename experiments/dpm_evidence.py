@@ -105,7 +105,7 @@ def hypotheses(model: dpm.Model, measured: list[Any], found: Any, T_true: np.nda
     config, surfaces = model.config.verification, [scan.surface for scan in measured]
     T = np.concatenate([dpm.distinct_motions(found), scans.correlate_views(*surfaces, config.views)])
     for alignment in (dpm.COARSE, dpm.FINE):
-        T = np.stack([one.T_target_source for one in scans.align_surfaces_from(*surfaces, T, alignment)])
+        T = scans.align_surfaces(*surfaces, T, alignment)
     return {
         "shares": dpm.evidence_shares(*measured, T, config).tolist(),
         "is_right": registration_recall(T, np.broadcast_to(T_true, T.shape)).is_right.tolist(),

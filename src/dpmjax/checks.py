@@ -58,6 +58,28 @@ def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = N
     return array
 
 
+def as_host_points(name: str, value: ArrayLike) -> np.ndarray:
+    """Makes points in space, on the host; the dtype is kept.
+
+    Args:
+        name: name of the argument, for messages.
+        value: the array.
+
+    Returns:
+        (n, 3) points, an array of NumPy.
+
+    Raises:
+        ValueError: the shape is another one, or the numbers are not real.
+    """
+    array = np.asarray(value)
+    if array.ndim != 2 or array.shape[1] != 3:
+        hint = "; pass points[:, :3] without the reflectance" if array.shape[1:] == (4,) else ""
+        raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}{hint}")
+    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+        raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
+    return array
+
+
 def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...], xp: ModuleType = jnp) -> Any:
     """Makes a boolean mask.
 

@@ -16,6 +16,13 @@ from jaxtyping import Array, Bool, Float, Int
 # Input of public functions: an array of JAX or of NumPy. They return arrays of JAX.
 AnyArray = jax.Array | np.ndarray
 
+# Poses and motions on the host: homogeneous matrices, one or several.
+Pose = Float[np.ndarray, "4 4"]
+Poses = Float[np.ndarray, "_n 4 4"]
+
+# Inverse covariance of a motion on the host, in the tangent of its source, translation first.
+Information = Float[np.ndarray, "6 6"]
+
 
 @flax.struct.dataclass
 class ScanSet:
@@ -41,6 +48,10 @@ class PointCloud:
 
     points: Float[AnyArray, "n 3"]
     mask: Bool[AnyArray, " n"]
+
+
+# A raw scan: points in metres, in the frame of the lidar.
+RawScan = PointCloud | Float[AnyArray, "_n 3"]
 
 
 class Neighbours(NamedTuple):

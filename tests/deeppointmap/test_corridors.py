@@ -10,9 +10,9 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap.confidence import logistic_probability, weak_features
-from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, weak_direction_of
+from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
 from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
-from dpmjax.scans.weak_directions import facing_surface, facing_weights, sliding_motions, wall_axis, weak_share
+from dpmjax.scans.weak_directions import facing_samples, sliding_motions, wall_axis, weak_share, weakest_direction
 from tests.scans.surface_scenes import corridor, motion, seen_from
 
 CONFIG = VerificationConfig()
@@ -79,13 +79,13 @@ def test_the_weak_direction_is_the_axis_of_the_corridor(bare) -> None:
     assert weak_share(axes[0], axes[1]) < 0.1
     for axis, pose in zip(axes, POSES, strict=True):
         assert abs(axis.axis @ pose[:3, :3].T[:, 0]) > 0.999
-    weak = weak_direction_of(*bare, T_TRUE, CONFIG)
+    weak = weakest_direction(*(scan.surface for scan in bare), T_TRUE, CONFIG.plane_radius_m)
     assert abs(weak.direction @ POSES[1][:3, :3].T[:, 0]) > 0.99
     assert weak.sigma_m > 1
 
 
 def test_elements_that_face_the_axis_make_the_shift_known(with_pillars) -> None:
-    weak = weak_direction_of(*with_pillars, T_TRUE, CONFIG)
+    weak = weakest_direction(*(scan.surface for scan in with_pillars), T_TRUE, CONFIG.plane_radius_m)
     assert abs(weak.direction @ POSES[1][:3, :3].T[:, 0]) > 0.99
     assert 0 < weak.sigma_m < 0.2
 
@@ -119,7 +119,7 @@ def test_the_motions_go_both_ways_round_as_far_as_the_scans_reach(bare) -> None:
 
 def test_only_elements_that_face_the_axis_are_compared(with_pillars) -> None:
     surface, axis = with_pillars[0].surface, POSES[0][:3, :3].T[:, 0]
-    facing = facing_surface(surface, axis)
+    facing, _ = facing_samples(surface, axis, np.inf)
     assert 0 < len(facing.samples) < len(surface.samples) / 10
     at_pillars = (surface.points[facing.samples] @ POSES[0][:3, :3].T + POSES[0][:3, 3])[:, 0]
     distances = np.abs(at_pillars[:, None] - np.array([*PILLARS_M, *(x + 0.6 for x in PILLARS_M)])).min(axis=1)
@@ -128,13 +128,12 @@ def test_only_elements_that_face_the_axis_are_compared(with_pillars) -> None:
 
 def test_an_end_wall_counts_as_one_position(with_pillars) -> None:
     axis = POSES[0][:3, :3].T[:, 0]
-    facing = facing_surface(with_pillars[0].surface, axis)
-    weights = facing_weights(facing, axis, 10.0)
+    facing, weights = facing_samples(with_pillars[0].surface, axis, 10.0)
     positions = np.floor(facing.points[facing.samples] @ axis / 0.5)
     for position in np.unique(positions):
         at = positions == position
         assert weights[at].sum() == pytest.approx(min(at.sum(), 10.0))
-    np.testing.assert_array_equal(facing_weights(facing, axis, np.inf), 1)
+    np.testing.assert_array_equal(facing_samples(facing, axis, np.inf)[1], 1)
 
 
 def test_scans_without_walls_have_no_weak_axis() -> None:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry.normals import pyramid_elements
-from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid, build_pyramid_on_host
 from dpmjax.types import SurfaceElements
 from tests.tolerances import ROUNDING
 

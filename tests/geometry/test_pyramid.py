@@ -9,9 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.geometry import pyramid_host
-from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host, farthest_points_on_host
+from dpmjax.geometry import pyramid as pyramid_host
+from dpmjax.geometry.pyramid import (
+    PyramidConfig,
+    PyramidStage,
+    build_pyramid,
+    build_pyramid_on_host,
+    farthest_points_on_host,
+)
 from dpmjax.types import PointPyramid
 from tests.tolerances import ACCUMULATED, ROUNDING
 

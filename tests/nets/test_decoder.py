@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, correlate, init_model, model_preset, overlap
-from dpmjax.deeppointmap.model import coarse_features, overlap_logit, predict_offsets, similarity_features
+from dpmjax.deeppointmap.model import decode, overlap_logit, predict_offsets, similarity_features
 from dpmjax.nets import DecoderConfig, attention
 from dpmjax.nets.attention import embed_positions
 from dpmjax.types import DescriptorCloud
@@ -100,7 +100,7 @@ def test_clouds_change_places_together(model: Model) -> None:
 def test_heads_have_their_shapes(model: Model) -> None:
     a, b = correlate(model, cloud(8, 8), cloud(9, 8))
     assert similarity_features(model, a).shape == (8, 32)
-    assert coarse_features(model, cloud(8, 8)).shape == (8, 64)
+    assert decode(model, cloud(8, 8).features, part="coarse_head").shape == (8, 64)
     assert predict_offsets(model, a.features[:5], b.features[:5]).shape == (5, 3)
     assert overlap_logit(model, a, b).shape == ()
 

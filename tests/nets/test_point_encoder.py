@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap.model import Model, encode_pyramid, init_model, model_shapes
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import ray_directions, to_ray_frame
-from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid_on_host
 from dpmjax.nets import DecoderConfig, EncoderConfig
 from dpmjax.nets.point_encoder import NeighbourhoodMaximum
 from dpmjax.types import PointPyramid

@@ -15,8 +15,8 @@ from dpmjax import load_map, save_map
 from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_scan
 from dpmjax.io import InputError
 from dpmjax.saved_maps import map_bytes
-from dpmjax.scans.range_images import range_image
-from dpmjax.scans.surfaces import SurfaceConfig, scan_surface
+from dpmjax.scans.surfaces import SurfaceConfig, range_image, scan_surface
+from dpmjax.scans.weak_directions import diagonal_information
 from dpmjax.slam import SlamConfig
 from dpmjax.slam.keyframe_map import (
     Keyframe,
@@ -24,11 +24,10 @@ from dpmjax.slam.keyframe_map import (
     MapEdge,
     MapOrigin,
     add_keyframe,
-    diagonal_information,
     with_origin,
 )
 from dpmjax.types import DescriptorCloud
-from tests.scans.test_compact import room
+from tests.deeppointmap.test_compact import room
 from tests.slam.truth import noise
 
 RNG = np.random.default_rng(3)

@@ -13,7 +13,7 @@ import dpmjax
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.io import InputError
 from dpmjax.saved_maps import load_state, save_map, save_state
-from dpmjax.saved_maps.run_state import from_columns, part_of, prefixed, to_columns
+from dpmjax.saved_maps.map_file import from_columns, to_columns
 from dpmjax.slam import ScanReport, SlamConfig, SlamMethods, SlamState, finish_slam, init_slam, make_methods, step_slam
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
@@ -206,8 +206,8 @@ def test_columns_give_the_records_back() -> None:
     ]
     of_many_rows = [records[0], Record(4, "d", np.arange(10.0).reshape(5, 2)), Record(5, "e", np.zeros((0, 2)))]
     for part in (records, records[:1], records[1:2], [], of_many_rows, of_many_rows[1:2]):
-        columns = prefixed(to_columns(part, "record"), "a") | prefixed(to_columns(records, "record"), "b")
-        assert_same(tuple(from_columns(Record, part_of(columns, "a"), "record")), tuple(part))
+        columns = to_columns(part, "record") | to_columns(records, "other")
+        assert_same(tuple(from_columns(Record, columns, "record")), tuple(part))
 
 
 def test_a_field_that_is_left_out_is_none_and_one_that_is_missing_is_named(as_user) -> None:

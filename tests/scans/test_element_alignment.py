@@ -56,10 +56,8 @@ def test_the_same_elements_are_aligned_to_rounding() -> None:
         np.testing.assert_allclose(align(SOURCE, moved, np.eye(4)).T_target_source, T_b_a, atol=2e-5)
 
 
-@pytest.mark.parametrize("is_symmetric", [True, False])
-def test_trees_and_exhaustive_search_give_one_motion(is_symmetric: bool) -> None:
-    ours = align_elements(SOURCE, TARGET, GUESS, is_symmetric=is_symmetric)
-    host = align_elements_on_host(SOURCE, TARGET, GUESS, is_symmetric=is_symmetric)
+def test_trees_and_exhaustive_search_give_one_motion() -> None:
+    ours, host = (align(SOURCE, TARGET, GUESS) for align in (align_elements, align_elements_on_host))
     np.testing.assert_allclose(ours.T_target_source, host.T_target_source, atol=2e-4)
     np.testing.assert_allclose(ours.rmse, host.rmse, rtol=1e-2)
     assert abs(int(ours.num_pairs) - int(host.num_pairs)) <= 2
@@ -99,11 +97,11 @@ def test_pairs_are_aligned_side_by_side() -> None:
     np.testing.assert_allclose(many.T_target_source[1], expected.T_target_source, atol=1e-5)
 
 
-@pytest.mark.parametrize("num", [0, 10])
+@pytest.mark.parametrize("num", [0, 5])
 def test_too_few_pairs_leave_the_motion(num: int) -> None:
-    few = SOURCE.replace(mask=jnp.arange(300) < num)
+    few, fewer = (side.replace(mask=jnp.arange(300) < num) for side in (SOURCE, TARGET))
     for align in (align_elements, align_elements_on_host):
-        found = align(few, TARGET, GUESS, is_symmetric=False)
+        found = align(few, fewer, GUESS)
         np.testing.assert_allclose(found.T_target_source, GUESS, atol=1e-6)
         assert np.isinf(found.rmse)
 

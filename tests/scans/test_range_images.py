@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.scans.range_images import range_image, view_points
+from dpmjax.scans.surfaces import range_image, view_points
 
 
 def sphere(radius: float, num: int = 20000) -> np.ndarray:

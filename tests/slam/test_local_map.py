@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpmjax.deeppointmap.prepared_scans import compact_elements
 from dpmjax.geometry import rigid
-from dpmjax.scans.compact import compact_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe
 from dpmjax.slam.local_map import (
+    RECENT_SHARE,
     PlacedElements,
     joined_surface,
     local_map_of,
-    nearest_keyframe,
     placed_keyframe,
     placed_scan,
     with_scan,
@@ -27,6 +27,7 @@ from tests.slam.truth import compact_of, laps, number_of, pose
 CONFIG = OdometryConfig(num_keyframes=5)
 TRUTH = laps(1, side_m=20.0, step_m=2.0)
 SPACING_M = 0.8
+EXTENT_M = SPACING_M / RECENT_SHARE
 
 
 def chain(T_world_keyframe: np.ndarray, missing_edge: int | None = None) -> KeyframeMap:
@@ -83,15 +84,15 @@ def test_a_local_map_moves_with_the_frame_of_the_map() -> None:
 def test_a_scan_that_adds_nothing_does_not_join() -> None:
     recent = (placed_at(np.eye(4), 5.0),)
     for T in (pose(0, 0, 0), pose(0.99 * SPACING_M, 0, 0), pose(0, 0, 0.16)):
-        assert with_scan(recent, placed_at(T, 5.0), SPACING_M) is recent
+        assert with_scan(recent, placed_at(T, 5.0), EXTENT_M) is recent
     for T in (pose(1.01 * SPACING_M, 0, 0), pose(0, 0, 0.18)):
         placed = placed_at(T, 5.0)
-        joined = with_scan(recent, placed, SPACING_M)
+        joined = with_scan(recent, placed, EXTENT_M)
         assert joined == (*recent, placed)
         # The distance is that from the last scan that has joined.
-        assert with_scan(joined, placed, SPACING_M) is joined
-        assert len(with_scan(joined, recent[0], SPACING_M)) == 3
-    assert with_scan((), recent[0], SPACING_M) == recent
+        assert with_scan(joined, placed, EXTENT_M) is joined
+        assert len(with_scan(joined, recent[0], EXTENT_M)) == 3
+    assert with_scan((), recent[0], EXTENT_M) == recent
     # People move around a lidar that stands still.
     here = placed_at(np.eye(4), 6.0)
     assert with_scan(recent, here, 0.0) == (*recent, here)
@@ -100,7 +101,7 @@ def test_a_scan_that_adds_nothing_does_not_join() -> None:
 def test_the_oldest_of_too_many_scans_leaves() -> None:
     recent: tuple[PlacedElements, ...] = ()
     for step in range(1, 11):
-        recent = with_scan(recent, placed_at(pose(step, 0, 0), 5.0 + step), SPACING_M)
+        recent = with_scan(recent, placed_at(pose(step, 0, 0), 5.0 + step), EXTENT_M)
     assert [placed.T_map_scan[0, 3] for placed in recent] == list(range(3, 11))
     surface = local_map_of(chain(TRUTH[:3]), recent, CONFIG).surface
     np.testing.assert_allclose(sorted(surface.points[-8:, 0]), [5 + 2 * step for step in range(3, 11)], atol=1e-5)
@@ -128,4 +129,4 @@ def test_elements_of_a_turned_scan_are_turned() -> None:
 def test_the_nearest_keyframe_is_nearest(row: int) -> None:
     local_map = local_map_of(chain(TRUTH), (), CONFIG)
     position = local_map.keyframes[row].T_map_scan[:3, 3] + [0.3, -0.4, 0.2]
-    assert nearest_keyframe(local_map, position) == row
+    assert local_map.nearest(position) == row

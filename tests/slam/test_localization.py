@@ -11,8 +11,7 @@ from dpmjax import localize
 from dpmjax.geometry import rigid
 from dpmjax.slam import SlamConfig, SlamMethods, localize_each, run_slam
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframe_map import KeyframeMap
-from dpmjax.slam.map_thinning import thin_map
+from dpmjax.slam.keyframe_map import KeyframeMap, thin_map
 from dpmjax.types import Verification
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
 

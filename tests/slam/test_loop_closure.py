@@ -8,13 +8,20 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans.surface_alignment import PlanePairs
-from dpmjax.scans.weak_directions import plane_information, with_least_covariance
+from dpmjax.scans.weak_directions import diagonal_information, plane_information, with_least_covariance
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
-from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, diagonal_information, submap_around
-from dpmjax.slam.loop_candidates import MIN_PATH_SHARE, find_loop_candidates, most_similar, nearest_pairs, pooled_vector
-from dpmjax.slam.loop_closure import MAX_AGAIN, search_again
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, submap_around
+from dpmjax.slam.loop_closure import (
+    MAX_AGAIN,
+    MIN_PATH_SHARE,
+    find_loop_candidates,
+    most_similar,
+    nearest_pairs,
+    search_again,
+)
 from dpmjax.slam.loops import Loop, LoopState, are_consistent
 from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.model_methods import pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 
@@ -164,7 +171,7 @@ def test_an_alignment_is_as_exact_as_its_planes_and_the_configuration_say() -> N
     normals = np.eye(3)[rng.integers(1, 3, 300)]  # walls and floor of a corridor along x
     pairs = PlanePairs(points, rng.normal(0, 0.02, 300), normals)
     T = pose(3.0, -1.0, 0.4)
-    information = with_least_covariance(plane_information(pairs, T, max_residual_m=0.15), 0.1, 0.02)
+    information = with_least_covariance(plane_information(pairs, T), 0.1, 0.02)
     covariance = np.linalg.inv(information)
     # The axis of the corridor in the frame of the source.
     along, across = (T[:3, :3].T @ np.eye(3)[axis] for axis in (0, 1))
@@ -172,7 +179,7 @@ def test_an_alignment_is_as_exact_as_its_planes_and_the_configuration_say() -> N
     np.testing.assert_allclose(np.sqrt(across @ covariance[:3, :3] @ across), 0.1, atol=0.01)
     assert (np.linalg.eigvalsh(covariance - np.diag([0.01] * 3 + [0.0004] * 3)) > -1e-9).all()
     few = PlanePairs(points[:3], np.zeros(3), normals[:3])
-    assert np.linalg.inv(plane_information(few, T, max_residual_m=0.15))[0, 0] > 50.0
+    assert np.linalg.inv(plane_information(few, T))[0, 0] > 50.0
 
 
 def test_a_part_starts_where_a_loop_says() -> None:

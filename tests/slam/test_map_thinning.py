@@ -7,8 +7,7 @@ import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.slam import SlamConfig, SlamMethods, run_slam
-from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts
-from dpmjax.slam.map_thinning import thin_map
+from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts, thin_map
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 TRUTH = laps(2, side_m=40.0, step_m=2.0)

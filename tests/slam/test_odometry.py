@@ -8,14 +8,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpmjax import model_preset
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_elements, compact_image
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.compact import compact_elements, compact_image
+from dpmjax.scans.weak_directions import diagonal_information
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
-from dpmjax.slam.keyframe_map import Keyframe, add_keyframe, diagonal_information
+from dpmjax.slam.keyframe_map import Keyframe, add_keyframe
 from dpmjax.slam.local_map import local_map_of
-from dpmjax.slam.odometry import CONTRADICTION_WEIGHT, MAX_ELEMENTS, SPREAD_M
+from dpmjax.slam.model_methods import CONTRADICTION_WEIGHT, MAX_ELEMENTS, SPREAD_M
 from dpmjax.types import SurfaceElements
 
 

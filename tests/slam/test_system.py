@@ -10,6 +10,7 @@ import pytest
 
 from dpmjax.geometry import rigid, se2
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.scans.weak_directions import diagonal_information
 from dpmjax.slam import (
     Alignment,
     LocalMap,
@@ -25,7 +26,6 @@ from dpmjax.slam import (
     step_slam,
 )
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframe_map import diagonal_information
 from tests.slam.truth import (
     EMPTY,
     MistakenMatcher,

@@ -14,7 +14,7 @@ import pytest
 
 from dpmjax.deeppointmap import Model, correlate, encode_pyramid, overlap, register
 from dpmjax.deeppointmap.model import similarity_features
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.types import DescriptorCloud
 from dpmjax.weights import load_model
 

@@ -60,7 +60,6 @@ from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import TrainingConfig as TrainingConfig
 from .training.curriculum import training_preset as training_preset
 from .training.curriculum import without as without
-from .training.data_pipeline import SampleMaker as SampleMaker
 from .training.evaluation import Evaluation as Evaluation
 from .training.evaluation import EvaluationPairs as EvaluationPairs
 from .training.evaluation import OffsetQuality as OffsetQuality
@@ -79,6 +78,7 @@ from .training.objective import ObjectiveConfig as ObjectiveConfig
 from .training.processes import join_processes as join_processes
 from .training.sampling import SamplingConfig as SamplingConfig
 from .training.scan_store import PreparedDrive as PreparedDrive
+from .training.scan_store import SampleMaker as SampleMaker
 from .training.scan_store import ScanStore as ScanStore
 from .training.scan_store import prepare_drive as prepare_drive
 from .training.scan_store import prepare_drives as prepare_drives

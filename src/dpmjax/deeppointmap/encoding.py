@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import require_positive, require_some
+from dpmjax.checks import as_host_points, require_positive, require_some
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.scans.preprocess import first_of_each_voxel, preprocess_scan_on_host
-from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid
+from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
 # Number of scans, or of pairs, in one call of a compiled program.
 CHUNK = 4
@@ -25,13 +25,7 @@ CHUNK = 4
 EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 
 
-def encode(
-    model: Model,
-    points: PointCloud | Float[AnyArray, "n 3"],
-    *,
-    scale: float = 1.0,
-    num_elements: int | None = None,
-) -> DescriptorCloud:
+def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
     Raises a `ValueError` if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements`
@@ -55,11 +49,7 @@ def encode(
 
 
 def encode_scans(
-    model: Model,
-    scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]],
-    *,
-    scale: float = 1.0,
-    num_elements: int | None = None,
+    model: Model, scans: Sequence[RawScan], *, scale: float = 1.0, num_elements: int | None = None
 ) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
@@ -83,7 +73,7 @@ def encode_scans(
     return join_chunks(parts, len(scans))
 
 
-def scene_scale(scans: Sequence[PointCloud | Float[AnyArray, "_n 3"]], config: ModelConfig) -> float:
+def scene_scale(scans: Sequence[RawScan], config: ModelConfig) -> float:
     """Chooses the factor by which scans are enlarged so that rooms fill the range of the encoder as streets do.
 
     Args:
@@ -108,14 +98,12 @@ def _extent_m(points: Float[np.ndarray, "n 3"], config: ModelConfig) -> float:
     return float(np.percentile(np.linalg.norm(thinned, axis=1), EXTENT_PERCENT)) if len(thinned) else 0.0
 
 
-def valid_points(points: PointCloud | Float[AnyArray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
     """Returns the points of a scan that its mask allows, as an array of NumPy."""
     return np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
 
 
-def pyramid_of_scan(
-    points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, *, scale: float = 1.0
-) -> PointPyramid:
+def pyramid_of_scan(points: RawScan, config: ModelConfig, *, scale: float = 1.0) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
     Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
@@ -131,7 +119,7 @@ def pyramid_of_scan(
     return pyramid_of_cloud(thin_scan(points, config, scale=scale), config)
 
 
-def thin_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, *, scale: float = 1.0) -> PointCloud:
+def thin_scan(points: RawScan, config: ModelConfig, *, scale: float = 1.0) -> PointCloud:
     """Preprocesses a raw scan for the encoder, on the host.
 
     Args:
@@ -147,12 +135,7 @@ def thin_scan(points: PointCloud | Float[AnyArray, "n 3"], config: ModelConfig, 
     """
     require_positive("scale", scale)
     array, mask = (points.points, points.mask) if isinstance(points, PointCloud) else (points, None)
-    array = np.asarray(array)
-    if array.ndim != 2 or array.shape[1] != 3:
-        hint = "; pass points[:, :3] without the reflectance" if array.shape[1:] == (4,) else ""
-        raise ValueError(f"points: expected shape (n, 3), got {array.shape}{hint}")
-    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
-        raise ValueError(f"points: expected real numbers, got dtype {array.dtype}")
+    array = as_host_points("points", array)
     if scale != 1:
         array = array * np.float32(scale)
     return preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from dpmjax.geometry import se2
 from dpmjax.geometry.rigid import inverse
 from dpmjax.sequences import LidarSequence
+from dpmjax.types import Pose, Poses
 
 # Distances between the scans of a pair; scans of "far" do not overlap.
 DISTANCE_BANDS_M = {"near": (2.0, 10.0), "middle": (10.0, 20.0), "far": (60.0, np.inf)}
@@ -29,7 +30,7 @@ class ScanPair(NamedTuple):
 
     source: Float[np.ndarray, "n 3"]
     target: Float[np.ndarray, "m 3"]
-    T_target_source: Float[np.ndarray, "4 4"]
+    T_target_source: Pose
 
 
 def draw_scan_pairs(drive: LidarSequence, band: str, num_pairs: int, *, seed: int = 0) -> Int[np.ndarray, "p 2"]:
@@ -78,7 +79,7 @@ def read_scan_pairs(drive: LidarSequence, pairs: Int[np.ndarray, "p 2"], *, seed
         yield ScanPair(scans[0], scans[1], inverse(T_world_scan[1]) @ T_world_scan[0])
 
 
-def true_poses(drive: LidarSequence) -> Float[np.ndarray, "n 4 4"]:
+def true_poses(drive: LidarSequence) -> Poses:
     """Returns the true poses of a drive.
 
     Args:

@@ -20,7 +20,7 @@ from dpmjax.checks import require_shape
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
-from dpmjax.geometry.pyramid_host import build_pyramid_on_host
+from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
 from dpmjax.types import DescriptorCloud, PointPyramid
@@ -157,7 +157,7 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
     a, b = a.described, b.described
     for name, cloud in (("a", a), ("b", b)):
         _require_descriptor_cloud(name, cloud, model.config.decoder.input_channels)
-    return _decode(model, a, b, part="correlate")
+    return decode(model, a, b, part="correlate")
 
 
 @jax.jit
@@ -172,7 +172,7 @@ def overlap_logit(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float
     Returns:
         The logit.
     """
-    return _decode(model, a, b, part="overlap_logit")
+    return decode(model, a, b, part="overlap_logit")
 
 
 @jax.jit
@@ -186,7 +186,7 @@ def similarity_features(model: Model, correlated: DescriptorCloud) -> Float[Arra
     Returns:
         One row for each descriptor.
     """
-    return _decode(model, correlated.features, part="similarity_head")
+    return decode(model, correlated.features, part="similarity_head")
 
 
 @jax.jit
@@ -219,20 +219,6 @@ def unit_rows(features: Float[Array, "m c"]) -> Float[Array, "m c"]:
 
 
 @jax.jit
-def coarse_features(model: Model, cloud: DescriptorCloud) -> Float[Array, "m c"]:
-    """Computes the features of the coarse pairing loss (DeepPointMap eq. 5).
-
-    Args:
-        model: encoder and decoder.
-        cloud: an uncorrelated cloud.
-
-    Returns:
-        One row for each descriptor.
-    """
-    return _decode(model, cloud.features, part="coarse_head")
-
-
-@jax.jit
 def predict_offsets(
     model: Model,
     features: Float[Array, "... c"],
@@ -259,7 +245,7 @@ def predict_offsets(
     if not model.config.decoder.predicts_offsets:
         others = partners.shape[:-1] if partner_rows is None else partner_rows.shape
         return jnp.zeros((*jnp.broadcast_shapes(features.shape[:-1], others), 3), features.dtype)
-    offsets = _decode(model, features, partners, partner_rows, part="offset_head")
+    offsets = decode(model, features, partners, partner_rows, part="offset_head")
     if directions is None or model.config.encoder.frame == "lidar":
         return offsets
     return from_ray_frame(offsets, directions)
@@ -269,8 +255,17 @@ def _encoder(config: ModelConfig) -> PointEncoder:
     return PointEncoder(config.encoder, tuple(stage.radii for stage in config.pyramid.stages))
 
 
-def _decode(model: Model, *arguments: Any, part: str) -> Any:
-    # `part` is a method or a head of the decoder.
+def decode(model: Model, *arguments: Any, part: str) -> Any:
+    """Applies a method or a head of the decoder, such as "coarse_head" for the coarse pairing loss (eq. 5).
+
+    Args:
+        model: encoder and decoder.
+        *arguments: arguments of the part.
+        part: its name in `DescriptorDecoder`.
+
+    Returns:
+        The result of the part.
+    """
     return DescriptorDecoder(model.config.decoder).apply(
         {"params": model.params["decoder"]},
         *arguments,

@@ -13,33 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.deeppointmap.verification import (
-    PLANE_DISTANCE_M,
-    MeasuredScan,
-    VerificationConfig,
-    compare_scans,
-    verify_motions,
-)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
 from dpmjax.geometry import rigid
-from dpmjax.scans.surface_alignment import (
-    AlignmentConfig,
-    AlignmentLevel,
-    align_surfaces,
-    align_surfaces_from,
-    pair_with_planes,
-)
-from dpmjax.scans.view_correlation import T_level_lidar, correlate_views
-from dpmjax.scans.weak_directions import (
-    WallAxis,
-    WeakDirection,
-    facing_surface,
-    facing_weights,
-    sliding_motions,
-    wall_axis,
-    weak_share,
-    weakest_direction,
-)
-from dpmjax.types import Verification
+from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
+from dpmjax.scans.view_correlation import correlate_views
+from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
+from dpmjax.types import Pose, Poses, Verification
 
 # Alignment of each hypothesis.
 COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
@@ -94,12 +73,12 @@ class VerifiedMotion(NamedTuple):
     """
 
     row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
+    T_target_source: Pose
     verification: Verification
 
 
 def choose_motion(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> VerifiedMotion:
     """Chooses the hypothesis under which two scans agree best.
 
@@ -115,26 +94,26 @@ def choose_motion(
     Returns:
         The best hypothesis, aligned.
     """
-    hypotheses, scans = np.asarray(T_target_source, float), (source, target)
+    pair, hypotheses = _Pair(source, target, config), np.asarray(T_target_source, float)
     tried: list[VerifiedMotion] = []
-    for some in _candidates(source, target, hypotheses, config):
-        tried += _aligned(scans, some, COARSE, config)
+    for some in pair.candidates(hypotheses):
+        tried += pair.aligned(some, COARSE)
         tried.sort(key=lambda motion: -motion.verification.score)
         if tried[0].verification.score > CLEAR_SCORE:
             break
-    finalists, remaining = _aligned(scans, tried[:NUM_FINE], FINE, config), tried[NUM_FINE:]
+    finalists, remaining = pair.aligned(tried[:NUM_FINE], FINE), tried[NUM_FINE:]
     axes = wall_axis(source.surface), wall_axis(target.surface)
     num_slid = 0
     if is_weak := weak_share(*axes) < config.max_weak_share:
         starts = sliding_motions(*axes, SLIDING_STEP_M)
         num_slid = len(starts)
-        slid = _moved(scans, starts, COARSE)
-        order = np.argsort(-_facing_elements(scans, axes, slid, config), kind="stable")
-        finalists += _aligned(scans, [_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE, config)
+        slid = align_surfaces(source.surface, target.surface, starts, COARSE)
+        order = np.argsort(-pair.facing_elements(axes, slid), kind="stable")
+        finalists += pair.aligned([_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE)
     motions = [*finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
-    facing = _facing_elements(scans, axes, T, config) if is_weak else np.zeros(len(motions))
+    facing = pair.facing_elements(axes, T) if is_weak else np.zeros(len(motions))
     best = int(np.argmax((facing if is_weak else scores)[: len(finalists)]))
     chosen, is_other = motions[best], _is_apart(T, T[best])
     if chosen.row is None:
@@ -145,59 +124,49 @@ def choose_motion(
     return chosen._replace(verification=found)
 
 
-def _aligned(
-    scans: tuple[MeasuredScan, MeasuredScan],
-    candidates: Sequence[_Candidate | VerifiedMotion],
-    alignment: AlignmentConfig,
-    config: VerificationConfig,
-) -> list[VerifiedMotion]:
-    T = _moved(scans, np.stack([candidate.T_target_source for candidate in candidates]), alignment)
-    verified = verify_motions(*scans, T, config)
-    return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
-
-
-def _moved(
-    scans: tuple[MeasuredScan, MeasuredScan], starts: Float[np.ndarray, "s 4 4"], alignment: AlignmentConfig
-) -> Float[np.ndarray, "s 4 4"]:
-    found = align_surfaces_from(scans[0].surface, scans[1].surface, starts, alignment)
-    return np.stack([one.T_target_source for one in found])
-
-
-def _facing_elements(
-    scans: tuple[MeasuredScan, MeasuredScan],
-    axes: tuple[WallAxis, WallAxis],
-    T_target_source: Float[np.ndarray, "s 4 4"],
-    config: VerificationConfig,
-) -> Float[np.ndarray, " s"]:
-    """Counts elements that face the weak axis and meet; those in free space and unmet visible ones count against it."""
-    settings, counts = replace(config, num_samples=NUM_FACING), []
-    motions = T_target_source, rigid.inverse(T_target_source)
-    for scan, other, axis, T_other_scan in zip(scans, scans[::-1], axes, motions, strict=True):
-        surface = facing_surface(scan.surface, axis.axis)
-        side = compare_scans(scan._replace(surface=surface), other, T_other_scan, settings)
-        values = side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible
-        counts.append(values @ facing_weights(surface, axis.axis, MAX_FACING)[:NUM_FACING])
-    return np.mean(counts, axis=0)
-
-
 class _Candidate(NamedTuple):
     row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
+    T_target_source: Pose
 
 
-def _candidates(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "h 4 4"], config: VerificationConfig
-) -> Iterator[list[_Candidate]]:
-    """Yields hypotheses in batches; from the second batch on, they alternate with motions of the correlated views."""
-    hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
-    yield hypotheses[:HYPOTHESES_AT_ONCE]
-    searched: list[_Candidate] = []
-    if config.views.num_motions > 0:
-        searched = [_Candidate(None, T) for T in correlate_views(source.surface, target.surface, config.views)]
-    further = hypotheses[HYPOTHESES_AT_ONCE:]
-    for start in range(0, max(len(searched), len(further)), HYPOTHESES_AT_ONCE):
-        some = slice(start, start + HYPOTHESES_AT_ONCE)
-        yield from filter(None, (searched[some], further[some]))
+class _Pair(NamedTuple):
+    # The two scans whose motion is chosen.
+    source: MeasuredScan
+    target: MeasuredScan
+    config: VerificationConfig
+
+    def candidates(self, T_target_source: Poses) -> Iterator[list[_Candidate]]:
+        """Yields hypotheses in batches; from the second on, they alternate with motions of the correlated views."""
+        hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
+        yield hypotheses[:HYPOTHESES_AT_ONCE]
+        searched: list[_Candidate] = []
+        if self.config.views.num_motions > 0:
+            found = correlate_views(self.source.surface, self.target.surface, self.config.views)
+            searched = [_Candidate(None, T) for T in found]
+        further = hypotheses[HYPOTHESES_AT_ONCE:]
+        for start in range(0, max(len(searched), len(further)), HYPOTHESES_AT_ONCE):
+            some = slice(start, start + HYPOTHESES_AT_ONCE)
+            yield from filter(None, (searched[some], further[some]))
+
+    def aligned(
+        self, candidates: Sequence[_Candidate | VerifiedMotion], alignment: AlignmentConfig
+    ) -> list[VerifiedMotion]:
+        """Aligns the surfaces of both scans from each candidate, and verifies the motions."""
+        starts = np.stack([candidate.T_target_source for candidate in candidates])
+        T = align_surfaces(self.source.surface, self.target.surface, starts, alignment)
+        verified = verify_motions(self.source, self.target, T, self.config)
+        return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
+
+    def facing_elements(self, axes: Sequence[WallAxis], T_target_source: Poses) -> Float[np.ndarray, " s"]:
+        """Counts elements that face the weak axis and meet; those in free space and unmet visible ones are deducted."""
+        settings, counts = replace(self.config, num_samples=NUM_FACING), []
+        scans, motions = (self.source, self.target), (T_target_source, rigid.inverse(T_target_source))
+        for scan, other, axis, T_other_scan in zip(scans, scans[::-1], axes, motions, strict=True):
+            surface, weights = facing_samples(scan.surface, axis.axis, MAX_FACING)
+            side = compare_scans(scan._replace(surface=surface), other, T_other_scan, settings)
+            values = side.meets - FACING_CONTRADICTED * side.is_contradicted - FACING_VISIBLE * side.is_visible
+            counts.append(values @ weights[:NUM_FACING])
+        return np.mean(counts, axis=0)
 
 
 def refine_motion(
@@ -214,35 +183,13 @@ def refine_motion(
     Returns:
         The refined motion and its verification.
     """
-    start = motion.T_target_source
-    T = align_surfaces(source.surface, target.surface, start, REFINEMENT).T_target_source
-    found = verify_motions(source, target, T[None], config)[0]
+    T = align_surfaces(source.surface, target.surface, motion.T_target_source[None], REFINEMENT)
+    found = verify_motions(source, target, T, config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
-    return VerifiedMotion(motion.row, T, found._replace(**kept))
+    return VerifiedMotion(motion.row, T[0], found._replace(**kept))
 
 
-def weak_direction_of(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "4 4"], config: VerificationConfig
-) -> WeakDirection:
-    """Finds the horizontal direction in which a motion is least certain, by all source elements that meet planes.
-
-    Args:
-        source: a scan.
-        target: the second scan.
-        T_target_source: the motion.
-        config: tolerances.
-
-    Returns:
-        The direction in the target frame, and the standard deviation of the translation along it.
-    """
-    # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
-    level = AlignmentLevel(config.plane_radius_m, max(1, len(source.surface.samples)), 1)
-    pairs = pair_with_planes(source.surface, target.surface, T_target_source, level)
-    up = T_level_lidar(target.surface)[2, :3]
-    return weakest_direction(pairs, T_target_source, up, max_residual_m=PLANE_DISTANCE_M)
-
-
-def _is_apart(T: Float[np.ndarray, "s 4 4"], T_other: Float[np.ndarray, "4 4"]) -> Bool[np.ndarray, " s"]:
+def _is_apart(T: Poses, T_other: Pose) -> Bool[np.ndarray, " s"]:
     """Returns True for motions to another place than that of `T_other`; only these compete with it."""
     difference = rigid.inverse(T_other) @ T
     cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2

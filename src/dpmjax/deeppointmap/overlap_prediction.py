@@ -22,11 +22,11 @@ from dpmjax.deeppointmap.confidence import OverlapEvidence
 from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
-from dpmjax.deeppointmap.prepared_scans import PreparedScan, RawScan, ScanOrCloud, descriptors_of
+from dpmjax.deeppointmap.prepared_scans import PreparedScan, ScanOrCloud, descriptors_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
-from dpmjax.types import DescriptorCloud
+from dpmjax.types import DescriptorCloud, RawScan
 
 # Scans that are nearer to each other overlap.
 OVERLAP_M = 20.0

@@ -27,7 +27,7 @@ from dpmjax.geometry import se2
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import DescriptorCloud
+from dpmjax.types import DescriptorCloud, Pose, Poses
 
 # Seconds of one registration, or of each of several.
 Seconds = float | Float[np.ndarray, " p"]
@@ -75,9 +75,9 @@ class StagedRegistration(NamedTuple):
         seconds: seconds of each stage.
     """
 
-    descriptors: Float[np.ndarray, "4 4"]
-    verified: Float[np.ndarray, "4 4"]
-    refined: Float[np.ndarray, "4 4"]
+    descriptors: Pose
+    verified: Pose
+    refined: Pose
     evidence: MatchEvidence
     seconds: StageSeconds
 
@@ -99,7 +99,7 @@ class ScanEvaluation(NamedTuple):
     verified: RegistrationRecall
     refined: RegistrationRecall
     confidence: Float[np.ndarray, " p"]
-    T_target_source: Float[np.ndarray, "p 4 4"]
+    T_target_source: Poses
     seconds: StageSeconds
 
 
@@ -150,7 +150,7 @@ def evaluate_scan_pairs(model: Model, pairs: Iterable[ScanPair]) -> ScanEvaluati
         found.append(register_in_stages(model, pair))
         true.append(pair.T_target_source)
 
-    def errors(motions: list[Float[np.ndarray, "4 4"]]) -> RegistrationRecall:
+    def errors(motions: list[Pose]) -> RegistrationRecall:
         return registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
 
     seconds = np.reshape([result.seconds for result in found], (-1, len(StageSeconds._fields)))
@@ -196,12 +196,7 @@ class OverlapEvaluation(NamedTuple):
 
 
 def evaluate_overlap(
-    model: Model,
-    drive: LidarSequence,
-    num_pairs: int,
-    *,
-    seed: int = 0,
-    on_scan: Callable[[], object] | None = None,
+    model: Model, drive: LidarSequence, num_pairs: int, *, seed: int = 0, on_scan: Callable[[], object] | None = None
 ) -> OverlapEvaluation:
     """Predicts the overlap of pairs nearer than 20 m, and of pairs farther than 40 m.
 

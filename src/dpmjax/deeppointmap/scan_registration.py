@@ -11,28 +11,20 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from dpmjax.checks import require_pairs
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import encode, scene_scale
+from dpmjax.deeppointmap.encoding import scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, weak_direction_of
-from dpmjax.deeppointmap.prepared_scans import (
-    NUM_THREADS,
-    PreparedScan,
-    RawScan,
-    Scale,
-    ScanOrCloud,
-    descriptors_of,
-    prepare_scans,
-)
-from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
+from dpmjax.deeppointmap.prepared_scans import PreparedScan, Scale, ScanOrCloud, descriptors_of, prepare_each
+from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
-from dpmjax.scans.weak_directions import WeakDirection
-from dpmjax.types import DescriptorCloud, Registration, Verification
+from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
+from dpmjax.types import DescriptorCloud, Pose, Poses, Registration, Verification
 
 # Number of surface elements of a scan that is refined against a cloud.
 NUM_ELEMENTS = 1024
@@ -111,7 +103,7 @@ def register_each(
     refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
-    prepared = _prepared(model, pairs, scale, num_elements=num_elements)
+    prepared = prepare_each(model, pairs, scale, num_elements=num_elements)
     matching, verification = config or model.config.matching, model.config.verification
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         started = []
@@ -178,7 +170,7 @@ def match_clouds(
     return jax.device_get(trace_match(model, source.described, target.described, config=config))
 
 
-def distinct_motions(hypotheses: Registration) -> Float[np.ndarray, "h 4 4"]:
+def distinct_motions(hypotheses: Registration) -> Poses:
     """Returns the motions of the hypotheses that any pair supports; at least one.
 
     Args:
@@ -195,7 +187,7 @@ class _RegisteredMotion(NamedTuple):
     """Chosen and refined motion of one pair, in metres; the confidence rests on the evidence before the refinement."""
 
     row: int | None
-    T_target_source: Float[np.ndarray, "4 4"]
+    T_target_source: Pose
     evidence: Verification | None = None
     verification: Verification | None = None
     weak: WeakDirection | None = None
@@ -230,24 +222,6 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
     return replace(hypotheses, T_target_source=jnp.asarray(T), rmse=hypotheses.rmse / np.float32(scale))
 
 
-def _prepared(
-    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
-) -> dict[int, DescriptorCloud | PreparedScan]:
-    """Prepares each scan object once; surfaces are measured only where both sides of a pair are scans."""
-    raw: dict[int, RawScan] = {}
-    ready: dict[int, DescriptorCloud | PreparedScan] = {}
-    for pair in pairs:
-        is_verified = not any(isinstance(scan, DescriptorCloud) for scan in pair)
-        for scan in pair:
-            if isinstance(scan, DescriptorCloud | PreparedScan):
-                ready[id(scan)] = scan
-            elif is_verified:
-                raw[id(scan)] = scan
-            elif id(scan) not in ready:
-                ready[id(scan)] = encode(model, scan, scale=scale, num_elements=num_elements)
-    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values()), scale=scale), strict=True))}
-
-
 def _verified(
     source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
 ) -> _RegisteredMotion:
@@ -255,7 +229,7 @@ def _verified(
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
-    weak = weak_direction_of(source, target, T, config)
+    weak = weakest_direction(source.surface, target.surface, T, config.plane_radius_m)
     return _RegisteredMotion(chosen.row, T, chosen.verification, final.verification, weak)
 
 
@@ -267,8 +241,7 @@ def _refined(
     # number of planes.
     T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
-        aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
-        T_target_source = np.array(aligned.T_target_source)
+        T_target_source = align_elements_on_host(source.elements, target.elements, T_target_source).T_target_source
     T_target_source[:3, 3] /= scale
     return _RegisteredMotion(0, T_target_source)
 

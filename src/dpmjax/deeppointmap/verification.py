@@ -15,11 +15,10 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scans.range_images import RangeImage, range_image, view_points
 from dpmjax.scans.surface_alignment import AlignmentLevel, nearest_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
+from dpmjax.scans.surfaces import RangeImage, Surface, SurfaceConfig, range_image, scan_surface, view_points
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
-from dpmjax.types import Verification
+from dpmjax.types import Poses, Verification
 
 # A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
 # are near those of the source, so its own points are compared with the planes of the source.
@@ -28,11 +27,8 @@ SPARSE_SHARE = 0.5
 # Surfaces whose normals are nearer to the vertical are level.
 LEVEL_COSINE = 0.8
 
-# Largest distance of a point from a plane that it meets.
-PLANE_DISTANCE_M = 0.15
-
-# Least cosine between the normals of a point and of a plane that it meets.
-MIN_COSINE = 0.7
+# Number of threads that measure and verify scans while JAX encodes and matches others.
+NUM_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -
 
 
 def verify_motions(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> list[Verification]:
     """Compares two scans under several motions.
 
@@ -161,7 +157,7 @@ class ComparedScan(NamedTuple):
 
 
 def compare_scans(
-    scan: MeasuredScan, other: MeasuredScan, T_other_scan: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    scan: MeasuredScan, other: MeasuredScan, T_other_scan: Poses, config: VerificationConfig
 ) -> ComparedScan:
     """Compares the samples of one scan with a second scan.
 
@@ -176,17 +172,12 @@ def compare_scans(
     """
     level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
     planes = nearest_planes(scan.surface, other.surface, T_other_scan, level)
-    meets = planes.is_paired & (np.abs(planes.residuals) < PLANE_DISTANCE_M)
-    meets &= planes.cosines > MIN_COSINE
-    view = view_points(other.image, planes.points.reshape(-1, 3))
     is_level = np.abs(scan.surface.normals[scan.surface.samples[: config.num_samples], 2]) > LEVEL_COSINE
-    return ComparedScan(
-        meets, view.is_visible.reshape(meets.shape), view.is_contradicted.reshape(meets.shape), is_level
-    )
+    return ComparedScan(planes.meets, *view_points(other.image, planes.points), is_level)
 
 
 def evidence_shares(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> Float[np.ndarray, "s 6"]:
     """Computes the shares that `EvidenceWeights` weighs.
 
@@ -206,7 +197,7 @@ def evidence_shares(
 
 
 def _both_sides(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Float[np.ndarray, "s 4 4"], config: VerificationConfig
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
 ) -> tuple[ComparedScan, ComparedScan]:
     return (
         compare_scans(source, target, T_target_source, config),

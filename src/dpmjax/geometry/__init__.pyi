@@ -13,7 +13,7 @@ from .normals import pyramid_elements as pyramid_elements
 from .pyramid import PyramidConfig as PyramidConfig
 from .pyramid import PyramidStage as PyramidStage
 from .pyramid import build_pyramid as build_pyramid
-from .pyramid_host import build_pyramid_on_host as build_pyramid_on_host
+from .pyramid import build_pyramid_on_host as build_pyramid_on_host
 from .sampling import farthest_point_sample as farthest_point_sample
 from .sampling import sample_free_space as sample_free_space
 from .sampling import typical_range as typical_range

@@ -167,9 +167,5 @@ def pyramid_elements(pyramid: PointPyramid, num_elements: int) -> SurfaceElement
     faces_away = jnp.sum(fit.normals * positions, axis=1) > 0
     normals = jnp.where(faces_away[:, None], -fit.normals, fit.normals)
     is_plane = mask & (jnp.sum(is_near, axis=1) >= MIN_NEIGHBOURS)
-    return SurfaceElements(
-        positions=positions,
-        normals=jnp.where(is_plane[:, None], normals, 0),
-        planarity=jnp.where(is_plane, fit.flatness, 0),
-        mask=mask,
-    )
+    normals, planarity = jnp.where(is_plane[:, None], normals, 0), jnp.where(is_plane, fit.flatness, 0)
+    return SurfaceElements(positions, normals, planarity, mask)

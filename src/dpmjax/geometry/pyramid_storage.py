@@ -112,17 +112,13 @@ def stored_pyramids(records: np.ndarray, config: PyramidConfig) -> StoredPyramid
     def field(name: str) -> np.ndarray:
         return np.ascontiguousarray(records[name])
 
-    return StoredPyramid(
-        num_points=field("num_points"),
-        unit=field("unit"),
-        points=field("points"),
-        samples=field("samples"),
-        neighbours=tuple(
-            tuple(field(_neighbours(number, block)) for block in range(len(stage.radii)))
-            for number, stage in enumerate(config.stages)
-        ),
-        interpolation=tuple(field(f"interpolation_{step}") for step in range(config.num_interpolations)),
+    neighbours = tuple(
+        tuple(field(_neighbours(number, block)) for block in range(len(stage.radii)))
+        for number, stage in enumerate(config.stages)
     )
+    interpolation = tuple(field(f"interpolation_{step}") for step in range(config.num_interpolations))
+    num_points, unit, points, samples = map(field, ("num_points", "unit", "points", "samples"))
+    return StoredPyramid(num_points, unit, points, samples, neighbours, interpolation)
 
 
 def sampled_positions(

@@ -6,17 +6,16 @@ are rounded to one step. Coded surface elements are rounded to centimetres. Ragg
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Float, Int8
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
+from dpmjax.deeppointmap.prepared_scans import MAX_COMPONENT, CompactElements, CompactImage, CompactScan, round_features
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.compact import MAX_COMPONENT, CompactElements, CompactImage
-from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin
+from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin, edge_arrays
 
 Precision = Literal["float32", "int8"]
 KINDS: tuple[EdgeKind, ...] = get_args(EdgeKind)
@@ -80,20 +79,16 @@ def unpack_map(arrays: Arrays, precision: Precision, origin: MapOrigin) -> Keyfr
 def _pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
     """Makes the arrays of poses and edges; "float32" keeps float64 poses exactly, others round them to float32."""
     dtype = np.float64 if precision == "float32" else np.float32
-    edges = slam_map.edges
-
-    def poses(T: Iterable[NDArray[Any]]) -> NDArray[Any]:
-        return np.array([pose[:3] for pose in T], dtype).reshape(-1, 3, 4)
-
+    edges = edge_arrays(slam_map.edges)
     return {
         **{name: slam_map.column(name).astype(kind) for name, kind in NUMBERS.items()},
-        "T_odometry_keyframe": poses(slam_map.column("T_odometry_keyframe")),
-        "T_world_keyframe": poses(slam_map.T_world_keyframe),
+        "T_odometry_keyframe": slam_map.column("T_odometry_keyframe")[:, :3].astype(dtype),
+        "T_world_keyframe": slam_map.T_world_keyframe[:, :3].astype(dtype),
         "vectors": slam_map.vectors if precision == "float32" else _encode_vectors(slam_map.vectors),
-        "edge_rows": np.array([edge[:2] for edge in edges], np.int32).reshape(-1, 2),
-        "edge_kind": np.array([KINDS.index(edge.kind) for edge in edges], np.uint8),
-        "edge_T": poses(edge.T_target_source for edge in edges),
-        "edge_information": np.array([edge.information[TRIANGLE] for edge in edges], dtype).reshape(-1, 21),
+        "edge_rows": np.stack([edges.source, edges.target], axis=1).astype(np.int32),
+        "edge_kind": np.array([KINDS.index(edge.kind) for edge in slam_map.edges], np.uint8),
+        "edge_T": edges.measurements[:, :3].astype(dtype),
+        "edge_information": edges.information[:, *TRIANGLE].astype(dtype, order="C"),
     }
 
 
@@ -109,17 +104,12 @@ def _unpack_graph(arrays: Arrays, scans: Sequence[CompactScan], origin: MapOrigi
         raise ValueError(f"edge_rows and edge_kind: expected rows of {k} keyframes and {len(KINDS)} kinds")
     information = np.zeros((len(rows), 6, 6))
     information[:, *TRIANGLE] = information[:, *TRIANGLE[::-1]] = _take(arrays, "edge_information", len(rows), 21)
-    columns = zip(*(array.tolist() for array in numbers.values()), T_odometry, scans, strict=True)
-    edges = zip(*rows.T.tolist(), _poses(arrays, "edge_T", len(rows)), information, kinds, strict=True)
-    return KeyframeMap(
-        tuple(
-            Keyframe(scan, T, path_m, segment, extent_m, kept) for scan, segment, path_m, extent_m, T, kept in columns
-        ),
-        T_world,
-        _unit_vectors(_take(arrays, "vectors", k, None, kind="fi")),
-        tuple(MapEdge(source, target, T, matrix, KINDS[kind]) for source, target, T, matrix, kind in edges),
-        origin,
-    )
+    scan, segment, path_m, extent_m = (array.tolist() for array in numbers.values())
+    keyframes = map(Keyframe, scan, T_odometry, path_m, segment, extent_m, scans)
+    T_edges = _poses(arrays, "edge_T", len(rows))
+    edges = map(MapEdge, *rows.T.tolist(), T_edges, information, [KINDS[kind] for kind in kinds])
+    vectors = _unit_vectors(_take(arrays, "vectors", k, None, kind="fi"))
+    return KeyframeMap(tuple(keyframes), T_world, vectors, tuple(edges), origin)
 
 
 def _poses(arrays: Arrays, name: str, count: int) -> NDArray[np.float64]:
@@ -136,18 +126,17 @@ def _pack_scans(scans: Sequence[CompactScan], precision: Precision) -> Arrays:
     num_elements = max(len(scan.elements.mask) for scan in scans)
     if precision == "int8":
         num_elements = min(num_elements, max(NUM_ELEMENTS, scans[0].features.shape[0]))
-    elements = [_of_length(scan.elements, num_elements) for scan in scans]
-    arrays = {
-        "directions": np.stack([scan.directions for scan in scans]),
-        **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1),
-    }
+    padded = [_of_length(scan.elements, num_elements) for scan in scans]
+    elements = [np.stack(parts) for parts in zip(*padded, strict=True)]
+    names = "features", "feature_steps", "directions"
+    features, steps, directions = (np.stack([getattr(scan, name) for scan in scans]) for name in names)
+    arrays = {"directions": directions, **_pack_images(scans, IMAGE_STEP if precision == "int8" else 1)}
     if precision == "int8":
-        features = np.concatenate([scan.features * scan.feature_steps[:, None] for scan in scans])
-        return arrays | _encode_features(features) | _encode_elements(elements)
-    arrays |= {name: np.stack([getattr(scan, name) for scan in scans]) for name in ("features", "feature_steps")}
-    return arrays | {
-        f"element_{name}": np.stack([getattr(one, name) for one in elements]) for name in CompactElements._fields
-    }
+        exact = (features * steps[..., None]).reshape(-1, features.shape[-1])
+        return arrays | _encode_features(exact) | _encode_elements(elements)
+    named = zip(CompactElements._fields, elements, strict=True)
+    arrays |= {"features": features, "feature_steps": steps}
+    return arrays | {f"element_{name}": array for name, array in named}
 
 
 def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
@@ -157,20 +146,18 @@ def _unpack_scans(arrays: Arrays, precision: Precision) -> list[CompactScan]:
     if k == 0 or len(mask) != k or m > n:
         raise ValueError(f"element_mask: expected rows of {k} keyframes with {m} descriptors or more, got {mask.shape}")
     if precision == "int8":
-        elements = _decode_elements(arrays, mask)
-        rounded = [round_features(one) for one in _decode_features(arrays, k * m).reshape(k, m, -1)]
+        elements = _decode_elements(arrays, k, n)
+        features, steps = round_features(_decode_features(arrays, k * m).reshape(k, m, -1))
     else:
-        columns = (
+        elements = (
             _take(arrays, "element_unit_m", k).tolist(),
             _take(arrays, "element_positions", k, n, 3, kind="i"),
             _take(arrays, "element_normals", k, n, 3, kind="i"),
             _take(arrays, "element_planarity", k, n, kind="u"),
         )
-        elements = [CompactElements(*parts) for parts in zip(*columns, mask, strict=True)]
-        steps = _take(arrays, "feature_steps", k, m)
-        rounded = list(zip(_take(arrays, "features", k, m, None, kind="i"), steps, strict=True))
-    parts_of_scans = zip(elements, rounded, directions, _unpack_images(arrays, k), strict=True)
-    return [CompactScan(one, *features_of, angles, image) for one, features_of, angles, image in parts_of_scans]
+        steps, features = _take(arrays, "feature_steps", k, m), _take(arrays, "features", k, m, None, kind="i")
+    elements_of_scans = map(CompactElements, *elements, mask)
+    return list(map(CompactScan, elements_of_scans, features, steps, directions, _unpack_images(arrays, k)))
 
 
 def _of_length(elements: CompactElements, num_elements: int) -> CompactElements:
@@ -219,40 +206,30 @@ def _unit_vectors(stored: NDArray[Any]) -> Float[np.ndarray, "k c"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1)
 
 
-def _encode_elements(keyframes: Sequence[CompactElements]) -> Arrays:
+def _encode_elements(elements: Sequence[NDArray[Any]]) -> Arrays:
     """Rounds positions to 2 cm, normals to two octahedral coordinates (Meyer et al. 2010), planarity to 16 steps."""
-    positions = [np.rint(one.positions.T * (one.unit_m / POSITION_STEP_M)) for one in keyframes]
+    unit_m, positions, normals, planarity, mask = elements
+    upward = normals * np.where(normals[..., 2:] < 0, -1.0, 1.0)
+    flat = upward[..., :2] / np.maximum(np.abs(upward).sum(axis=-1, keepdims=True), 1)
+    positions = np.rint(positions.swapaxes(1, 2) * (unit_m / POSITION_STEP_M)[:, None, None])
     return {
-        "element_positions": np.stack(positions).astype(np.int16),
-        "element_normals": np.stack([_octahedral(one.normals) for one in keyframes]),
-        "element_planarity": np.stack([np.rint(one.planarity / PLANARITY_STEP) for one in keyframes]).astype(np.uint8),
-        "element_mask": np.stack([one.mask for one in keyframes]),
+        "element_positions": positions.astype(np.int16),
+        "element_normals": np.rint(flat.swapaxes(1, 2) * MAX_COMPONENT).astype(np.int8),
+        "element_planarity": np.rint(planarity / PLANARITY_STEP).astype(np.uint8),
+        "element_mask": mask,
     }
 
 
-def _decode_elements(arrays: Arrays, mask: Bool[np.ndarray, "k n"]) -> list[CompactElements]:
-    k, n = mask.shape
+def _decode_elements(arrays: Arrays, k: int, n: int) -> tuple[Any, ...]:
+    """Returns the units, positions, normals and planarities of k scans, as in `CompactElements`."""
     positions = _take(arrays, "element_positions", k, 3, n, kind="i").astype(np.int16)
     planarity = _take(arrays, "element_planarity", k, n, kind="u").astype(np.int64)
-    normals = [
-        np.where(flat[:, None] > 0, _from_octahedral(codes), 0)
-        for flat, codes in zip(planarity, _take(arrays, "element_normals", k, 2, n, kind="i"), strict=True)
-    ]
+    x, y = _take(arrays, "element_normals", k, 2, n, kind="i").swapaxes(0, 1) / MAX_COMPONENT
+    normals = np.stack([x, y, np.maximum(1 - (np.abs(x) + np.abs(y)), 0)], axis=-1)
+    normals = np.rint(normals / np.linalg.norm(normals, axis=-1, keepdims=True) * MAX_COMPONENT)
+    normals = np.where(planarity[..., None] > 0, normals, 0).astype(np.int8)
     planarity = np.minimum(planarity * PLANARITY_STEP, 255).astype(np.uint8)
-    columns = zip(positions.transpose(0, 2, 1), np.array(normals, np.int8), planarity, mask, strict=True)
-    return [CompactElements(POSITION_STEP_M, *arrays) for arrays in columns]
-
-
-def _octahedral(normals: Int8[np.ndarray, "n 3"]) -> Int8[np.ndarray, "2 n"]:
-    upward = normals * np.where(normals[:, 2:] < 0, -1.0, 1.0)
-    flat = upward[:, :2] / np.maximum(np.abs(upward).sum(axis=1, keepdims=True), 1)
-    return np.rint(flat.T * MAX_COMPONENT).astype(np.int8)
-
-
-def _from_octahedral(stored: Int8[np.ndarray, "2 n"]) -> Float[np.ndarray, "n 3"]:
-    flat = stored.astype(np.float64) / MAX_COMPONENT
-    normals = np.column_stack([*flat, np.maximum(1 - np.abs(flat).sum(axis=0), 0)])
-    return np.rint(normals / np.linalg.norm(normals, axis=1, keepdims=True) * MAX_COMPONENT)
+    return [POSITION_STEP_M] * k, positions.swapaxes(1, 2), normals, planarity
 
 
 def _pack_images(scans: Sequence[CompactScan], step: int) -> Arrays:

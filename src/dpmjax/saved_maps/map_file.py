@@ -1,7 +1,8 @@
-"""Saved maps: one `.npz` file of plain arrays, checked on load.
+"""Saved maps, and states of runs: one `.npz` file of plain arrays, checked on load.
 
 Ragged arrays are concatenated, with the number of rows of each keyframe. `header` is JSON in UTF-8: format, version,
-precision, fingerprint of the weights, and the settings of SLAM.
+precision, fingerprint of the weights, and the settings of SLAM. The state of a run is the map, and the states of
+odometry and loop closure. It is written after a keyframe, and a killed run continues from the file.
 """
 
 from __future__ import annotations
@@ -10,24 +11,35 @@ import dataclasses
 import io
 import json
 import zipfile
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
+from dpmjax.checks import require_one_of
 from dpmjax.io.files import load_arrays, refusing, write_atomically
 from dpmjax.saved_maps.map_arrays import Arrays, Precision, pack_map, unpack_map
 from dpmjax.sequences import InputError, require
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.keyframe_map import KeyframeMap, MapOrigin
-from dpmjax.slam.map_thinning import thin_map
+from dpmjax.slam.front_end import FrontEndState, ScanReport
+from dpmjax.slam.keyframe_map import KeyframeMap, MapOrigin, thin_map
+from dpmjax.slam.local_map import PlacedElements
+from dpmjax.slam.loops import Loop, LoopState
+from dpmjax.slam.system import SlamState
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3
 # Smaller than the spacing of consecutive keyframes, so that only keyframes of other laps are left out.
 SPACING_SHARE = 0.2
 
-ADVICE = "save it again with dpmjax.save_map"
+ADVICE, RESUME_ADVICE = "save it again with dpmjax.save_map", "start the run again without --resume"
+
+# Prefix of the arrays of the map in the file of a state.
+MAP = "map."
+OF_LOOPS = ("loops",)
+# Fields that are stored separately, or computed from the map.
+OF_FRONT_END = ("local_map", "recent", "lost", "scores")
 
 
 def save_map(
@@ -70,8 +82,7 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
     Raises:
         ValueError: if the precision is unknown or the map is empty.
     """
-    if precision not in get_args(Precision):
-        raise ValueError(f"precision: expected one of {', '.join(get_args(Precision))}, got {precision!r}")
+    require_one_of("precision", precision, get_args(Precision))
     if spacing_share is None:
         spacing_share = SPACING_SHARE if precision == "int8" else 0.0
     if spacing_share != 0:
@@ -166,3 +177,127 @@ def map_of_arrays(path: str | Path, arrays: Arrays) -> KeyframeMap:
         require(is_good, path, f"{name} holds values that are not finite numbers", ADVICE)
     with refusing(path, "damaged: {error}", ADVICE, (Exception,)):
         return unpack_map(arrays, precision, origin)
+
+
+class RunState(NamedTuple):
+    """A run after a keyframe.
+
+    Attributes:
+        state: state after the keyframe.
+        reports: reports of all scans of the run until then.
+    """
+
+    state: SlamState
+    reports: tuple[ScanReport, ...]
+
+
+def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]) -> Path:
+    """Writes the state of a run; an interruption never leaves half a file.
+
+    Args:
+        path: an existing file is replaced.
+        state: state after a keyframe.
+        reports: reports of all scans of the run until then.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if the map is empty, or the last scan is not the one of a keyframe.
+    """
+    front_end, slam_map, loops = state
+    if front_end.local_map is not None:
+        raise ValueError("state: expected the state after a keyframe, got scans since the last one")
+    arrays = {f"{MAP}{name}": array for name, array in map_arrays(slam_map, "float32").items()}
+    arrays |= (
+        to_columns(reports, "report") | to_columns(loops.loops, "loop") | to_columns([loops], "loops", without=OF_LOOPS)
+    )
+    arrays |= to_columns(front_end.recent, "recent") | to_columns([front_end], "front_end", without=OF_FRONT_END)
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, scores=np.array(front_end.scores), **arrays)
+    return write_atomically(path, content.getvalue())
+
+
+def load_state(path: str | Path) -> RunState:
+    """Reads the state that `save_state` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The state, bit for bit, and the reports.
+
+    Raises:
+        InputError: no such file, or one that cannot be read.
+    """
+    try:
+        arrays = load_arrays(path)
+        require("front_end" in arrays, path, "no state of a run", RESUME_ADVICE)
+        of_map = {name.removeprefix(MAP): array for name, array in arrays.items() if name.startswith(MAP)}
+        slam_map = map_of_arrays(path, of_map)
+    except InputError as error:
+        raise InputError(path, error.found, RESUME_ADVICE) from error
+    with refusing(path, "damaged: {error}", RESUME_ADVICE, (Exception,)):
+        (loops,) = from_columns(LoopState, arrays, "loops", without=OF_LOOPS)
+        (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=OF_FRONT_END)
+        recent = tuple(from_columns(PlacedElements, arrays, "recent"))
+        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent, lost=())
+        loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
+        return RunState(SlamState(front_end, slam_map, loops), tuple(from_columns(ScanReport, arrays, "report")))
+
+
+def to_columns(records: Sequence[Any], name: str, *, without: Collection[str] = ()) -> Arrays:
+    """Turns records of one type into one array a field.
+
+    Args:
+        records: named tuples of numbers, texts, arrays of one shape or of many rows, or None.
+        name: prefix of the names of the arrays.
+        without: fields that are left out.
+
+    Returns:
+        The arrays. A mask marks each None, which takes no space.
+    """
+    columns = {name: np.array(len(records))}
+    for field in [field for field in records[0]._fields if field not in without] if records else ():
+        values = [getattr(record, field) for record in records]
+        found = [value for value in values if value is not None]
+        if len({np.shape(value) for value in found}) > 1:
+            columns[f"{name}.{field}"] = np.concatenate(found)
+            columns[f"{name}.{field}.lengths"] = np.array([len(value) for value in found])
+        elif found:
+            columns[f"{name}.{field}"] = np.array(found)
+        if len(found) < len(values):
+            columns[f"{name}.{field}.is_there"] = np.array([value is not None for value in values])
+    return columns
+
+
+def from_columns(
+    record_type: Any, columns: Mapping[str, np.ndarray], name: str, *, without: Collection[str] = ()
+) -> list[Any]:
+    """Turns columns back into records.
+
+    Args:
+        record_type: the named tuple.
+        columns: columns from `to_columns`; others may be among them.
+        name: name given there.
+        without: fields that were left out there.
+
+    Returns:
+        The records: numbers and texts of Python, arrays of NumPy; None for a field that was left out.
+
+    Raises:
+        ValueError: if a field is missing.
+    """
+    num, fields = int(columns[name]), []
+    for field in record_type._fields:
+        key = f"{name}.{field}"
+        is_there = columns.get(f"{key}.is_there", np.full(num, key in columns))
+        if num and field not in without and not (key in columns or f"{key}.is_there" in columns):
+            raise ValueError(f"{key} is missing")
+        column = columns.get(key, np.zeros(0))
+        found: Any = column.tolist() if column.ndim == 1 else column
+        if f"{key}.lengths" in columns:
+            found = np.split(column, np.cumsum(columns[f"{key}.lengths"])[:-1])
+        rest = iter(found)
+        fields.append([next(rest) if there else None for there in is_there])
+    return [record_type(*values) for values in zip(*fields, strict=True)] if num else []

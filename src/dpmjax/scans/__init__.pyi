@@ -4,7 +4,6 @@ from .corrections import deskew as deskew
 from .corrections import offsets_by_azimuth as offsets_by_azimuth
 from .corrections import offsets_by_times as offsets_by_times
 from .corrections import raise_beams as raise_beams
-from .element_alignment import ELEMENT_ALIGNMENT as ELEMENT_ALIGNMENT
 from .element_alignment import ElementAlignment as ElementAlignment
 from .element_alignment import align_elements as align_elements
 from .element_alignment import align_elements_on_host as align_elements_on_host
@@ -13,9 +12,7 @@ from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host
 from .surface_alignment import AlignmentConfig as AlignmentConfig
 from .surface_alignment import AlignmentLevel as AlignmentLevel
-from .surface_alignment import SurfaceAlignment as SurfaceAlignment
 from .surface_alignment import align_surfaces as align_surfaces
-from .surface_alignment import align_surfaces_from as align_surfaces_from
 from .surfaces import Surface as Surface
 from .surfaces import SurfaceConfig as SurfaceConfig
 from .surfaces import scan_surface as scan_surface

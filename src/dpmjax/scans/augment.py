@@ -19,7 +19,7 @@ from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.geometry.rigid import namespace_of
 from dpmjax.scans.preprocess import farthest_first
-from dpmjax.types import AnyArray, PointCloud
+from dpmjax.types import AnyArray, PointCloud, Poses
 
 # Lower and upper bound of a uniform draw.
 Interval = tuple[float, float]
@@ -152,7 +152,7 @@ def random_motion(config: AugmentConfig, *, key: PRNGKeyArray) -> Float[Array, "
     return _motion(angles, jax.random.normal(translation_key, (3,)), config)
 
 
-def random_motions_on_host(config: AugmentConfig, num: int, rng: np.random.Generator) -> Float[np.ndarray, "s 4 4"]:
+def random_motions_on_host(config: AugmentConfig, num: int, rng: np.random.Generator) -> Poses:
     """Draws motions as `random_motion` does, in NumPy.
 
     Args:

@@ -10,7 +10,6 @@ whole scans.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,20 +22,18 @@ from jaxtyping import Float, Int
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
-from dpmjax.scans.surface_alignment import MIN_PAIRS, PAIR_COSINE, AlignmentConfig, AlignmentLevel
+from dpmjax.scans.surface_alignment import MIN_PAIRS, PAIR_COSINE, AlignmentLevel, is_converged
 from dpmjax.scans.surfaces import MIN_FLATNESS
 from dpmjax.types import AnyArray, SurfaceElements
 
 ALL = 1 << 20
 
 # Elements are metres apart and their planes are large, so the kernel shrinks, but the radius hardly.
-ELEMENT_ALIGNMENT = AlignmentConfig(
-    levels=(
-        AlignmentLevel(3.0, ALL, 3, kernel_m=0.5),
-        AlignmentLevel(2.0, ALL, 2, kernel_m=0.33),
-        AlignmentLevel(2.0, ALL, 3, kernel_m=0.2),
-        AlignmentLevel(2.0, ALL, 4, kernel_m=0.1),
-    )
+LEVELS = (
+    AlignmentLevel(3.0, ALL, 3, kernel_m=0.5),
+    AlignmentLevel(2.0, ALL, 2, kernel_m=0.33),
+    AlignmentLevel(2.0, ALL, 3, kernel_m=0.2),
+    AlignmentLevel(2.0, ALL, 4, kernel_m=0.1),
 )
 
 
@@ -60,22 +57,16 @@ class _Step(NamedTuple):
     step: PlaneStep
 
 
-@functools.partial(jax.jit, static_argnames=("config", "is_symmetric"))
+@jax.jit
 def align_elements(
-    source: SurfaceElements,
-    target: SurfaceElements,
-    T_target_source: Float[AnyArray, "4 4"],
-    config: AlignmentConfig = ELEMENT_ALIGNMENT,
-    *,
-    is_symmetric: bool = True,
+    source: SurfaceElements, target: SurfaceElements, T_target_source: Float[AnyArray, "4 4"]
 ) -> ElementAlignment:
     """Aligns two sets of surface elements from a first guess, by the distances of points to planes.
 
-    Each element of the source is moved onto the plane of the nearest element of the target (Chen and Medioni 1992). In
-    the symmetric form, each element of the target is also paired with the nearest plane of the source: the normals of
-    both sides count, as in Rusinkiewicz 2019. A Geman-McClure kernel makes it robust. A pair is weighted by
-    the planarity of the plane and by the cosine between both normals; elements of less than `MIN_FLATNESS` are left
-    out.
+    Each element of the source is moved onto the plane of the nearest element of the target (Chen and Medioni 1992), and
+    each element of the target is paired with the nearest plane of the source: the normals of both sides count, as in
+    Rusinkiewicz 2019. A Geman-McClure kernel makes it robust. A pair is weighted by the planarity of the plane and by
+    the cosine between both normals; elements of less than `MIN_FLATNESS` are left out.
 
     The derivative is that of the last step with its pairs and weights held fixed: at convergence, that of the solution.
 
@@ -83,27 +74,20 @@ def align_elements(
         source: elements in the source frame, metres; masked ones may hold anything.
         target: the same in the target frame.
         T_target_source: first guess, within about 3 m and 10 degrees.
-        config: levels and kernel; `num_points` of a level are the first elements of each side.
-        is_symmetric: True also pairs elements of the target with planes of the source.
 
     Returns:
         The motion.
     """
     source, target = (jax.tree.map(jnp.asarray, side) for side in (source, target))
     T = lax.stop_gradient(jnp.asarray(T_target_source, source.positions.dtype))
-    for level in config.levels:
-        step_from = _stepper(*lax.stop_gradient((source, target)), level, config, is_symmetric=is_symmetric)
-        T = _descend(step_from, T, level, config)
-    return _stepper(source, target, config.levels[-1], config, is_symmetric=is_symmetric)(T).after
+    for level in LEVELS:
+        step_from = _stepper(*lax.stop_gradient((source, target)), level)
+        T = _descend(step_from, T, level)
+    return _stepper(source, target, LEVELS[-1])(T).after
 
 
 def align_elements_on_host(
-    source: SurfaceElements,
-    target: SurfaceElements,
-    T_target_source: Float[AnyArray, "4 4"],
-    config: AlignmentConfig = ELEMENT_ALIGNMENT,
-    *,
-    is_symmetric: bool = True,
+    source: SurfaceElements, target: SurfaceElements, T_target_source: Float[AnyArray, "4 4"]
 ) -> ElementAlignment:
     """Returns what `align_elements` returns, in float64: trees find the neighbours.
 
@@ -111,20 +95,18 @@ def align_elements_on_host(
         source: see `align_elements`; arrays of NumPy or of JAX.
         target: the same in the target frame.
         T_target_source: first guess.
-        config: levels and kernel.
-        is_symmetric: see `align_elements`.
 
     Returns:
         The motion, as arrays of NumPy.
     """
     source, target = (jax.tree.map(_on_host, side) for side in (source, target))
     T: AnyArray = np.array(T_target_source, np.float64)
-    for level in config.levels:
-        step_from = _stepper(source, target, level, config, is_symmetric=is_symmetric)
+    for level in LEVELS:
+        step_from = _stepper(source, target, level)
         for _ in range(level.num_iterations):
             found = step_from(T)
             T = found.after.T_target_source
-            if config.is_converged(found.step):
+            if is_converged(found.step):
                 break
     return step_from(T).after
 
@@ -135,45 +117,36 @@ def _on_host(leaf: AnyArray) -> np.ndarray:
 
 
 def _descend(
-    step_from: Callable[[Any], _Step], T: Float[jax.Array, "4 4"], level: AlignmentLevel, config: AlignmentConfig
+    step_from: Callable[[Any], _Step], T: Float[jax.Array, "4 4"], level: AlignmentLevel
 ) -> Float[jax.Array, "4 4"]:
     def take(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
         T, count, _ = carry
         found = step_from(T)
-        return found.after.T_target_source, count + 1, config.is_converged(found.step)
+        return found.after.T_target_source, count + 1, is_converged(found.step)
 
     start = T, jnp.asarray(0), jnp.asarray(False)
     return lax.while_loop(lambda carry: (carry[1] < level.num_iterations) & ~carry[2], take, start)[0]
 
 
-def _stepper(
-    source: SurfaceElements,
-    target: SurfaceElements,
-    level: AlignmentLevel,
-    config: AlignmentConfig,
-    *,
-    is_symmetric: bool,
-) -> Callable[[Any], _Step]:
+def _stepper(source: SurfaceElements, target: SurfaceElements, level: AlignmentLevel) -> Callable[[Any], _Step]:
     """Returns the function that takes one step from a motion, on arrays of NumPy or of JAX."""
-    source, target = _planes(source, level), _planes(target, level)
+    source, target = _planes(source), _planes(target)
     near_source, near_target = _search(source, level.radius_m), _search(target, level.radius_m)
 
     def step_from(T_target_source: Any) -> _Step:
         moved = _moved(T_target_source, source)
         rows, is_pair = near_target(moved.positions)
-        pairs = _pairs(moved, _rows(target, rows), is_pair, sign=1)
-        if is_symmetric:
-            rows, is_pair = near_source(_moved(rigid.inverse(T_target_source), target).positions)
-            others = _pairs(target, _rows(moved, rows), is_pair, sign=-1)
-            pairs = jax.tree.map(lambda *parts: rigid.namespace_of(parts[0]).concatenate(parts), pairs, others)
-        return _solve(pairs, T_target_source, level, config)
+        there = _pairs(moved, _rows(target, rows), is_pair, sign=1)
+        rows, is_pair = near_source(_moved(rigid.inverse(T_target_source), target).positions)
+        back = _pairs(target, _rows(moved, rows), is_pair, sign=-1)
+        pairs = jax.tree.map(lambda *parts: rigid.namespace_of(parts[0]).concatenate(parts), there, back)
+        return _solve(pairs, T_target_source, level.kernel_width_m)
 
     return step_from
 
 
-def _planes(side: SurfaceElements, level: AlignmentLevel) -> SurfaceElements:
-    """Returns the first elements of a side; those that are no plane are masked, and 0."""
-    side = _rows(side, slice(level.num_points))
+def _planes(side: SurfaceElements) -> SurfaceElements:
+    """Returns the elements of a side; those that are no plane are masked, and 0."""
     xp, mask = rigid.namespace_of(side.positions), side.mask & (side.planarity > MIN_FLATNESS)
     positions, normals = (xp.where(mask[:, None], vectors, 0) for vectors in (side.positions, side.normals))
     return SurfaceElements(positions, normals, xp.where(mask, side.planarity, 0), mask)
@@ -228,11 +201,11 @@ def _pairs(queries: SurfaceElements, planes: SurfaceElements, is_pair: Any, *, s
     return _Pairs(queries.positions, planes.normals, residuals, weights)
 
 
-def _solve(pairs: _Pairs, T_target_source: Any, level: AlignmentLevel, config: AlignmentConfig) -> _Step:
+def _solve(pairs: _Pairs, T_target_source: Any, kernel_m: float) -> _Step:
     xp = rigid.namespace_of(pairs.points)
     num_pairs = (pairs.weights > 0).sum()
     is_enough = num_pairs >= MIN_PAIRS
-    weights = pairs.weights * geman_mcclure(pairs.residuals, config.kernel_width_m(level))
+    weights = pairs.weights * geman_mcclure(pairs.residuals, kernel_m)
     if xp is jnp:
         weights = lax.stop_gradient(weights)
     step = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights)

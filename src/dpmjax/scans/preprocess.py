@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive_fields
+from dpmjax.checks import as_host_points, as_mask, as_points, require_count, require_fields, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import voxel_sample
 from dpmjax.types import AnyArray, PointCloud
@@ -164,9 +164,7 @@ def preprocess_scan_on_host(
     Raises:
         ValueError: if the shapes do not match.
     """
-    points = np.asarray(points, np.float32)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    points = as_host_points("points", points).astype(np.float32, copy=False)
     mask = as_mask("mask", mask, points.shape[:1], np)
     require_count("num_threads", num_threads)
     is_kept = _is_within(points, config) & mask

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_count, require_positive
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.surfaces import Surface
+from dpmjax.types import Poses
 
 # A level ends after a step that turns less, radians, and is shorter, metres.
 CONVERGED_RAD = 1e-4
@@ -32,6 +33,9 @@ PAIR_COSINE = 0.3
 # Fewer pairs do not constrain a motion.
 MIN_PAIRS = 20
 
+# Largest distance of a point from a plane that it meets, and least cosine between the normals of both.
+PLANE_DISTANCE_M, MIN_COSINE = 0.15, 0.7
+
 
 @dataclass(frozen=True)
 class AlignmentLevel:
@@ -41,7 +45,7 @@ class AlignmentLevel:
         radius_m: largest distance of a point from the point of the opposite surface that it is paired with.
         num_points: number of points that are paired.
         num_iterations: largest number of steps.
-        kernel_m: width of the kernel; None for that of the configuration.
+        kernel_m: width of the Geman-McClure kernel; None for a sixth of the radius, at least 5 cm.
     """
 
     radius_m: float
@@ -55,6 +59,11 @@ class AlignmentLevel:
         require_count("num_points", self.num_points)
         require_count("num_iterations", self.num_iterations)
 
+    @property
+    def kernel_width_m(self) -> float:
+        """Width of the kernel, metres."""
+        return max(MIN_KERNEL_M, KERNEL_SHARE * self.radius_m) if self.kernel_m is None else self.kernel_m
+
 
 @dataclass(frozen=True)
 class AlignmentConfig:
@@ -64,54 +73,24 @@ class AlignmentConfig:
         levels: coarse to fine.
     """
 
-    levels: tuple[AlignmentLevel, ...] = (
-        AlignmentLevel(3.0, 1500, 6),
-        AlignmentLevel(1.0, 4000, 8),
-        AlignmentLevel(0.4, 8000, 10),
-    )
+    levels: tuple[AlignmentLevel, ...]
 
     def __post_init__(self) -> None:
         if not self.levels:
             raise ValueError("levels: expected one or more, got none")
 
-    def kernel_width_m(self, level: AlignmentLevel) -> float:
-        """Returns the width of the kernel at a level.
 
-        Args:
-            level: one of the levels.
+def is_converged(step: PlaneStep) -> Any:
+    """Compares steps with the limits of convergence.
 
-        Returns:
-            Metres.
-        """
-        return max(MIN_KERNEL_M, KERNEL_SHARE * level.radius_m) if level.kernel_m is None else level.kernel_m
+    Args:
+        step: steps of any leading axes.
 
-    def is_converged(self, step: PlaneStep) -> Any:
-        """Compares steps with the limits of convergence.
-
-        Args:
-            step: steps of any leading axes, of NumPy or of JAX.
-
-        Returns:
-            True for short steps.
-        """
-        length_squared, angle_squared = (
-            (part**2).sum(axis=-1) for part in (step.tangent[..., :3], step.tangent[..., 3:])
-        )
-        return (length_squared < CONVERGED_M**2) & (angle_squared < CONVERGED_RAD**2)
-
-
-class SurfaceAlignment(NamedTuple):
-    """The aligned motion.
-
-    Attributes:
-        T_target_source: float64.
-        rmse: weighted root mean square distance of the pairs to their planes, metres; infinite where there are too few.
-        num_pairs: number of pairs in the last step.
+    Returns:
+        True for short steps.
     """
-
-    T_target_source: Float[np.ndarray, "4 4"]
-    rmse: float
-    num_pairs: int
+    length_squared, angle_squared = ((part**2).sum(axis=-1) for part in (step.tangent[..., :3], step.tangent[..., 3:]))
+    return (length_squared < CONVERGED_M**2) & (angle_squared < CONVERGED_RAD**2)
 
 
 class PlanePairs(NamedTuple):
@@ -153,73 +132,49 @@ class NearestPlanes(NamedTuple):
         """The paired samples."""
         return PlanePairs(*(values[self.is_paired] for values in self[1:4]))
 
+    @property
+    def meets(self) -> Bool[np.ndarray, "s n"]:
+        """True for a sample that meets a plane: it is near, and the normals of both surfaces agree."""
+        return self.is_paired & (np.abs(self.residuals) < PLANE_DISTANCE_M) & (self.cosines > MIN_COSINE)
 
-def align_surfaces(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "4 4"],
-    config: AlignmentConfig = AlignmentConfig(),
-) -> SurfaceAlignment:
+
+def align_surfaces(source: Surface, target: Surface, T_target_source: Poses, config: AlignmentConfig) -> Poses:
     """Aligns two surfaces by the distances of points to planes (Chen and Medioni 1992), with a robust kernel.
 
-    Args:
-        source: surface of a scan.
-        target: the second surface.
-        T_target_source: first guess, within about 3 m and 10 degrees.
-        config: levels and kernel.
-
-    Returns:
-        The motion; the first guess where there are too few pairs.
-    """
-    (found,) = align_surfaces_from(source, target, np.asarray(T_target_source)[None], config)
-    return found
-
-
-def align_surfaces_from(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "s 4 4"],
-    config: AlignmentConfig = AlignmentConfig(),
-) -> list[SurfaceAlignment]:
-    """Aligns two surfaces from several first guesses, in step: all of them look up their neighbours together.
+    The alignments from all first guesses proceed in step: all of them look up their neighbours together.
 
     Args:
         source: surface of a scan.
         target: the second surface.
-        T_target_source: first guesses; see `align_surfaces`.
+        T_target_source: first guesses, within about 3 m and 10 degrees.
         config: levels and kernel.
 
     Returns:
-        One result of `align_surfaces` for each guess.
+        The motion from each first guess, float64; the guess itself where there are too few pairs.
     """
     T = np.array(T_target_source, np.float64)
-    rmse, num_pairs = np.full(len(T), np.inf), np.zeros(len(T), int)
     has_pairs = np.ones(len(T), bool)
     for level in config.levels:
         is_active = has_pairs.copy()
         for _ in range(level.num_iterations):
             rows = np.flatnonzero(is_active)
-            pairs = nearest_planes(source, target, T[rows], level)
-            num_pairs[rows] = pairs.is_paired.sum(axis=1)
-            is_enough = num_pairs[rows] >= MIN_PAIRS
+            planes = nearest_planes(source, target, T[rows], level)
+            is_enough = planes.is_paired.sum(axis=1) >= MIN_PAIRS
             lost = rows[~is_enough]
-            rmse[lost], has_pairs[lost], is_active[lost] = np.inf, False, False
+            has_pairs[lost], is_active[lost] = False, False
             if not is_enough.all():
-                rows, pairs = rows[is_enough], NearestPlanes(*(values[is_enough] for values in pairs))
+                rows, planes = rows[is_enough], NearestPlanes(*(values[is_enough] for values in planes))
             if len(rows) == 0:
                 break
-            step, rmse[rows] = _step(pairs, level, config)
+            weights = planes.flatness * np.maximum(planes.cosines - PAIR_COSINE, 0) * planes.is_paired
+            weights *= geman_mcclure(planes.residuals, level.kernel_width_m)
+            step = step_to_planes(planes.points, planes.normals, planes.residuals, weights)
             T[rows] = motion_about(step) @ T[rows]
-            is_active[rows] = ~config.is_converged(step)
-    return [SurfaceAlignment(*found) for found in zip(T, rmse.tolist(), num_pairs.tolist(), strict=True)]
+            is_active[rows] = ~is_converged(step)
+    return T
 
 
-def nearest_planes(
-    source: Surface,
-    target: Surface,
-    T_target_source: Float[np.ndarray, "s 4 4"],
-    level: AlignmentLevel,
-) -> NearestPlanes:
+def nearest_planes(source: Surface, target: Surface, T_target_source: Poses, level: AlignmentLevel) -> NearestPlanes:
     """Finds the planes of the target nearest to the first samples of the source, under several motions.
 
     Args:
@@ -248,32 +203,3 @@ def nearest_planes(
         cosines=np.where(own.any(axis=1), cosines, 1.0),
         flatness=target.flatness[nearest],
     )
-
-
-def pair_with_planes(
-    source: Surface, target: Surface, T_target_source: Float[np.ndarray, "4 4"], level: AlignmentLevel
-) -> PlanePairs:
-    """Pairs the first samples of the source with the nearest planes of the target.
-
-    Args:
-        source: surface of a scan.
-        target: the second surface.
-        T_target_source: motion of the source.
-        level: radius and number of points.
-
-    Returns:
-        The pairs; points without a neighbour within the radius are left out.
-    """
-    return nearest_planes(source, target, np.asarray(T_target_source)[None], level).pairs
-
-
-def _step(
-    pairs: NearestPlanes, level: AlignmentLevel, config: AlignmentConfig
-) -> tuple[PlaneStep, Float[np.ndarray, " s"]]:
-    """Returns the step that brings points onto their planes, and the rmse before it."""
-    weights = pairs.flatness * np.maximum(pairs.cosines - PAIR_COSINE, 0) * pairs.is_paired
-    weights *= geman_mcclure(pairs.residuals, config.kernel_width_m(level))
-    total = weights.sum(axis=1)
-    squares = np.sum(weights * pairs.residuals**2, axis=1)
-    rmse = np.sqrt(np.divide(squares, total, out=np.full(len(total), np.inf), where=total > 0))
-    return step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights), rmse

@@ -1,4 +1,8 @@
-"""Surface that a lidar scan has measured, on the host: thinned points, their normals, and a tree to search them."""
+"""Surface and free space that a lidar scan has measured, on the host.
+
+The surface is thinned points, their normals, and a tree to search them. Free space is a range image by azimuth and
+elevation: a point of another scan cannot lie between the lidar and the surfaces.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from dpmjax.checks import require_count, require_positive_fields
+from dpmjax.checks import as_host_points, require_count, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.planes import fit_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
@@ -22,6 +27,12 @@ NUM_PROBED = 200
 
 # Least flatness of a point of a surface; foliage, wires and edges are less flat.
 MIN_FLATNESS = 0.1
+
+# Pixels of 2 degrees, in elevation and azimuth.
+NUM_ROWS, NUM_COLUMNS = 90, 180
+
+# A point contradicts a measurement if it is nearer by more than both: a distance, and a share of its range.
+MARGIN_M, MARGIN_SHARE = 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -84,9 +95,7 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    points = as_host_points("points", points)
     with np.errstate(invalid="ignore", over="ignore"):
         squared = np.sum(points.astype(np.float64) ** 2, axis=1)
         is_within = (squared >= config.min_range_m**2) & (squared <= config.max_range_m**2)
@@ -160,3 +169,71 @@ def _samples(normals: Float[np.ndarray, "n 3"], flatness: Float[np.ndarray, " n"
         is_along = direction == axis
         rank[is_along] = np.arange(is_along.sum())
     return rows[np.argsort(rank, kind="stable")]
+
+
+class RangeImage(NamedTuple):
+    """Ranges by azimuth and elevation, as the lidar sees them.
+
+    Attributes:
+        nearest_m: (rows, columns) smallest range of a pixel and its neighbours; infinite where nothing was measured.
+        farthest_m: (rows, columns) largest such range; 0 where nothing was measured.
+    """
+
+    nearest_m: Float[np.ndarray, "r c"]
+    farthest_m: Float[np.ndarray, "r c"]
+
+
+class View(NamedTuple):
+    """Visibility of the points of another scan in a range image.
+
+    Attributes:
+        is_visible: True where the lidar measured something in this direction, and the point is not far behind it.
+        is_contradicted: True where the point lies clearly in front of all that was measured in this direction.
+    """
+
+    is_visible: Bool[np.ndarray, "*n"]
+    is_contradicted: Bool[np.ndarray, "*n"]
+
+
+def range_image(points: Float[np.ndarray, "n 3"]) -> RangeImage:
+    """Makes the range image of a scan, with a margin of one pixel about each measurement.
+
+    Args:
+        points: metres, in the frame of the lidar.
+
+    Returns:
+        The image.
+    """
+    nearest, farthest = np.full((NUM_ROWS, NUM_COLUMNS), np.inf), np.zeros((NUM_ROWS, NUM_COLUMNS))
+    pixels, ranges = _project(points)
+    np.minimum.at(nearest.reshape(-1), pixels, ranges)
+    np.maximum.at(farthest.reshape(-1), pixels, ranges)
+    nearest = minimum_filter1d(minimum_filter1d(nearest, 3, axis=0, mode="nearest"), 3, axis=1, mode="wrap")
+    farthest = maximum_filter1d(maximum_filter1d(farthest, 3, axis=0, mode="nearest"), 3, axis=1, mode="wrap")
+    return RangeImage(nearest, farthest)
+
+
+def view_points(image: RangeImage, points: Float[np.ndarray, "*n 3"]) -> View:
+    """Compares points with the ranges that the lidar of an image has measured in their directions.
+
+    Args:
+        image: range image from `range_image`.
+        points: metres, in the frame of that lidar.
+
+    Returns:
+        Masks of the points that are visible, and of those that contradict the image.
+    """
+    pixels, ranges = _project(points)
+    nearest, farthest = image.nearest_m.ravel()[pixels], image.farthest_m.ravel()[pixels]
+    margin = np.maximum(MARGIN_M, MARGIN_SHARE * ranges)
+    is_measured = np.isfinite(nearest)
+    return View(is_measured & (ranges <= farthest + margin), is_measured & (ranges < nearest - margin))
+
+
+def _project(points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the pixel and the range of each point."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    flat = np.hypot(x, y)
+    column = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * NUM_COLUMNS).astype(np.int64) % NUM_COLUMNS
+    row = np.floor((np.arctan2(z, flat) / np.pi + 0.5) * NUM_ROWS).astype(np.int64)
+    return np.clip(row, 0, NUM_ROWS - 1) * NUM_COLUMNS + column, np.hypot(flat, z)

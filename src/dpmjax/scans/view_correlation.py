@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
+from dpmjax.types import Pose, Poses
 
 # Two motions are also distinct if they differ by more steps of the turn than this.
 DISTINCT_TURNS = 1.5
@@ -67,9 +68,7 @@ class ViewCorrelationConfig:
         require_fields(self, "num_motions", low=0)
 
 
-def correlate_views(
-    source: Surface, target: Surface, config: ViewCorrelationConfig = ViewCorrelationConfig()
-) -> Float[np.ndarray, "h 4 4"]:
+def correlate_views(source: Surface, target: Surface, config: ViewCorrelationConfig = ViewCorrelationConfig()) -> Poses:
     """Finds the motions under which two scans look alike from above.
 
     Each scan is first turned until its ground is level; the ground of both then has one height.
@@ -106,7 +105,7 @@ def _extent_share(source: Surface, target: Surface) -> float:
     return float(np.clip(max(extents) / FULL_EXTENT_M, MIN_EXTENT_SHARE, 1))
 
 
-def T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
+def T_level_lidar(surface: Surface) -> Pose:
     """Finds the turn that makes the ground of a scan level, and the shift that puts it at height 0.
 
     Args:
@@ -132,7 +131,7 @@ def T_level_lidar(surface: Surface) -> Float[np.ndarray, "4 4"]:
 
 
 def _images(
-    surface: Surface, T_level_lidar: Float[np.ndarray, "4 4"], turns: Float[np.ndarray, " t"], cell_m: float
+    surface: Surface, T_level_lidar: Pose, turns: Float[np.ndarray, " t"], cell_m: float
 ) -> Float[np.ndarray, "t c n n"]:
     R = T_level_lidar[:3, :3]
     x, y, _ = (surface.points @ R.T).T
@@ -178,7 +177,7 @@ def _best_peaks(
     return found
 
 
-def planar_motion(turn: float, x: float, y: float) -> Float[np.ndarray, "4 4"]:
+def planar_motion(turn: float, x: float, y: float) -> Pose:
     """Makes a motion in the horizontal plane.
 
     Args:

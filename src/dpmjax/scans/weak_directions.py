@@ -14,12 +14,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import PlanePairs
+from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, AlignmentLevel, PlanePairs, nearest_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
-
-# Information without any plane: standard deviations of 10 m and 1 rad.
-UNKNOWN = np.diag(np.repeat([10.0**-2, 1.0**-2], 3))
+from dpmjax.types import Information, Pose, Poses
 
 # Number of independent pairs with the information of all pairs, because residuals are correlated.
 NUM_INDEPENDENT = 200
@@ -53,20 +51,34 @@ class WeakDirection(NamedTuple):
     sigma_m: float
 
 
-def plane_information(
-    pairs: PlanePairs, T_target_source: Float[np.ndarray, "4 4"], *, max_residual_m: float
-) -> Float[np.ndarray, "6 6"]:
+def diagonal_information(sigma_m: float, sigma_rad: float) -> Information:
+    """Makes the information of a motion whose six errors are independent.
+
+    Args:
+        sigma_m: standard deviation of each translation.
+        sigma_rad: standard deviation of each rotation.
+
+    Returns:
+        The inverse covariance, translation first.
+    """
+    return np.diag(np.repeat([sigma_m**-2.0, sigma_rad**-2.0], 3))
+
+
+# Information without any plane.
+UNKNOWN = diagonal_information(10.0, 1.0)
+
+
+def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
     """Computes the normal equations of point-to-plane residuals.
 
     Args:
-        pairs: pairs under the motion.
+        pairs: pairs under the motion; those farther apart than `PLANE_DISTANCE_M` meet no plane.
         T_target_source: the motion.
-        max_residual_m: pairs with a larger residual meet no plane.
 
     Returns:
         Inverse covariance in the tangent of the source, translation first.
     """
-    is_used = np.abs(pairs.residuals) < max_residual_m
+    is_used = np.abs(pairs.residuals) < PLANE_DISTANCE_M
     if is_used.sum() < 6:
         return UNKNOWN.copy()
     normals = pairs.normals[is_used] @ T_target_source[:3, :3]
@@ -77,32 +89,29 @@ def plane_information(
     return np.asarray(system + UNKNOWN)
 
 
-def weakest_direction(
-    pairs: PlanePairs,
-    T_target_source: Float[np.ndarray, "4 4"],
-    up: Float[np.ndarray, "3"],
-    *,
-    max_residual_m: float,
-) -> WeakDirection:
-    """Finds the horizontal direction in which the translation is least certain, for any rotation.
+def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, radius_m: float) -> WeakDirection:
+    """Finds the horizontal direction in which the translation of a motion is least certain, for any rotation.
 
     Normals across that direction have small components along it by noise alone; these do not count.
 
     Args:
-        pairs: pairs under the motion.
+        source: surface of a scan.
+        target: surface of the second scan.
         T_target_source: the motion.
-        up: unit vector in the target frame.
-        max_residual_m: pairs with a larger residual meet no plane.
+        radius_m: largest distance of an element from the element whose plane it meets.
 
     Returns:
         The direction and the standard deviation along it.
     """
+    # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
+    level = AlignmentLevel(radius_m, max(1, len(source.samples)), 1)
+    pairs = nearest_planes(source, target, T_target_source[None], level).pairs
 
     def covariance_in_target(some: PlanePairs) -> Float[np.ndarray, "3 3"]:
-        inverse = np.linalg.inv(plane_information(some, T_target_source, max_residual_m=max_residual_m))
+        inverse = np.linalg.inv(plane_information(some, T_target_source))
         return T_target_source[:3, :3] @ inverse[:3, :3] @ T_target_source[:3, :3].T
 
-    horizontal = np.linalg.svd(up[None])[2][1:]
+    horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]
     direction = np.linalg.eigh(horizontal @ covariance_in_target(pairs) @ horizontal.T)[1][:, 1] @ horizontal
     along = pairs.normals @ direction
     noise = np.where(np.abs(along) < MIN_FACING_COSINE, along, 0)
@@ -110,9 +119,7 @@ def weakest_direction(
     return WeakDirection(direction, float(np.sqrt(direction @ covariance_in_target(held) @ direction)))
 
 
-def with_least_covariance(
-    information: Float[np.ndarray, "6 6"], sigma_m: float, sigma_rad: float
-) -> Float[np.ndarray, "6 6"]:
+def with_least_covariance(information: Information, sigma_m: float, sigma_rad: float) -> Information:
     """Adds a constant diagonal covariance, which bounds the covariance of a pose from below.
 
     Args:
@@ -139,7 +146,7 @@ class WallAxis(NamedTuple):
         extent_m: horizontal range of nine in ten voxels.
     """
 
-    T_level_lidar: Float[np.ndarray, "4 4"]
+    T_level_lidar: Pose
     yaw: float
     information: Float[np.ndarray, "2"]
     profile: Float[np.ndarray, " b"]
@@ -192,7 +199,7 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
     return float(along / (along + across))
 
 
-def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[np.ndarray, "s 4 4"]:
+def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Poses:
     """Makes motions that align the walls of both scans across the axis, for both headings, at regular shifts along it.
 
     Args:
@@ -214,31 +221,20 @@ def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Float[
     return np.stack(motions)
 
 
-def facing_surface(surface: Surface, axis: Float[np.ndarray, "3"]) -> Surface:
-    """Returns a surface whose samples are those that face an axis.
+def facing_samples(
+    surface: Surface, axis: Float[np.ndarray, "3"], max_count: float
+) -> tuple[Surface, Float[np.ndarray, " s"]]:
+    """Selects the samples that face an axis, and weighs those at one position along it up to a limit together.
 
     Args:
         surface: surface of a scan.
         axis: unit vector in the frame of the lidar.
-
-    Returns:
-        The surface with fewer samples.
-    """
-    is_facing = np.abs(surface.normals[surface.samples] @ axis) > FACING_COSINE
-    return surface._replace(samples=surface.samples[is_facing])
-
-
-def facing_weights(surface: Surface, axis: Float[np.ndarray, "3"], max_count: float) -> Float[np.ndarray, " s"]:
-    """Weighs samples so that those at one position along an axis count up to a limit together.
-
-    Args:
-        surface: surface from `facing_surface`.
-        axis: unit vector in the frame of the lidar.
         max_count: largest sum of the weights at one position.
 
     Returns:
-        A weight in (0, 1] for each sample.
+        The surface with fewer samples, and a weight in (0, 1] for each.
     """
-    positions = np.floor(surface.points[surface.samples] @ axis / POSITION_M)
+    samples = surface.samples[np.abs(surface.normals[surface.samples] @ axis) > FACING_COSINE]
+    positions = np.floor(surface.points[samples] @ axis / POSITION_M)
     _, position, counts = np.unique(positions, return_inverse=True, return_counts=True)
-    return np.minimum(1.0, max_count / counts[position])
+    return surface._replace(samples=samples), np.minimum(1.0, max_count / counts[position])

@@ -12,25 +12,29 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.interfaces import SlamMethods
+from dpmjax.slam.interfaces import AnyScan, SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts, joined_maps, take_keyframes, with_origin
-from dpmjax.slam.loop_candidates import similar_keyframes
-from dpmjax.slam.loop_closure import examine_candidates, is_resting
+from dpmjax.slam.loop_closure import examine_candidates, is_resting, similar_keyframes
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.scan_input import AnyScan
-from dpmjax.slam.system import SlamResult, as_methods, place_scans, run_slam
+from dpmjax.slam.model_methods import as_methods, methods_for
+from dpmjax.slam.system import SlamResult, place_scans, run_slam
+from dpmjax.types import Pose, Poses
 
 # Three float32 numbers.
 BYTES_A_POINT = 12
 
 # Callback for progress: number of compared keyframes, and number of all keyframes to compare.
 OnKeyframe = Callable[[int, int], None]
+
+
+def _ignore(_: int, __: int) -> None:
+    """Shows no progress."""
 
 
 class JoinedMaps(NamedTuple):
@@ -79,7 +83,7 @@ class AgentsResult(NamedTuple):
         traffic: bytes that each agent sends.
     """
 
-    T_world_scan: tuple[Float[np.ndarray, "_n 4 4"], ...]
+    T_world_scan: tuple[Poses, ...]
     component: tuple[int, ...]
     joined: JoinedMaps
     agents: tuple[SlamResult, ...]
@@ -139,7 +143,7 @@ def run_agents(
 
 
 def join_agents(
-    methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe | None = None
+    methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe = _ignore
 ) -> AgentsResult:
     """Joins the maps that agents have made alone, the second half of `run_agents`.
 
@@ -156,32 +160,23 @@ def join_agents(
     return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)
 
 
-def merge_maps(
-    model: Model | SlamMethods,
-    *maps: KeyframeMap,
-    config: SlamConfig | None = None,
-    on_keyframe: OnKeyframe | None = None,
-) -> MergedMaps:
+def merge_maps(model: Model | SlamMethods, *maps: KeyframeMap, on_keyframe: OnKeyframe = _ignore) -> MergedMaps:
     """Joins maps of different days or of different robots where they show the same places.
 
     Args:
-        model: the model that made the maps; or methods of your own.
+        model: the model that made the maps, which takes the settings of the first one; or methods of your own.
         *maps: two or more. The frame of the first map of each component is kept.
-        config: settings; None takes those of the first map. Methods of your own carry theirs.
         on_keyframe: called while keyframes are compared, for progress.
 
     Returns:
         One map, or several where no loop joins them, and the maps that have met.
 
     Raises:
-        ValueError: if there are fewer than two maps, if a map was made with other weights, or if methods come with
-            another configuration.
+        ValueError: if there are fewer than two maps, or if a map was made with other weights.
     """
     if len(maps) < 2:
         raise ValueError(f"maps: expected at least two, got {len(maps)}")
-    if config is None and not isinstance(model, SlamMethods) and maps[0].origin is not None:
-        config = maps[0].origin.config
-    joined = join_maps(as_methods(model, config), maps, on_keyframe=on_keyframe)
+    joined = join_maps(methods_for(model, maps[0]), maps, on_keyframe=on_keyframe)
     numbers = joined.component_of_map
     merged = [
         take_component(joined, component) if numbers.count(component) > 1 else maps[numbers.index(component)]
@@ -190,9 +185,7 @@ def merge_maps(
     return MergedMaps(tuple(merged), joined)
 
 
-def join_maps(
-    methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe | None = None
-) -> JoinedMaps:
+def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = _ignore) -> JoinedMaps:
     """Finds loops between maps and optimises those that meet as one graph.
 
     The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
@@ -222,8 +215,7 @@ def join_maps(
             is_other = np.isin(map_of_row, order[:place])
             candidates = similar_keyframes(joined, row, is_other, methods.config.loops)
             loops = examine_candidates(methods, joined, loops, candidates)
-        if on_keyframe is not None:
-            on_keyframe(number, len(compared))
+        on_keyframe(number, len(compared))
     if num_accepted(loops):
         joined, state = optimize_map(joined, LoopState((*inner, *loops)))
         loops = state.loops[len(inner) :]
@@ -269,7 +261,7 @@ def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
 
 def _in_own_frames(
     joined: KeyframeMap, map_of_row: np.ndarray, components: Sequence[int], maps: Sequence[KeyframeMap]
-) -> Float[np.ndarray, "k 4 4"]:
+) -> Poses:
     """Moves each component, so that the first keyframe of its first map stays where it was."""
     T_world = joined.T_world_keyframe.copy()
     component_of_row = np.array(components)[map_of_row]
@@ -295,10 +287,10 @@ def _num_bytes(record: object) -> int:
     return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(record))
 
 
-def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Float[np.ndarray, "_n 4 4"], ...]:
+def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:
     """Computes the poses of all scans; the first scan of a component's first agent is its origin."""
-    found: list[Float[np.ndarray, "_n 4 4"]] = []
-    origins: dict[int, Float[np.ndarray, "4 4"]] = {}
+    found: list[Poses] = []
+    origins: dict[int, Pose] = {}
     for number, agent in enumerate(agents):
         T_world_keyframe = joined.slam_map.T_world_keyframe[joined.map_of_keyframe == number]
         T_agent_scan = place_scans(T_world_keyframe, agent.reports)

@@ -9,32 +9,15 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
-from dpmjax.slam.interfaces import Alignment, SlamMethods, ThinnedScan
-from dpmjax.slam.keyframe_map import (
-    Keyframe,
-    KeyframeMap,
-    MapEdge,
-    Pose,
-    add_keyframe,
-    diagonal_information,
-    with_origin,
-)
-from dpmjax.slam.local_map import (
-    RECENT_SHARE,
-    LocalMap,
-    PlacedElements,
-    joined_surface,
-    local_map_of,
-    nearest_keyframe,
-    placed_scan,
-    with_scan,
-)
-from dpmjax.slam.scan_input import PreparedInput
+from dpmjax.scans.weak_directions import diagonal_information
+from dpmjax.slam.interfaces import Alignment, PreparedInput, SlamMethods, ThinnedScan
+from dpmjax.slam.keyframe_map import Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
+from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
+from dpmjax.types import Information, Pose
 
 # Turn between keyframes at a smaller distance.
 KEYFRAME_RAD = 0.6
@@ -149,20 +132,6 @@ class FrontEndState(NamedTuple):
         return float(np.median(self.scores)) if self.scores else 1.0
 
 
-class Located(NamedTuple):
-    """Pose of a scan in the frame of the last keyframe, and the inputs of a new keyframe.
-
-    Attributes:
-        report: the pose, and the reason of its acceptance or rejection.
-        information: (6, 6) in the tangent of the scan.
-        compact: the encoded scan; None where it was not encoded.
-    """
-
-    report: ScanReport
-    information: Float[np.ndarray, "6 6"]
-    compact: CompactScan | None = None
-
-
 def place_scan(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: PreparedInput
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
@@ -185,26 +154,33 @@ def place_scan(
     if not state.is_begun:
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
         report = report._replace(status="first", reason=reason, T_keyframe_scan=np.eye(4), score=1.0)
-        located = Located(report, diagonal_information(UNKNOWN_M, np.pi), scan.compact)
+        located = _Located(report, diagonal_information(UNKNOWN_M, np.pi), scan.compact)
         return _make_keyframe(methods, state, slam_map, thinned, located)
     local_map = state.local_map or local_map_of(slam_map, state.recent, methods.config.odometry)
     state = state._replace(local_map=local_map)
-    located = _locate(methods, state, local_map, thinned, report, scan.compact)
-    if located.report.status == "restarted" or _is_keyframe(methods, located.report, thinned):
+    located = _Search(methods, state, local_map, thinned, scan.compact).located(report)
+    report = located.report
+    if report.status == "restarted" or _is_keyframe(methods, report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
-    after, report = _advanced(state, located.report), located.report
+    after = _advanced(state, report)
     placed = placed_scan(thinned.measured.surface, report.T_keyframe_scan)
     if report.status == "predicted":
         after = after._replace(lost=(*state.lost, placed))
     else:
         # People move around a lidar that stands still, so the local map is renewed where it fits less.
         is_changed = bool(state.scores) and report.score < GOOD_SHARE * state.usual_score
-        spacing_m = 0.0 if is_changed else RECENT_SHARE * thinned.extent_m
-        recent = with_scan(state.recent, placed, spacing_m)
+        recent = with_scan(state.recent, placed, 0.0 if is_changed else thinned.extent_m)
         if recent is not state.recent:
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
     return after, slam_map, report
+
+
+class _Located(NamedTuple):
+    # The pose and why it was accepted; its information in the tangent of the scan; the scan, if it was encoded.
+    report: ScanReport
+    information: Information
+    compact: CompactScan | None = None
 
 
 class _Attempt(NamedTuple):
@@ -217,81 +193,76 @@ class _Attempt(NamedTuple):
     is_calibrated: bool = True
 
 
-def _locate(
-    methods: SlamMethods,
-    state: FrontEndState,
-    local_map: LocalMap,
-    scan: ThinnedScan,
-    report: ScanReport,
-    compact: CompactScan | None,
-) -> Located:
-    config, usual = methods.config.front_end, state.usual_score
-    tried = _attempt(methods, state, local_map, scan, compact)
-    best, probability = tried.best, tried.probability
-    # A new part has no usual score yet, and sparse scans never score high.
-    wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
-    is_far = not are_near(state.predicted, best.T_map_scan, PLACE_M, PLACE_RAD)
-    if is_far and state.scores and (probability or 0.0) < config.min_probability:
-        # A motion that neither the last motion nor the decoder supports needs the usual score.
-        wanted = GOOD_SHARE * usual
-    T, information = best.T_map_scan, best.information
-    status: ScanStatus = "tracked" if best is tried.tracked else "network"
-    if best.score < wanted and not _is_confirmed(tried, config.min_probability):
-        T = _guess(methods, state, local_map, scan, tried)
-        status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
-        information = diagonal_information(GUESS_M, GUESS_RAD)
-    reason = f"score {best.score:.2f} of usually {usual:.2f}"
-    if probability is not None:
-        reason += f", P {probability:.2f} by the network"
-    # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
-    report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
-    return Located(report._replace(score=best.score, probability=probability), information, tried.compact)
+class _Search(NamedTuple):
+    # The search of the pose of a scan, which may be encoded already.
+    methods: SlamMethods
+    state: FrontEndState
+    local_map: LocalMap
+    scan: ThinnedScan
+    compact: CompactScan | None
 
+    def located(self, report: ScanReport) -> _Located:
+        """Estimates the pose, and accepts it or guesses another one."""
+        state, config, usual = self.state, self.methods.config.front_end, self.state.usual_score
+        tried = self._attempt()
+        best, probability = tried.best, tried.probability
+        # A new part has no usual score yet, and sparse scans never score high.
+        wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
+        is_far = not are_near(state.predicted, best.T_map_scan, PLACE_M, PLACE_RAD)
+        if is_far and state.scores and (probability or 0.0) < config.min_probability:
+            # A motion that neither the last motion nor the decoder supports needs the usual score.
+            wanted = GOOD_SHARE * usual
+        T, information = best.T_map_scan, best.information
+        status: ScanStatus = "tracked" if best is tried.tracked else "network"
+        if best.score < wanted and not _is_confirmed(tried, config.min_probability):
+            T = self._guess(tried)
+            status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
+            information = diagonal_information(GUESS_M, GUESS_RAD)
+        reason = f"score {best.score:.2f} of usually {usual:.2f}"
+        if probability is not None:
+            reason += f", P {probability:.2f} by the network"
+        # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
+        report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
+        return _Located(report._replace(score=best.score, probability=probability), information, tried.compact)
 
-def _guess(methods: SlamMethods, state: FrontEndState, local_map: LocalMap, scan: ThinnedScan, tried: _Attempt) -> Pose:
-    """Returns the guessed pose of a rejected scan, aligned with the lost scans, too: behind a door the map ends."""
-    if state.lost:
-        surface = joined_surface((*local_map.keyframes, *state.recent, *state.lost))
-        tried = _attempt(methods, state, local_map._replace(surface=surface), scan, tried.compact)
-    T = tried.best.T_map_scan
-    # An alignment is the better guess, unless it is too far from the last motion.
-    return T if are_near(state.predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else state.predicted
+    def _guess(self, tried: _Attempt) -> Pose:
+        """Returns the guessed pose of a rejected scan, aligned with the lost scans, too: behind a door the map ends."""
+        if self.state.lost:
+            surface = joined_surface((*self.local_map.keyframes, *self.state.recent, *self.state.lost))
+            wider = self._replace(local_map=self.local_map._replace(surface=surface), compact=tried.compact)
+            tried = wider._attempt()
+        T, predicted = tried.best.T_map_scan, self.state.predicted
+        # An alignment is the better guess, unless it is too far from the last motion.
+        return T if are_near(predicted, T, 3 * GUESS_M, 3 * GUESS_RAD) else predicted
 
-
-def _attempt(
-    methods: SlamMethods,
-    state: FrontEndState,
-    local_map: LocalMap,
-    scan: ThinnedScan,
-    compact: CompactScan | None = None,
-) -> _Attempt:
-    """Aligns from the prediction and from the decoder's motions, in the order that the configuration names."""
-    geometry, predicted = methods.geometry, state.predicted
-    is_predicted = methods.config.odometry.proposer == "prediction"
-    good_score = max(MIN_SCORE, GOOD_SHARE * state.usual_score)
-    tracked = None
-    # The second scan of a drive has no last motion.
-    if is_predicted and state.scores:
-        tracked = geometry.align(local_map, scan, predicted)
-        if tracked.score >= good_score and len(state.scores) >= NUM_USUAL:
-            return _Attempt(tracked, tracked)
-    compact = methods.matcher.encode(scan) if compact is None else compact
-    row = nearest_keyframe(local_map, predicted[:3, 3])
-    proposal = methods.matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
-    starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
-    best = matched = geometry.search(local_map, scan, starts)
-    if tracked is None and (is_predicted or matched.score < good_score):
-        tracked = geometry.align(local_map, scan, predicted)
-    if tracked is not None:
-        if matched.score < good_score or not are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
-            others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
-            tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
-        # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
-        is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, np.inf)
-        is_sure = is_near or proposal.probability >= methods.config.front_end.min_probability
-        lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
-        best = _better_of(tracked, matched, lead if state.scores else 0.0)
-    return _Attempt(best, tracked, starts[0], proposal.probability, compact, proposal.is_calibrated)
+    def _attempt(self) -> _Attempt:
+        """Aligns from the prediction and from the decoder's motions, in the order that the configuration names."""
+        (matcher, geometry, config, _), state, local_map, scan, compact = self
+        predicted, is_predicted = state.predicted, config.odometry.proposer == "prediction"
+        good_score = max(MIN_SCORE, GOOD_SHARE * state.usual_score)
+        tracked = None
+        # The second scan of a drive has no last motion.
+        if is_predicted and state.scores:
+            tracked = geometry.align(local_map, scan, predicted)
+            if tracked.score >= good_score and len(state.scores) >= NUM_USUAL:
+                return _Attempt(tracked, tracked)
+        compact = matcher.encode(scan) if compact is None else compact
+        row = local_map.nearest(predicted[:3, 3])
+        proposal = matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
+        starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
+        best = matched = geometry.search(local_map, scan, starts)
+        if tracked is None and (is_predicted or matched.score < good_score):
+            tracked = geometry.align(local_map, scan, predicted)
+        if tracked is not None:
+            if matched.score < good_score or not are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
+                others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
+                tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
+            # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
+            is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, np.inf)
+            is_sure = is_near or proposal.probability >= config.front_end.min_probability
+            lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
+            best = _better_of(tracked, matched, lead if state.scores else 0.0)
+        return _Attempt(best, tracked, starts[0], proposal.probability, compact, proposal.is_calibrated)
 
 
 def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
@@ -320,7 +291,7 @@ def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: ThinnedScan) ->
 
 
 def _make_keyframe(
-    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: ThinnedScan, located: Located
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: ThinnedScan, located: _Located
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     report, row = located.report, len(slam_map)
     T, is_guess = report.T_keyframe_scan, row > 0 and report.status in ("first", "restarted")
@@ -340,13 +311,8 @@ def _make_keyframe(
     T_new_old, before = rigid.inverse(T), state.lost if is_guess else state.recent
     moved = tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in before)
     placed = placed_scan(scan.measured.surface, np.eye(4))
-    spacing_m = RECENT_SHARE * scan.extent_m
-    after = _advanced(state, report)._replace(
-        is_begun=True,
-        recent=with_scan(moved, placed, spacing_m),
-        local_map=None,
-        T_keyframe_last=np.eye(4),
-    )
+    recent = with_scan(moved, placed, scan.extent_m)
+    after = _advanced(state, report)._replace(is_begun=True, recent=recent, local_map=None, T_keyframe_last=np.eye(4))
     return after, slam_map, report._replace(keyframe=row, T_keyframe_scan=np.eye(4), is_keyframe=True)
 
 

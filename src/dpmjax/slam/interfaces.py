@@ -14,9 +14,9 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.keyframe_map import MapOrigin, Pose, Submap
+from dpmjax.slam.keyframe_map import MapOrigin, Submap
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import PointCloud, Verification
+from dpmjax.types import AnyArray, Information, PointCloud, Pose, Poses, Verification
 
 
 class ThinnedScan(NamedTuple):
@@ -48,7 +48,7 @@ class Alignment(NamedTuple):
     matched_share: float
     contradicted_share: float
     score: float
-    information: Float[np.ndarray, "6 6"]
+    information: Information
 
 
 class Geometry(Protocol):
@@ -76,7 +76,7 @@ class Geometry(Protocol):
             The alignment.
         """
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Float[np.ndarray, "s 4 4"]) -> Alignment:
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Poses) -> Alignment:
         """Aligns a scan from several first guesses, coarse to fine.
 
         Args:
@@ -88,7 +88,7 @@ class Geometry(Protocol):
             The alignment of the highest score.
         """
 
-    def other_motions(self, T_last_scan: Pose, extent_m: float) -> Float[np.ndarray, "s 4 4"]:
+    def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns motions that a vehicle may make instead of the predicted one.
 
         Args:
@@ -116,7 +116,7 @@ class Match(NamedTuple):
     probability: float
     rmse: float
     verification: Verification | None = None
-    information: Float[np.ndarray, "6 6"] | None = None
+    information: Information | None = None
 
 
 class Proposal(NamedTuple):
@@ -128,7 +128,7 @@ class Proposal(NamedTuple):
         is_calibrated: True for a probability.
     """
 
-    T_target_source: Float[np.ndarray, "h 4 4"]
+    T_target_source: Poses
     probability: float
     is_calibrated: bool = True
 
@@ -217,3 +217,34 @@ class SlamMethods(NamedTuple):
     def origin(self) -> MapOrigin:
         """The origin that maps of these methods note."""
         return MapOrigin(self.matcher.fingerprint, self.config, self.weights)
+
+
+class TimedScan(NamedTuple):
+    """A raw scan with the time of each point, to be deskewed by the predicted motion.
+
+    Attributes:
+        points: (n, 3) metres, each in the frame of the lidar at its own moment.
+        offsets: (n,) times since the scan's pose, as shares of the time between scans; see `scans.deskew`.
+    """
+
+    points: Float[AnyArray, "n 3"]
+    offsets: Float[AnyArray, " n"]
+
+
+AnyScan = Float[AnyArray, "_n 3"] | TimedScan
+
+
+class PreparedInput(NamedTuple):
+    """A scan after the work that needs no map.
+
+    Attributes:
+        num_points: number of points of the raw scan.
+        thinned: the thinned scan; None if it is empty.
+        T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
+        compact: the encoded scan; None where it was not encoded.
+    """
+
+    num_points: int
+    thinned: ThinnedScan | None
+    T_turn: Pose | None = None
+    compact: CompactScan | None = None

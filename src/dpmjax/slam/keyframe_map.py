@@ -1,4 +1,7 @@
-"""The map: keyframes, their poses, and the relative poses measured between them. Nothing is changed in place."""
+"""The map: keyframes, their poses, the relative poses measured between them. Nothing is changed in place.
+
+A map for localisation may be thinned: keyframes that another one covers are left out, and the graph is contracted.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,16 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.checks import require_positive
+from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph
-from dpmjax.scans.compact import expand_elements
 from dpmjax.slam.config import SlamConfig
+from dpmjax.types import Information, Pose, Poses
 
 # Largest distance of the keyframes of a submap (DeepPointMap's published configuration).
 SUBMAP_RADIUS_M = 20.0
 
-Pose = Float[np.ndarray, "4 4"]
 EdgeKind = Literal["odometry", "loop", "guess"]
 
 
@@ -57,7 +60,7 @@ class MapEdge(NamedTuple):
     source: int
     target: int
     T_target_source: Pose
-    information: Float[np.ndarray, "6 6"]
+    information: Information
     kind: EdgeKind
 
 
@@ -91,7 +94,7 @@ class KeyframeMap:
     """
 
     keyframes: tuple[Keyframe, ...] = ()
-    T_world_keyframe: Float[np.ndarray, "k 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    T_world_keyframe: Poses = field(default_factory=lambda: np.zeros((0, 4, 4)))
     vectors: Float[np.ndarray, "k c"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     edges: tuple[MapEdge, ...] = ()
     origin: MapOrigin | None = None
@@ -121,7 +124,7 @@ class Submap(NamedTuple):
     """
 
     scans: tuple[CompactScan, ...]
-    T_submap_keyframe: Float[np.ndarray, "n 4 4"]
+    T_submap_keyframe: Poses
 
 
 def add_keyframe(
@@ -239,7 +242,7 @@ def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius
 
 
 def _joined(num_nodes: int, edges: Iterable[Sequence[Any]]) -> sp.csr_array:
-    ends = np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2).T
+    ends = _ends(edges)
     return sp.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (num_nodes, num_nodes)).tocsr()
 
 
@@ -282,21 +285,84 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     Returns:
         The graph.
     """
-    ends = np.array([edge[:2] for edge in slam_map.edges], np.int64).reshape(-1, 2).T
-    T_target_source = np.array([edge.T_target_source for edge in slam_map.edges]).reshape(-1, 4, 4)
-    information = np.array([edge.information for edge in slam_map.edges]).reshape(-1, 6, 6)
-    edges = Edges(ends[0], ends[1], T_target_source, information)
-    return PoseGraph.create(slam_map.T_world_keyframe, edges, ids=slam_map.column("scan"))
+    return PoseGraph.create(slam_map.T_world_keyframe, edge_arrays(slam_map.edges), ids=slam_map.column("scan"))
 
 
-def diagonal_information(sigma_m: float, sigma_rad: float) -> Float[np.ndarray, "6 6"]:
-    """Makes the information of a motion whose six errors are independent.
+def edge_arrays(edges: Sequence[MapEdge]) -> Edges:
+    """Returns the ends, motions and information of edges as stacked arrays."""
+    source, target = _ends(edges)
+    T_target_source = np.array([edge.T_target_source for edge in edges]).reshape(-1, 4, 4)
+    return Edges(source, target, T_target_source, np.array([edge.information for edge in edges]).reshape(-1, 6, 6))
+
+
+def _ends(edges: Iterable[Sequence[Any]]) -> Int[np.ndarray, "2 e"]:
+    return np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2).T
+
+
+def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
+    """Leaves out keyframes near others, also of other laps, so that repeated drives of a place do not enlarge the map.
+
+    Poses do not change. An edge between keyframes that were left out joins those that cover them; its
+    information is divided by the number of steps that it replaces.
 
     Args:
-        sigma_m: standard deviation of each translation.
-        sigma_rad: standard deviation of each rotation.
+        slam_map: map of a run.
+        spacing_share: smallest distance of joined keyframes, as a share of the extent of the earlier one.
 
     Returns:
-        The inverse covariance, translation first.
+        The smaller map; the first keyframe stays.
+
+    Raises:
+        ValueError: if the spacing is not positive.
     """
-    return np.diag(np.repeat([sigma_m**-2.0, sigma_rad**-2.0], 3))
+    require_positive("spacing_share", spacing_share)
+    if len(slam_map) == 0:
+        return slam_map
+    kept, cover = _covering(slam_map, spacing_share)
+    row_of = {row: number for number, row in enumerate(kept)}
+    edges: dict[tuple[int, int, str], MapEdge] = {}
+    for edge in slam_map.edges:
+        found = _contracted(slam_map, edge, cover, row_of)
+        key = (found.source, found.target, found.kind)
+        is_better = key not in edges or np.trace(found.information) > np.trace(edges[key].information)
+        if found.source != found.target and is_better:
+            edges[key] = found
+    return take_keyframes(slam_map, kept, edges.values())
+
+
+def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
+    """Returns the rows that stay, and the nearest one of these for each row."""
+    extents_m = slam_map.column("extent_m")
+    # Parts of a map that no loop has joined have no known distance.
+    part = connected_parts(len(slam_map), slam_map.edges_of("odometry", "loop"))
+
+    def apart_m(row: int) -> Float[np.ndarray, " n"]:
+        distances = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])[kept]
+        return np.where(part[kept] == part[row], distances, np.inf)
+
+    kept: list[int] = []
+    for row in range(len(slam_map)):
+        if not (apart_m(row) < spacing_share * extents_m[kept]).any():
+            kept.append(row)
+    return kept, np.array([kept[int(np.argmin(apart_m(row)))] for row in range(len(slam_map))], np.int64)
+
+
+def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"], row_of: dict[int, int]) -> MapEdge:
+    """Moves both ends of an edge to the keyframes that cover them."""
+    source, target = int(cover[edge.source]), int(cover[edge.target])
+    T_world = slam_map.T_world_keyframe
+    T_target_end = rigid.inverse(T_world[target]) @ T_world[edge.target]
+    T_start_source = rigid.inverse(T_world[edge.source]) @ T_world[source]
+    T = T_target_end @ edge.T_target_source @ T_start_source
+    num_steps = 1 + (source != edge.source) + (target != edge.target)
+    information = _moved_information(edge.information, T_start_source) / num_steps
+    return MapEdge(row_of[source], row_of[target], T, information, edge.kind)
+
+
+def _moved_information(information: Information, T_old_new: Pose) -> np.ndarray:
+    """Moves an information matrix from the tangent of the old frame to that of the new one."""
+    R, t = T_old_new[:3, :3], T_old_new[:3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    adjoint = np.block([[R, cross @ R], [np.zeros((3, 3)), R]])
+    moved = adjoint.T @ information @ adjoint
+    return (moved + moved.T) / 2

@@ -11,15 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.compact import expand_elements
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig
-from dpmjax.slam.keyframe_map import KeyframeMap, Pose, nearest_in_graph
-from dpmjax.types import AnyArray
+from dpmjax.slam.keyframe_map import KeyframeMap, nearest_in_graph
+from dpmjax.types import AnyArray, Pose
 
 # Smallest distance between the last scans, as a share of the extent.
 RECENT_SHARE = 0.08
@@ -60,6 +59,11 @@ class LocalMap(NamedTuple):
     compact: tuple[CompactScan, ...]
     surface: Surface
 
+    def nearest(self, position_map: Float[np.ndarray, " 3"]) -> int:
+        """Returns the index in `keyframes` of the keyframe that is nearest to a position in metres."""
+        positions = np.array([placed.T_map_scan[:3, 3] for placed in self.keyframes])
+        return int(np.argmin(np.linalg.norm(positions - position_map, axis=1)))
+
 
 def local_map_of(slam_map: KeyframeMap, recent: Sequence[PlacedElements], config: OdometryConfig) -> LocalMap:
     """Builds the local map: recent scans, and the nearest keyframes that the graph joins to the last one.
@@ -97,29 +101,23 @@ def _placed(T_map_scan: Pose, *arrays: AnyArray) -> PlacedElements:
 
 
 def with_scan(
-    recent: tuple[PlacedElements, ...], placed: PlacedElements, spacing_m: float
+    recent: tuple[PlacedElements, ...], placed: PlacedElements, extent_m: float
 ) -> tuple[PlacedElements, ...]:
     """Adds a scan that is far enough from the last one, and drops the oldest of more than `NUM_RECENT` scans.
 
     Args:
         recent: the last scans, oldest first.
         placed: the scan.
-        spacing_m: smallest distance from the last scan, unless the scan is turned.
+        extent_m: extent of the scan; 0 adds it at any distance.
 
     Returns:
         The new last scans; the same tuple where the scan is not added.
     """
     if recent:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
-        if np.linalg.norm(T_last_scan[:3, 3]) < spacing_m and turn_rad(T_last_scan) < RECENT_RAD:
+        if np.linalg.norm(T_last_scan[:3, 3]) < RECENT_SHARE * extent_m and turn_rad(T_last_scan) < RECENT_RAD:
             return recent
     return (*recent, placed)[-NUM_RECENT:]
-
-
-def nearest_keyframe(local_map: LocalMap, position_map: Float[np.ndarray, " 3"]) -> int:
-    """Returns the index in `keyframes` of the keyframe that is nearest to a position in metres."""
-    positions = np.array([placed.T_map_scan[:3, 3] for placed in local_map.keyframes])
-    return int(np.argmin(np.linalg.norm(positions - position_map, axis=1)))
 
 
 def joined_surface(placed: Sequence[PlacedElements]) -> Surface:

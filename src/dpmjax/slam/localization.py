@@ -18,10 +18,11 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframe_map import KeyframeMap, Pose, Submap, submap_around, with_origin
-from dpmjax.slam.loop_candidates import most_similar
-from dpmjax.slam.system import make_methods
-from dpmjax.types import AnyArray
+from dpmjax.slam.keyframe_map import KeyframeMap, Submap, submap_around, with_origin
+from dpmjax.slam.loop_closure import most_similar
+from dpmjax.slam.model_methods import methods_for
+from dpmjax.slam.system import corrected_points
+from dpmjax.types import AnyArray, Pose
 
 # Largest sum of probabilities of a second place, as a share of the sum of the best place.
 MAX_RIVAL_SHARE = 0.5
@@ -160,10 +161,9 @@ def localize_each(
     """
     if slam_map.origin is None:
         raise ValueError("slam_map: expected keyframes, got an empty map")
-    methods = model if isinstance(model, SlamMethods) else make_methods(model, slam_map.origin.config)
-    with_origin(slam_map, methods.origin)
-    for scan in scans:
-        yield _Search(methods, slam_map, config or LocalizationConfig()).localized(np.asarray(scan))
+    search = _Search(methods_for(model, slam_map), slam_map, config or LocalizationConfig())
+    with_origin(slam_map, search.methods.origin)
+    yield from map(search.localized, scans)
 
 
 # Registrations that agree, the most probable first.
@@ -176,11 +176,9 @@ class _Search(NamedTuple):
     slam_map: KeyframeMap
     config: LocalizationConfig
 
-    def localized(self, scan: np.ndarray) -> Localization:
+    def localized(self, scan: Float[AnyArray, "_n 3"]) -> Localization:
         """Registers the scan with keyframes until the place is clear, or none is left."""
-        if scan.ndim != 2 or scan.shape[1] != 3:
-            raise ValueError(f"scan: expected shape (n, 3), got {scan.shape}")
-        thinned = self.methods.geometry.thin(scan[np.isfinite(scan).all(axis=1)])
+        thinned = self.methods.geometry.thin(corrected_points(scan, None))
         if thinned is None:
             return Localization("empty", None, 0.0, None, "too few points")
         compact, extent_m = self.methods.matcher.encode(thinned), thinned.extent_m

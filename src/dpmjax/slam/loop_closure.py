@@ -1,39 +1,44 @@
 """Loop closure: detection, registration map to map, and verification (DeepPointMap section 4).
 
-Loops that agree with others become edges, and the map is optimised.
+Candidates are older keyframes near the new one by the estimated poses, or similar to it by retrieval. Loops that agree
+with others become edges, and the map is optimised.
 """
 
 from __future__ import annotations
 
+import itertools
 from bisect import bisect_right
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from dpmjax.scans.weak_directions import with_least_covariance
-from dpmjax.slam.interfaces import Match, SlamMethods
+from dpmjax.slam.config import LoopClosureConfig
+from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
-from dpmjax.slam.loop_candidates import find_loop_candidates, nearest_pairs
-from dpmjax.slam.loops import (
-    DESCRIPTOR_INFORMATION,
-    Loop,
-    LoopState,
-    LoopStatus,
-    accept_consistent,
-    loop_status,
-    num_accepted,
-)
+from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, num_accepted, with_match
 from dpmjax.slam.map_optimization import optimize_map
+
+# Upper bound of the radius (DeepPointMap: 100 m).
+MAX_RADIUS_M = 100.0
+
+# Smallest distance of a candidate along the path, in extents.
+MIN_PATH_SHARE = 4.0
+
+# Radius of the candidates by distance, in extents.
+RADIUS_SHARE = 1.5
+
+# Share of the path since a candidate that is added to the radius.
+DRIFT_SHARE = 0.03
+
+# Smallest similarity of a candidate by retrieval.
+MIN_COSINE = 0.8
+
+# The mean of fewer vectors is too noisy to subtract.
+MIN_NUM_CENTRED = 20
 
 # Overlap probability above which no further candidate is examined.
 SURE_OVERLAP = 0.9
-
-# Lower bound of the standard deviation of an aligned loop: people and the motion of the lidar disturb scans.
-FLOOR_M = 0.05
-
-# Lower bound of the standard deviation of the rotation of an aligned loop.
-FLOOR_RAD = 0.005
 
 # Length of path after an accepted loop without a search for another one, in extents.
 REST_SHARE = 0.3
@@ -148,13 +153,7 @@ def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates
         loop = loops[number]
         source, target = (submap_around(slam_map, row, num_submap) for row in loop[:2])
         (match,) = methods.matcher.register([(source, target)])
-        loops[number] = loop._replace(
-            status=loop_status(slam_map, loop, match, config),
-            probability=match.probability,
-            rmse=match.rmse,
-            T_target_source=match.T_target_source,
-            information=_edge_information(match),
-        )
+        loops[number] = with_match(slam_map, loop, match, config)
         if loops[number].status == "waits for support":
             break
     return loops
@@ -177,8 +176,131 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
     return loops
 
 
-def _edge_information(match: Match) -> Float[np.ndarray, "6 6"]:
-    """Returns the information by the planes, with an upper bound; without planes, that of descriptors."""
-    if match.information is None:
-        return DESCRIPTOR_INFORMATION
-    return with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)
+def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[Loop]:
+    """Finds older keyframes that may show the place of a keyframe.
+
+    By distance: within a radius that grows with the length of the path between, because odometry drifts. By retrieval:
+    over the whole map, even after drift or a lost track. Of several neighbours only the best is a candidate.
+
+    Args:
+        slam_map: the map.
+        row: row of the new keyframe.
+        config: largest numbers of candidates.
+
+    Returns:
+        Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
+    """
+    extent_m, since_m = slam_map.keyframes[row].extent_m, _path_since_m(*_paths(slam_map), row)
+    is_old = _is_old(since_m, row, extent_m)
+    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
+    is_near = is_old & (apart_m <= np.minimum(RADIUS_SHARE * extent_m + DRIFT_SHARE * since_m, MAX_RADIUS_M))
+    near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
+    near = _spread(near, slam_map, extent_m / 2, config.num_near)
+    by_distance = [Loop(row, int(other), "distance") for other in near]
+    by_retrieval = [loop for loop in similar_keyframes(slam_map, row, is_old, config) if loop.target not in near]
+    in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))
+    return [candidate for candidate in in_turn if candidate is not None]
+
+
+def nearest_pairs(slam_map: KeyframeMap) -> list[tuple[float, int, int]]:
+    """Finds, for each keyframe, the nearest older one that a loop may join to it, by the estimated poses alone.
+
+    Args:
+        slam_map: the map.
+
+    Returns:
+        Distance in metres and both rows, newer first, where it is within the extent of the newer scan; nearest first.
+    """
+    pairs, paths = [], _paths(slam_map)
+    for row, keyframe in enumerate(slam_map.keyframes):
+        is_old = _is_old(_path_since_m(*paths, row), row, keyframe.extent_m)
+        apart_m = np.where(is_old, slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3]), np.inf)
+        target = int(np.argmin(apart_m))
+        if apart_m[target] < keyframe.extent_m:
+            pairs.append((float(apart_m[target]), row, target))
+    return sorted(pairs)
+
+
+def similar_keyframes(
+    slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"], config: LoopClosureConfig
+) -> list[Loop]:
+    """Finds keyframes that may show the place of a keyframe, by retrieval alone, without positions.
+
+    Args:
+        slam_map: the map; or several maps in one record.
+        row: row of the keyframe.
+        is_allowed: False for keyframes that are no candidates.
+        config: largest number of candidates.
+
+    Returns:
+        Candidates, most similar first.
+    """
+    rows, cosines = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_allowed)
+    spacing_m = slam_map.keyframes[row].extent_m / 2
+    similar = _spread(rows[cosines >= MIN_COSINE], slam_map, spacing_m, config.num_similar)
+    return [Loop(row, int(other), "retrieval") for other in similar]
+
+
+def most_similar(
+    vectors: Float[np.ndarray, "k d"],
+    query: Float[np.ndarray, " d"],
+    count: int,
+    *,
+    is_allowed: Bool[np.ndarray, " k"] | None = None,
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Finds the vectors with the largest cosine, by one matrix product.
+
+    The mean of many vectors is common to all places, so it is subtracted first.
+
+    Args:
+        vectors: unit vectors.
+        query: vector of any norm.
+        count: largest number of vectors.
+        is_allowed: False for vectors that are no candidates.
+
+    Returns:
+        Rows, most similar first, and their cosines.
+    """
+    if len(vectors) == 0 or count == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.float32)
+    mean = vectors.mean(axis=0) if len(vectors) >= MIN_NUM_CENTRED else np.zeros_like(query)
+    centred = query - mean
+    # |v - m|^2 = 1 - 2 v.m + m.m for unit vectors: no centred copy of the whole map.
+    lengths = np.sqrt(np.maximum(1 - 2 * (vectors @ mean) + mean @ mean, 1e-12)) * max(np.linalg.norm(centred), 1e-6)
+    cosines = (vectors @ centred - mean @ centred) / lengths
+    if is_allowed is not None:
+        cosines = np.where(is_allowed, cosines, -np.inf)
+    count = min(count, len(cosines))
+    rows = np.argpartition(-cosines, count - 1)[:count]
+    rows = rows[np.argsort(-cosines[rows], kind="stable")]
+    rows = rows[np.isfinite(cosines[rows])]
+    return rows, cosines[rows].astype(np.float32)
+
+
+def _paths(slam_map: KeyframeMap) -> tuple[Float[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Returns the lengths of the paths to all keyframes, and their segments."""
+    return slam_map.column("path_m"), slam_map.column("segment")
+
+
+def _path_since_m(path_m: Float[np.ndarray, " k"], segments: Int[np.ndarray, " k"], row: int) -> np.ndarray:
+    """Returns the path length from each keyframe to that of `row`; infinite where the track was lost between them."""
+    return np.where(segments == segments[row], path_m[row] - path_m, np.inf)
+
+
+def _is_old(since_m: Float[np.ndarray, " k"], row: int, extent_m: float) -> Bool[np.ndarray, " k"]:
+    """Returns True for keyframes early enough on the path for a loop to that of `row`."""
+    return (np.arange(len(since_m)) < row) & (since_m > MIN_PATH_SHARE * extent_m)
+
+
+def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float, count: int) -> Int[np.ndarray, " m"]:
+    """Returns the first rows without those within `spacing_m` of an earlier row of the same segment."""
+    positions = slam_map.T_world_keyframe[rows, :3, 3]
+    segments = np.array([slam_map.keyframes[row].segment for row in rows])
+    is_free: Bool[np.ndarray, " n"] = np.ones(len(rows), bool)
+    taken: list[int] = []
+    for number in range(len(rows)):
+        if is_free[number] and len(taken) < count:
+            taken.append(number)
+            distance: Float[np.ndarray, " n"] = np.linalg.norm(positions - positions[number], axis=1)
+            is_free &= (distance > spacing_m) | (segments != segments[number])
+    return rows[taken]

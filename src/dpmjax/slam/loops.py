@@ -10,19 +10,24 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
+from dpmjax.scans.weak_directions import diagonal_information, with_least_covariance
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
-from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, Pose, diagonal_information
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge
+from dpmjax.types import Information, Pose
 
 # Standard deviations of a registration by descriptors alone: translation and rotation.
 DESCRIPTOR_SIGMA_M, DESCRIPTOR_SIGMA_RAD = 0.2, 0.02
 
 # Information of a registration by descriptors alone.
 DESCRIPTOR_INFORMATION = diagonal_information(DESCRIPTOR_SIGMA_M, DESCRIPTOR_SIGMA_RAD)
+
+# Lower bounds of the standard deviations of an aligned loop, translation and rotation: people and the motion of the
+# lidar disturb scans.
+FLOOR_M, FLOOR_RAD = 0.05, 0.005
 
 # Standard deviation of odometry over one metre; it grows with the root of the path.
 DRIFT_M = 0.05
@@ -78,7 +83,7 @@ class Loop(NamedTuple):
     probability: float | None = None
     rmse: float | None = None
     T_target_source: Pose | None = None
-    information: Float[np.ndarray, "6 6"] | None = None
+    information: Information | None = None
 
     @property
     def edge(self) -> MapEdge:
@@ -129,8 +134,8 @@ def num_accepted(loops: Iterable[Loop]) -> int:
     return sum(loop.status == "accepted" for loop in loops)
 
 
-def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
-    """Tests a registration of a loop against its probability and odometry.
+def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> Loop:
+    """Records the registration of a loop, and tests it against its probability and odometry.
 
     Args:
         slam_map: the map.
@@ -139,8 +144,16 @@ def loop_status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClo
         config: smallest probability.
 
     Returns:
-        "waits for support", or the reason of the rejection.
+        The loop; it "waits for support", or its status is the reason of the rejection.
     """
+    information = DESCRIPTOR_INFORMATION
+    if match.information is not None:
+        information = with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)
+    status = _status(slam_map, loop, match, config)
+    return Loop(*loop[:3], status, loop.overlap, match.probability, match.rmse, match.T_target_source, information)
+
+
+def _status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
     if match.probability < config.min_probability:
         return "improbable"
     source, target = slam_map.keyframes[loop.source], slam_map.keyframes[loop.target]

@@ -13,9 +13,9 @@ from jaxtyping import Float, Int
 from dpmjax.deepmapping.mapping import register_clouds
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
-from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, Pose, as_pose_graph, connected_parts
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, as_pose_graph, connected_parts
 from dpmjax.slam.loops import LoopState
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, Pose, Poses
 
 # Cost above which the optimisation reduces the weight of a loop edge.
 OUTLIER_CHI2 = 25.0
@@ -66,9 +66,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     return slam_map, LoopState(tuple(loops), len(slam_map))
 
 
-def _joined_poses(
-    T_world_keyframe: Float[np.ndarray, "k 4 4"], parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]
-) -> Float[np.ndarray, "k 4 4"]:
+def _joined_poses(T_world_keyframe: Poses, parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]) -> Poses:
     """Moves whole parts, so that one edge between two parts holds exactly: a start near the solution."""
     T_world, parts = T_world_keyframe.copy(), parts.copy()
     for edge in edges:

@@ -1,28 +1,36 @@
-"""The whole system: scan by scan, front end, loop closure and optimisation make one map."""
+"""The whole system: scan by scan, front end, loop closure and optimisation make one map.
+
+The work on a scan that needs no map is done in a thread, one scan ahead.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
+from dpmjax.checks import as_host_points
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.scans.corrections import deskew
 from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
-from dpmjax.slam.interfaces import SlamMethods
+from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
-from dpmjax.slam.matcher import NetworkMatcher
-from dpmjax.slam.odometry import SurfaceGeometry
-from dpmjax.slam.scan_input import AnyScan, PreparedInput, TimedScan, in_advance, prepare_ahead, prepare_input
+from dpmjax.slam.model_methods import as_methods
+from dpmjax.types import Pose, Poses
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 class SlamState(NamedTuple):
@@ -53,53 +61,18 @@ class SlamResult(NamedTuple):
         T_odometry_scan: (n, 4, 4) every scan by odometry alone, without any loop.
     """
 
-    T_world_scan: Float[np.ndarray, "n 4 4"]
+    T_world_scan: Poses
     keyframes: np.ndarray
     loops: tuple[Loop, ...]
     graph: PoseGraph | None
     reports: tuple[ScanReport, ...]
     state: SlamState
-    T_odometry_scan: Float[np.ndarray, "n 4 4"]
+    T_odometry_scan: Poses
 
     @property
     def map(self) -> KeyframeMap:
         """The map: keyframes, poses and edges."""
         return self.state.slam_map
-
-
-def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:
-    """Makes the methods of a trained model: its networks, and point-to-plane geometry.
-
-    Args:
-        model: encoder and decoder.
-        config: settings of all stages.
-        weights: name of the weights, noted in the map.
-
-    Returns:
-        The methods.
-    """
-    config = config or SlamConfig()
-    return SlamMethods(NetworkMatcher(model), SurfaceGeometry(model.config, config.odometry), config, weights)
-
-
-def as_methods(model: Model | SlamMethods, config: SlamConfig | None) -> SlamMethods:
-    """Returns given methods unchanged, and makes the methods of a model.
-
-    Args:
-        model: a trained model, or methods.
-        config: settings for a model; methods carry their own.
-
-    Returns:
-        The methods.
-
-    Raises:
-        ValueError: if methods come with a configuration.
-    """
-    if isinstance(model, SlamMethods):
-        if config is not None:
-            raise ValueError("config: expected None with methods, which carry their own")
-        return model
-    return make_methods(model, config)
 
 
 def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
@@ -170,9 +143,7 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
     )
 
 
-def place_scans(
-    T_world_keyframe: Float[np.ndarray, "k 4 4"], reports: Sequence[ScanReport]
-) -> Float[np.ndarray, "n 4 4"]:
+def place_scans(T_world_keyframe: Poses, reports: Sequence[ScanReport]) -> Poses:
     """Computes the world pose of each scan from the pose of its keyframe.
 
     Args:
@@ -219,3 +190,80 @@ def run_slam(
         state, report = step_slam(methods, state, scan)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
+
+
+def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> PreparedInput:
+    """Does the work on a scan that needs no map: thins it, and encodes it where each scan is encoded.
+
+    Args:
+        methods: matcher, geometry, settings.
+        scan: points in metres, in the frame of the lidar, perhaps with times.
+        T_turn: predicted motion, by which a scan with times is deskewed; None for a scan without times.
+
+    Returns:
+        The prepared scan.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
+    if thinned is not None and methods.config.odometry.proposer == "network":
+        compact = methods.matcher.encode(thinned)
+    return PreparedInput(len(scan.points if isinstance(scan, TimedScan) else scan), thinned, T_turn, compact)
+
+
+def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
+    """Returns the finite points of a scan, and undoes the motion of the lidar where the scan has times.
+
+    Args:
+        scan: points in metres, in the frame of the lidar, perhaps with times.
+        T_turn: motion from one scan to the next; None leaves the points unchanged.
+
+    Returns:
+        The points.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    points = as_host_points("scan", scan.points if isinstance(scan, TimedScan) else scan)
+    is_finite = np.isfinite(points).all(axis=1)
+    if not isinstance(scan, TimedScan) or T_turn is None:
+        return points[is_finite]
+    return deskew(points[is_finite], np.asarray(scan.offsets)[is_finite], T_turn)
+
+
+def prepare_ahead(methods: SlamMethods, scan: AnyScan) -> PreparedInput | TimedScan:
+    """Prepares a scan before those in front of it have poses, for instance in another thread.
+
+    Args:
+        methods: methods from `make_methods`.
+        scan: see `step_slam`.
+
+    Returns:
+        The input of `step_slam`; a scan with times is unchanged, because the motion before it is not known yet.
+
+    Raises:
+        ValueError: if the shape is not (n, 3).
+    """
+    return scan if isinstance(scan, TimedScan) else prepare_input(methods, scan)
+
+
+def in_advance(work: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
+    """Works on each item in a thread, the next one while the caller uses this one.
+
+    Args:
+        work: called with one item after another.
+        items: the items, taken one ahead by the thread of the caller.
+
+    Yields:
+        The results, in order; an error of the work is raised in place of its result.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        done: Future[Result] | None = None
+        for item in items:
+            begun = pool.submit(work, item)
+            if done is not None:
+                yield done.result()
+            done = begun
+        if done is not None:
+            yield done.result()

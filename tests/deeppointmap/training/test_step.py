@@ -178,7 +178,7 @@ def test_the_learning_rate_falls_at_the_end_or_when_it_is_asked_to(start) -> Non
 EIGHT_DEVICES = """
 import jax, numpy as np
 from dpmjax.deeppointmap import SampleMaker, init_training
-from dpmjax.deeppointmap.training.processes import BATCH_AXIS, device_mesh, place
+from dpmjax.deeppointmap.training.processes import device_mesh, place
 from dpmjax.deeppointmap.training.step import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
@@ -187,7 +187,7 @@ batch, params = maker(0), init_training(jax.random.key(0), toy.TRAINING).params
 gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
 alone = gradient(params, batch)
 mesh = device_mesh()
-spread = place(batch, mesh, BATCH_AXIS)
+spread = place(batch, mesh, is_batch=True)
 mask = spread.groups[0].mask
 assert len(mask.sharding.device_set) == 8 and mask.addressable_shards[0].data.shape[0] == 1
 together = gradient(place(params, mesh), spread)

@@ -26,7 +26,7 @@ from dpmjax.geometry.bearing import directions_of
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.scans.augment import AugmentConfig
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import AnyArray, DescriptorCloud, Registration
+from dpmjax.types import AnyArray, DescriptorCloud, Poses, Registration
 
 TRAINED = ObjectiveConfig()
 
@@ -84,7 +84,7 @@ class EvaluationPairs(NamedTuple):
     """
 
     scans: SampleScans
-    T_world_scan: Float[np.ndarray, "n 4 4"]
+    T_world_scan: Poses
     pairs: tuple[Pairs, ...]
     scale_m: float
 
@@ -101,7 +101,7 @@ class EvaluationPairs(NamedTuple):
         points = stored.points[row, : stored.num_points[row]] * (stored.unit[row] * np.float32(self.scale_m))
         return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
-    def true_motions(self, pairs: Pairs) -> Float[np.ndarray, "p 4 4"]:
+    def true_motions(self, pairs: Pairs) -> Poses:
         """Computes the true motions of pairs.
 
         Args:
@@ -214,9 +214,7 @@ def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorClo
     return jax.lax.map(best_motion, (sources, targets))
 
 
-def _maps(
-    clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Float[np.ndarray, "n 4 4"]
-) -> DescriptorCloud:
+def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Poses) -> DescriptorCloud:
     T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
     merged = _merge_all(clouds, jnp.asarray(rows), jnp.asarray(T_map_scan, jnp.float32))
     unions = zip(np.asarray(merged.positions), np.asarray(merged.mask), strict=True)

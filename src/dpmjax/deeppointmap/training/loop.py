@@ -24,17 +24,8 @@ from jaxtyping import Float, Int
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
-from dpmjax.deeppointmap.training.data_pipeline import SampleMaker
-from dpmjax.deeppointmap.training.processes import (
-    BATCH_AXIS,
-    device_mesh,
-    from_first,
-    is_first,
-    largest,
-    place,
-    together,
-)
-from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drives
+from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
+from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray
@@ -246,7 +237,7 @@ def _run_steps(
                 end = int(progress.state.end)
             stage = config.stage_at(number)
             begun = time.perf_counter()
-            state, report = step(progress.state, place(batch, mesh, BATCH_AXIS))
+            state, report = step(progress.state, place(batch, mesh, is_batch=True))
             number += 1
             with together():  # the next batch is prepared while the device computes
                 batch = next(batches, None) if number < end else None

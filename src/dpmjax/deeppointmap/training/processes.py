@@ -65,19 +65,19 @@ def device_mesh() -> Mesh:
     return Mesh(np.array(jax.devices()), (BATCH_AXIS,))
 
 
-def place(tree: TreeT, mesh: Mesh, *axes: str) -> TreeT:
+def place(tree: TreeT, mesh: Mesh, *, is_batch: bool = False) -> TreeT:
     """Puts arrays on the devices of a mesh.
 
     Args:
-        tree: without an axis, the same in every process. With `BATCH_AXIS`, the samples of this process, stacked along
-            the first axis. Their number is that of the devices of this process in the mesh, or a multiple.
+        tree: the same in every process; or a batch: the samples of this process, stacked along the first axis. Their
+            number is that of the devices of this process in the mesh, or a multiple.
         mesh: mesh from `device_mesh`.
-        *axes: `BATCH_AXIS` to spread the first axis over the devices; none to copy the tree to every device.
+        is_batch: True spreads the first axis over the devices; False copies the tree to every device.
 
     Returns:
         The tree as arrays of all processes.
     """
-    sharding = NamedSharding(mesh, PartitionSpec(*axes))
+    sharding = NamedSharding(mesh, PartitionSpec(BATCH_AXIS) if is_batch else PartitionSpec())
     return jax.tree.map(lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), tree)
 
 

@@ -20,7 +20,7 @@ from dpmjax.deeppointmap.matching import thinned_mask
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, GroupShape, Layout, SamplingConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, Poses
 
 TreeT = TypeVar("TreeT")
 NUM_ATTEMPTS = 100
@@ -35,7 +35,7 @@ class ScanTable:
         scene: (n,) number of the world of each pose; poses of different worlds are unrelated.
     """
 
-    T_world_lidar: Float[np.ndarray, "n 4 4"]
+    T_world_lidar: Poses
     scene: Int[np.ndarray, " n"]
 
     def __post_init__(self) -> None:
@@ -191,7 +191,7 @@ class PlacedScans(NamedTuple):
         mask: False for descriptors that are not there.
     """
 
-    T_world_scan: Float[np.ndarray, "s 4 4"]
+    T_world_scan: Poses
     positions_world: Float[np.ndarray, "s n 3"]
     mask: Bool[np.ndarray, "s n"]
 

@@ -24,18 +24,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dpmjax.deeppointmap.matching import merge_clouds
-from dpmjax.deeppointmap.model import (
-    Model,
-    coarse_features,
-    correlate,
-    encode_pyramid,
-    init_model,
-    predict_offsets,
-    similarity_features,
-)
+from dpmjax.deeppointmap.model import Model, correlate, decode, encode_pyramid, init_model, predict_offsets
 from dpmjax.deeppointmap.training.curriculum import DECAY_RATIO, TrainingConfig
 from dpmjax.deeppointmap.training.objective import (
-    ObjectiveConfig,
     ObjectiveTerms,
     TrainingPairs,
     TrainingSide,
@@ -192,8 +183,12 @@ def batch_loss(
         in_groups = max(GROUP_SCANS_AT_ONCE, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
-            maps = _merged(clouds, group.source), _merged(clouds, group.target)
-            return _map_pair_loss(model, *maps, group.T_target_source, config.objective)
+            # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
+            maps, T = (_merged(clouds, group.source), _merged(clouds, group.target)), group.T_target_source
+            correlated = correlate(model, *maps)
+            close = training_pairs(*maps, T, config=config.objective)
+            sides = zip(maps, correlated, correlated[::-1], close, strict=True)
+            return matching_loss(*(_side(model, *side) for side in sides), T, config=config.objective)
 
         return [
             _in_parts(of_group, group, in_groups // (group.source.rows.shape[1] + group.target.rows.shape[1]))
@@ -221,16 +216,6 @@ def encode_sample(model: Model, scan: SampleScans) -> DescriptorCloud:
     # A rigid motion in metres is one in normalised coordinates with a shorter translation.
     unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
     return encode_pyramid(model, moved_pyramid(scan.pyramids, scan.T_augmented_lidar * unit))
-
-
-def _map_pair_loss(
-    model: Model, a: DescriptorCloud, b: DescriptorCloud, T_b_a: Float[AnyArray, "4 4"], config: ObjectiveConfig
-) -> tuple[Float[Array, ""], ObjectiveTerms]:
-    # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
-    correlated_a, correlated_b = correlate(model, a, b)
-    close_a, close_b = training_pairs(a, b, T_b_a, config=config)
-    sides = (_side(model, a, correlated_a, correlated_b, close_a), _side(model, b, correlated_b, correlated_a, close_b))
-    return matching_loss(*sides, T_b_a, config=config)
 
 
 def _over_samples(function: Callable[[Any], Any], batch: Any) -> Any:
@@ -262,8 +247,8 @@ def _side(
     return TrainingSide(
         positions=cloud.positions,
         mask=cloud.mask,
-        matched_features=similarity_features(model, correlated),
-        coarse_features=coarse_features(model, cloud),
+        matched_features=decode(model, correlated.features, part="similarity_head"),
+        coarse_features=decode(model, cloud.features, part="coarse_head"),
         close=close,
         offsets=predict_offsets(model, own, other.features, directions, close.indices),
     )

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.scans.compact import compact_elements, compact_image, expand_elements, expand_image
-from dpmjax.scans.range_images import range_image, view_points
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, scan_surface
+from dpmjax.deeppointmap.prepared_scans import compact_elements, compact_image, expand_elements, expand_image
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, scan_surface, view_points
 from dpmjax.types import SurfaceElements
 
 
