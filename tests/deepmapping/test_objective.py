@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deepmapping.config import REFINE, DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.config import JOINT, REFINE, DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import WorldBatch, chamfer_term, free_factors, interpolate_log, occupancy_term
-from dpmjax.deepmapping.presets import JOINT
 from dpmjax.deepmapping.problem import MapFrame, Params, mapping_loss
 from dpmjax.nets.mapping import OccupancyConfig, init_map_net
 from tests.tolerances import ACCUMULATED, ROUNDING

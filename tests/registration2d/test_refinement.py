@@ -13,7 +13,7 @@ from dpmjax.registration2d import LoopConfig, RefinementConfig, correct_by_loops
 from dpmjax.registration2d.joint_alignment import choose_pairs
 from dpmjax.registration2d.loop_closure import LoopResult, count_support, find_candidates
 from dpmjax.registration2d.planar_scans import rounded_up
-from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.steps import StepPrior
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 

@@ -10,8 +10,7 @@ from dpmjax.registration2d import PlanarScans, assess_trajectory, incremental_ic
 from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, restore_torn
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.range_profiles import make_profiles
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_slides import slide_steps
+from dpmjax.registration2d.steps import StepPrior, slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.

@@ -30,7 +30,7 @@ from dpmjax.registration_rgbd.motion_search import (
     propose_motions,
     surface_directions,
 )
-from dpmjax.registration_rgbd.pose_adjustment import adjust_poses
+from dpmjax.registration_rgbd.projective_consistency import adjust_poses
 from dpmjax.registration_rgbd.trajectory_search import _best_that_differ, _explained, _window
 from tests.tolerances import ROUNDING
 

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
-from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.planar_sensor import PLANAR, as_scan_set
-from dpmjax.deepmapping.presets import preset
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
 from dpmjax.deepmapping.spatial_sensors import CLOUDS, DEPTH
 from dpmjax.geometry import se2

@@ -25,8 +25,7 @@ from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration2d.pair_alignment import PairSystem, Schedule, linearise_pair
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, rounded_up
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, RangeProfiles, make_profiles, pair_scores
-from dpmjax.registration2d.step_prior import StepPrior, pose_steps, prior_steps
-from dpmjax.registration2d.step_slides import held_steps, slide_steps
+from dpmjax.registration2d.steps import StepPrior, held_steps, pose_steps, prior_steps, slide_steps
 
 # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9

@@ -22,7 +22,7 @@ from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior, Schedule, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, batches
 from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles, weak_steps
-from dpmjax.registration2d.step_prior import BEAM_DEVIATION, pose_steps
+from dpmjax.registration2d.steps import BEAM_DEVIATION, pose_steps
 
 _SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
 _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)

@@ -21,12 +21,11 @@ from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
 from dpmjax.deepmapping.planar_sensor import as_scan_set
 from dpmjax.geometry import se2
-from dpmjax.registration2d.assessment import Assessment, assess_trajectory
 from dpmjax.registration2d.global_registration import nearest_tour, register_globally
 from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
 from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
-from dpmjax.registration2d.quality import Score, choose_trajectory
+from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, choose_trajectory
 from dpmjax.registration2d.recordings import Recording, choose_scans, take_scans
 from dpmjax.registration2d.refinement import refine
 from dpmjax.types import ScanSet

@@ -23,8 +23,7 @@ from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_slides import matched_steps, settle_steps
+from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps
 from dpmjax.types import ScanSet
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,

@@ -31,7 +31,7 @@ from dpmjax.registration2d.range_profiles import (
 )
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_joining import join_parts
-from dpmjax.registration2d.step_prior import MotionPrior
+from dpmjax.registration2d.steps import MotionPrior
 
 # Turns of a step that are searched, radians for each scan that it spans.
 _MAX_TURN = 1.7

@@ -22,8 +22,13 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 from dpmjax.geometry.se3 import Motion, motion_matrices
 from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, surface_gap
-from dpmjax.registration_rgbd.pose_adjustment import gap_equations, improve_motions, motion_scales
-from dpmjax.registration_rgbd.projective_consistency import Agreement, both_ways
+from dpmjax.registration_rgbd.projective_consistency import (
+    Agreement,
+    both_ways,
+    gap_equations,
+    improve_motions,
+    motion_scales,
+)
 
 # Largest translation between neighbouring images along each axis, metres.
 MAX_TRANSLATION = 0.7

@@ -28,8 +28,7 @@ from dpmjax.registration_rgbd.motion_search import (
     propose_motions,
     surface_directions,
 )
-from dpmjax.registration_rgbd.pose_adjustment import adjust_poses
-from dpmjax.registration_rgbd.projective_consistency import explained_share
+from dpmjax.registration_rgbd.projective_consistency import adjust_poses, explained_share
 
 # Least root mean square difference of two trajectories, as shares of the largest translation and of the largest turn.
 _APART = (0.085, 0.075)
