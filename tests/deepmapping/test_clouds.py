@@ -13,7 +13,7 @@ from dpmjax import deepmapping as dm
 from dpmjax.deepmapping.cloud_scans import PlaneCloud, find_partners, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
-from dpmjax.deepmapping.objective import scans_of_step
+from dpmjax.deepmapping.objective import blocks_of_step
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
@@ -169,10 +169,10 @@ def test_long_sets_are_fitted_in_blocks_that_see_every_scan(scans) -> None:
     phase = replace(dm.preset("fast", "clouds").warm_phases[0], scans_per_step=64)
     seen = set()
     for step in range(60):
-        rows, block = map(np.asarray, scans_of_step(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
-        assert len(rows) == 64
-        assert all((np.diff(rows[block == number]) == 1).all() for number in (0, 1))
-        seen |= set(rows.tolist())
+        rows = np.asarray(blocks_of_step(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
+        assert rows.shape == (2, 32)
+        assert (np.diff(rows, axis=1) == 1).all()
+        seen |= set(rows.ravel().tolist())
     assert seen == set(range(100))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import flax.struct
@@ -69,15 +69,12 @@ class CloudScans:
         return PlaneCloud(self.points, self.mask, self.normals, self.flatness)
 
 
-def as_cloud_scans(
-    scans: Sequence[ArrayLike], num_points: int = 2048, *, on_scan: Callable[[], object] | None = None
-) -> CloudScans:
+def as_cloud_scans(scans: Sequence[ArrayLike], num_points: int = 2048) -> CloudScans:
     """Thins lidar scans evenly, and estimates the plane around each point from the denser scan.
 
     Args:
         scans: (m_i, 3) points in the lidar frames, any unit, any number; points that are not finite are left out.
         num_points: capacity of each scan.
-        on_scan: called after each scan.
 
     Returns:
         The scans, in the unit of the points, without partners.
@@ -93,11 +90,7 @@ def as_cloud_scans(
         min_range_m=_NEAREST * unit, max_range_m=_FARTHEST * unit, voxel_size_m=_VOXEL * unit,
         num_neighbours=_NUM_NEIGHBOURS, neighbour_radius_m=_NEIGHBOURS * unit,
     )  # fmt: skip
-    rows = []
-    for number, cloud in enumerate(clouds):
-        rows.append(_thinned(cloud, number, config, num_points))
-        if on_scan is not None:
-            on_scan()
+    rows = [_thinned(cloud, number, config, num_points) for number, cloud in enumerate(clouds)]
     points, mask, normals, flatness = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
     partners = jnp.full((len(scans), _NUM_PARTNERS), -1, jnp.int32)
     spacing = np.median([_spacing(np.asarray(row.points)[np.asarray(row.mask)]) for row in rows])

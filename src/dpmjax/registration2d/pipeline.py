@@ -19,7 +19,7 @@ from dpmjax.checks import require_one_of, require_positive
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
-from dpmjax.deepmapping.planar_sensor import as_scan_set
+from dpmjax.deepmapping.sensors import as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.registration2d.global_registration import nearest_tour, register_globally
 from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
