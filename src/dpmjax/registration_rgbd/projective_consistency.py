@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import Motion, motion_matrices
-from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, SampledImages, surface_gap
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, SampledImages, Views, surface_gap
 
 # Cost of a contradiction in matches, and least cost, at coarse tolerances; tolerance up to which the full cost holds.
 # Along a bare wall a wrong pose matches nearly everywhere. At a coarse tolerance inexact poses cause contradictions.
@@ -95,26 +95,22 @@ def _match_and_contradiction(gap: Float[Array, "*n"]) -> tuple[Float[Array, "*n"
 
 
 def both_ways(
-    T_other_camera: Float[Array, "4 4"],
-    samples: tuple[PixelSample, PixelSample],
-    surfaces: tuple[Float[Array, "4 r c"], Float[Array, "4 r c"]],
-    pinhole: Pinhole,
-    tolerance: Float[Array, ""],
+    T_other_camera: Float[Array, "4 4"], view: Views, other: Views, pinhole: Pinhole, tolerance: Float[Array, ""]
 ) -> Agreement:
     """Computes the agreement of a pair of images, in both directions.
 
     Args:
         T_other_camera: motion of points of the first image into the frame of the second camera.
-        samples: points of the first and of the second image.
-        surfaces: `image_surface` of the first and of the second camera.
+        view: the first image.
+        other: the second image.
         pinhole: pinhole of both cameras.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
         The sum of both agreements.
     """
-    there = image_agreement(T_other_camera, samples[0], surfaces[1], pinhole, tolerance)
-    back = image_agreement(rigid.inverse(T_other_camera), samples[1], surfaces[0], pinhole, tolerance)
+    there = image_agreement(T_other_camera, view.sample, other.surfaces, pinhole, tolerance)
+    back = image_agreement(rigid.inverse(T_other_camera), other.sample, view.surfaces, pinhole, tolerance)
     return Agreement(there.total + back.total, there.comparable + back.comparable)
 
 
@@ -146,7 +142,7 @@ def consistency_of_pairs(
         T_other_camera = rigid.compose(rigid.inverse(T_world_camera[other]), T_world_camera)
         others = PixelSample(sample.points[other], sample.mask[other])
         agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
-            T_other_camera, (sample, others), (surfaces, surfaces[other]), scans.pinhole, tolerance
+            T_other_camera, Views(sample, surfaces), Views(others, surfaces[other]), scans.pinhole, tolerance
         )
         # At offset n / 2 the second half of the images repeats the pairs of the first half.
         is_new = (2 * offset != count) | (jnp.arange(count) < offset)
@@ -156,11 +152,7 @@ def consistency_of_pairs(
 
 
 def explained_share(
-    T_world_camera: Float[Array, "n 4 4"],
-    sample: PixelSample,
-    scans: DepthScans,
-    unit: Float[Array, ""] | float,
-    tolerance: Float[Array, ""],
+    T_world_camera: Float[Array, "n 4 4"], images: SampledImages, tolerance: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Computes the share of the points that another image explains, less the cost of contradicted points.
 
@@ -170,14 +162,13 @@ def explained_share(
 
     Args:
         T_world_camera: poses.
-        sample: sampled points of each image.
-        scans: depth images, unit of the poses.
-        unit: typical range of the images, unit of the points.
+        images: depth images, unit of the poses.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
         -20 to 1.
     """
+    scans, sample, unit = images
     rows, surfaces = jnp.arange(T_world_camera.shape[0]), scans.surfaces
 
     def explain(row: Int[Array, ""]) -> Float[Array, ""]:
@@ -249,7 +240,7 @@ def adjust_poses(
 
     def equations(motions: Float[Array, "m 4 4"]) -> tuple[Float[Array, "mk mk"], Float[Array, " mk"]]:
         T = rigid.compose(T_world_camera, with_first(motions))
-        matrix, gradient = _normal_equations(T, scans, sample, scales, tolerance)
+        matrix, gradient = _normal_equations(T, images, scales, tolerance)
         return matrix[free, free], gradient[free]
 
     def score(motions: Float[Array, "m 4 4"]) -> Float[Array, ""]:
@@ -260,13 +251,10 @@ def adjust_poses(
 
 
 def _normal_equations(
-    T: Float[Array, "n 4 4"],
-    scans: DepthScans,
-    sample: PixelSample,
-    scales: Float[Array, " k"],
-    tolerance: Float[Array, ""],
+    T: Float[Array, "n 4 4"], images: SampledImages, scales: Float[Array, " k"], tolerance: Float[Array, ""]
 ) -> tuple[Float[Array, "nk nk"], Float[Array, " nk"]]:
     """Computes the normal equations of the residuals of all pairs of images, in both directions."""
+    scans, sample, _ = images
     count, freedom, surfaces = T.shape[0], len(scales), scans.surfaces
 
     def gaps(values: Float[Array, "2 k"], pair: Int[Array, "2"]) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:

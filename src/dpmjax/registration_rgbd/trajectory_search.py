@@ -16,13 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.geometry.se3 import Motion
-from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, SampledImages
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, SampledImages, Views
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     MAX_TURN_DEG,
     DepthSearchConfig,
     SearchCamera,
-    Views,
     depth_search,
     motion_cost,
     propose_motions,
@@ -95,10 +94,9 @@ def initialize_depth(
 def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
     """Draws points of each image."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
-    num_scans = scans.mask.shape[0]
-    points, mask = np.asarray(scans.points).reshape(num_scans, -1, 3), np.asarray(scans.mask).reshape(num_scans, -1)
+    points, mask = (np.asarray(values) for values in scans.pixels)
     some = [p[rng.choice(np.flatnonzero(m), count)] for p, m in zip(points, mask, strict=True)]
-    return PixelSample(jnp.asarray(np.stack(some)), jnp.ones((num_scans, count), bool))
+    return PixelSample(jnp.asarray(np.stack(some)), jnp.ones((len(some), count), bool))
 
 
 def _window(num_placed: int, images: SampledImages, num_window: int) -> tuple[NDArray[np.intp], SampledImages]:
@@ -127,7 +125,7 @@ def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
 @jax.jit
 def _explained(T: Float[Array, "m n 4 4"], images: SampledImages, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
     """Computes the explained share of each trajectory."""
-    return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, images.unit, tolerance), T)
+    return jax.lax.map(lambda one: explained_share(one, images, tolerance), T)
 
 
 def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: DepthSearchConfig) -> NDArray[np.float64]:
