@@ -112,8 +112,6 @@ def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> P
     centre = np.asarray(prior.mean) * [1.0, 1.0, 0.0]
     for limit, fan, middle in ((_GOOD_FITNESS, near, centre), (_POOR_FITNESS, far, 0.0 * centre)):
         rows = np.flatnonzero(rough.fitness < limit)
-        if not len(rows):
-            continue
         belief = PairPrior(prior.mean[rows], prior.information[rows])
         guesses = middle[rows][:, None] + fan
         wide = match_pairs(source.take(rows), target.take(rows), guesses, COARSE, belief, metric=metric)

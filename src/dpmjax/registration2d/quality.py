@@ -24,7 +24,7 @@ import scipy.special
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.pair_search import Hypotheses
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, slide_steps
 
@@ -201,7 +201,7 @@ def view_misfit(scans: PlanarScans, poses: Floats) -> float:
     return 1.0 - float(np.sum(views.matched) / max(float(np.sum(views.visible)), 1.0))
 
 
-def near_pairs(poses: Floats, typical_range: float) -> tuple[Indices, Indices]:
+def near_pairs(poses: Floats, typical_range: float) -> Pairs:
     """Returns pairs (source, target) of each scan and its nearest scans, each pair once."""
     heading = _HEADING_WEIGHT * typical_range * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     count, row = min(_NUM_NEAREST + 1, len(poses)), np.arange(len(poses))

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PairPrior, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence, make_profiles
 
 # Standard deviations of a step of poses of unknown accuracy: typical ranges, radians.
@@ -235,11 +235,7 @@ def weak_directions(scans: PlanarScans) -> Float[np.ndarray, "n 2"]:
 
 
 def slide_steps(
-    profiles: RangeProfiles,
-    steps: Floats,
-    prior: StepPrior | None = None,
-    *,
-    pairs: tuple[Indices, Indices] | None = None,
+    profiles: RangeProfiles, steps: Floats, prior: StepPrior | None = None, *, pairs: Pairs | None = None
 ) -> Slides:
     """Computes the posterior of shifts of steps along the weak directions of their targets.
 
