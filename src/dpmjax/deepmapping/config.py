@@ -115,7 +115,6 @@ LOCALIZE = PhaseConfig(
     final_learning_rate=0.05,
     adam_decay=(0.9, 0.99),
     beams_per_step=128,
-    num_offsets=3,
     max_offset=8,
     scans_per_window=17,
 )
@@ -129,7 +128,6 @@ REFINE = PhaseConfig(
     learning_rate=2.5e-3,
     final_learning_rate=0.02,
     adam_decay=(0.9, 0.99),
-    num_free=1,
     surface_distance=(0.1, 0.004),
 )
 
@@ -224,7 +222,7 @@ JOINT = PhaseConfig(
 
 # Cold start of depth images.
 LOCALIZE_DEPTH = replace(
-    LOCALIZE, num_steps=400, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None
+    LOCALIZE, learning_rate=1e-3, beams_per_step=400, num_offsets=2, max_offset=3, scans_per_window=None
 )
 
 # Free poses of depth images; the decreasing limit of the Chamfer distance removes its bias at low overlap.
@@ -247,7 +245,6 @@ REFINE_DEPTH = replace(
     occupancy_weight=0.1,
     learning_rate=2e-3,
     beams_per_step=200,
-    num_offsets=3,
     max_offset=1 << 30,
     surface_distance=(0.05, 0.01),
     comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
@@ -259,9 +256,7 @@ JOINT_DEPTH = replace(
 )
 
 # Cold start of clouds.
-LOCALIZE_CLOUDS = replace(
-    LOCALIZE, num_steps=300, learning_rate=1e-3, beams_per_step=256, num_offsets=2, max_offset=3, scans_per_window=None
-)
+LOCALIZE_CLOUDS = replace(LOCALIZE_DEPTH, num_steps=300, beams_per_step=256)
 
 # Free poses of clouds, as `UNROLL_DEPTH`.
 UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)
@@ -269,17 +264,13 @@ UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_p
 # Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
 # scans; the distance to the plane between the rings does not.
 REFINE_CLOUDS = replace(
-    REFINE,
+    REFINE_DEPTH,
     name="free poses, planes and map",
     num_steps=300,
-    occupancy_weight=0.1,
-    learning_rate=2e-3,
     final_learning_rate=0.01,
     scans_per_step=64,
     beams_per_step=128,
-    num_offsets=3,
     max_offset=8,
-    surface_distance=(0.05, 0.01),
     comparison=PlaneComparison(width=(0.04, 0.002)),
 )
 

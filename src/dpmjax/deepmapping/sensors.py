@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.cloud_scans import CloudScans, PlaneCloud, misfit_of_pairs, rows_of
+from dpmjax.deepmapping.cloud_scans import CloudScans, misfit_of_pairs, rows_of
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison, ProjectiveComparison
 from dpmjax.deepmapping.objective import (
     Terms,
@@ -36,7 +36,7 @@ from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.nets.mapping import LocalizationNet, init_map_net
 from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
 from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
-from dpmjax.types import ScanSet
+from dpmjax.types import ScanSet, SurfaceElements
 
 SpatialScans = DepthScans | CloudScans
 _ALL = slice(None)
@@ -315,14 +315,14 @@ def _depth_loss(
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
 
 
-def _draw_points(scans: PlaneCloud, count: int, *, key: jax.Array) -> PlaneCloud:
+def _draw_points(scans: SurfaceElements, count: int, *, key: jax.Array) -> SurfaceElements:
     """Draws a random run of the shuffled points of each scan."""
     num_scans, capacity = scans.mask.shape
     if count >= capacity:
         return scans
     first = jax.random.randint(key, (num_scans, 1), 0, capacity)
     rows = (first + jnp.arange(count)) % capacity
-    return PlaneCloud(*(jax.vmap(lambda leaf, row: leaf[row])(leaf, rows) for leaf in scans))
+    return jax.vmap(rows_of)(scans, rows)
 
 
 def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:
@@ -353,7 +353,7 @@ def _cloud_loss(
     clouds = rows_of(scans.planes, seen)
     samples = _draw_points(clouds, phase.beams_per_step, key=point_key)
     own = jnp.arange(len(rows))
-    points = rigid.transform_points(T[own], samples.points[own])
+    points = rigid.transform_points(T[own], samples.positions[own])
     world = WorldBatch(points, T[own, :3, 3], samples.mask[own], length, progress)
     if not isinstance(comparison, PlaneComparison):
         pair_term = chamfer_term(world, offsets, comparison)
