@@ -71,13 +71,10 @@ class Views(NamedTuple):
     Attributes:
         sample: (r, p, 3) points of each image.
         surfaces: (r, 4, h - 1, w - 1) surfaces of `image_surface`.
-        directions: (r, a, 3) axes of the surfaces in the camera frame, the least constrained direction first; a search
-            of motions needs them.
     """
 
     sample: PixelSample
     surfaces: Float[Array, "... 4 r c"]
-    directions: Float[Array, "... a 3"] | None = None
 
 
 class SampledImages(NamedTuple):

@@ -164,6 +164,7 @@ def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]
 def propose_motions(
     T_world_camera: NDArray[np.float64],
     views: Views,
+    directions: Float[Array, "n a 3"],
     camera: SearchCamera,
     config: DepthSearchConfig,
     *,
@@ -174,6 +175,7 @@ def propose_motions(
     Args:
         T_world_camera: (m, 4, 4) poses of the images before the next one.
         views: all images, n > m.
+        directions: axes of the surfaces in the camera frames, the least constrained direction first.
         camera: camera of the images.
         config: settings of the search.
         key: key of the search.
@@ -191,7 +193,7 @@ def propose_motions(
         jnp.asarray(before >= 0, jnp.float32),
         _take(views, rows),
     )
-    found = _search(references, _take(views, scan), camera, key, config=config)
+    found = _search(references, _take(views, scan), directions[scan], camera, key, config=config)
     return np.asarray(found, np.float64)
 
 
@@ -308,7 +310,13 @@ def _slid(T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"]) -> Float[Ar
 
 @partial(jax.jit, static_argnames="config")
 def _search(
-    references: References, view: Views, camera: SearchCamera, key: jax.Array, *, config: DepthSearchConfig
+    references: References,
+    view: Views,
+    directions: Float[Array, "a 3"],
+    camera: SearchCamera,
+    key: jax.Array,
+    *,
+    config: DepthSearchConfig,
 ) -> Float[Array, "k 4 4"]:
     """Searches the best distinct T_last_scan of the image."""
     turn, tilt, far = np.deg2rad(MAX_TURN_DEG), np.deg2rad(_MAX_TILT_DEG), MAX_TRANSLATION
@@ -327,7 +335,7 @@ def _search(
         moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
         T = rigid.compose(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = nearest.scores(T, tolerances[_NUM_ROUNDS - 1])
-    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
+    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT), directions)
     adjusted_at = tolerances[_NUM_ROUNDS:]
     T = _distinct(T, comparison.scores(T, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART)
     for tolerance in adjusted_at:

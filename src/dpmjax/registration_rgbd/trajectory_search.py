@@ -68,7 +68,7 @@ def initialize_depth(
     images = SampledImages(scans, _sample(scans, _NUM_COMPARED, key=sample_key), unit)
     camera = SearchCamera(scans.pinhole, unit)
     views = [
-        Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
+        Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces)
         for k in range(config.num_trajectories + _NUM_TRIES)
     ]
     T = np.eye(4)[None, None]
@@ -78,7 +78,7 @@ def initialize_depth(
         continued = []
         for k, search_key_k in enumerate(jax.random.split(jax.random.fold_in(search_key, scan), num_searches)):
             before = T[k % len(T)]
-            T_last_next = propose_motions(before, views[k], camera, config, key=search_key_k)
+            T_last_next = propose_motions(before, views[k], directions, camera, config, key=search_key_k)
             poses = np.broadcast_to(before, (len(T_last_next), *before.shape))
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
