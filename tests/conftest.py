@@ -35,8 +35,7 @@ PACKAGE = Path(__file__).parents[1] / "src" / "dpmjax"
 ROOMS = {path.stem for path in PACKAGE.iterdir()} - {"__init__", "types", "deepmapping", "registration_rgbd"}
 CHECKED_FILES = (
     *("deepmapping.objective", "deepmapping.localization_training"),
-    *(f"registration_rgbd.{name}" for name in ("motion_search", "pose_adjustment", "projective_consistency")),
-    "registration_rgbd.trajectory_search",
+    *(f"registration_rgbd.{name}" for name in ("motion_search", "projective_consistency", "trajectory_search")),
 )
 jaxtyping.install_import_hook(
     [f"dpmjax.{name}" for name in (*sorted(ROOMS), *CHECKED_FILES)],

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping.cloud_scans import PlaneCloud, find_partners, misfit_of_pairs, plane_misfit, trajectory_misfit
+from dpmjax.deepmapping.cloud_scans import find_partners, misfit_of_pairs, plane_misfit, trajectory_misfit
 from dpmjax.deepmapping.engine import init
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
-from dpmjax.deepmapping.objective import scans_of_step
+from dpmjax.deepmapping.objective import blocks_of_step
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
+from dpmjax.types import SurfaceElements
 from tests.tolerances import ACCUMULATED, ROUNDING
 
 KEY = jax.random.key(0)
@@ -80,27 +81,27 @@ def ate(T: np.ndarray, truth: np.ndarray) -> float:
 def test_misfit_of_a_point_is_the_kernel_of_its_distance_to_the_plane() -> None:
     floor = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-2.0, 3.0)), -1).reshape(-1, 2)
     up = np.tile([0.0, 0.0, 1.0], (25, 1))
-    target = PlaneCloud(
-        jnp.asarray(np.column_stack([floor, np.zeros(25)])), jnp.ones(25, bool), jnp.asarray(up), jnp.ones(25)
+    target = SurfaceElements(
+        jnp.asarray(np.column_stack([floor, np.zeros(25)])), jnp.asarray(up), jnp.ones(25), jnp.ones(25, bool)
     )
-    source = PlaneCloud(jnp.array([[0.3, 0.2, 0.1]]), jnp.ones(1, bool), jnp.array([[0.0, 0.0, 1.0]]), jnp.ones(1))
+    source = SurfaceElements(jnp.array([[0.3, 0.2, 0.1]]), jnp.array([[0.0, 0.0, 1.0]]), jnp.ones(1), jnp.ones(1, bool))
     found = plane_misfit(jnp.eye(4), source, target, 0.2, 1.0)
     np.testing.assert_allclose(found, 0.1**2 / (0.1**2 + 0.2**2), **ROUNDING)
     far = replace_points(source, [[0.3, 0.2, 5.0]])
     np.testing.assert_allclose(plane_misfit(jnp.eye(4), far, target, 0.2, 1.0), 1.0, **ROUNDING)
-    other_side = source._replace(normals=-source.normals)
+    other_side = replace(source, normals=-source.normals)
     np.testing.assert_allclose(plane_misfit(jnp.eye(4), other_side, target, 0.2, 1.0), 1.0, **ROUNDING)
 
 
-def replace_points(cloud: PlaneCloud, points: list[list[float]]) -> PlaneCloud:
-    return cloud._replace(points=jnp.asarray(points))
+def replace_points(cloud: SurfaceElements, points: list[list[float]]) -> SurfaceElements:
+    return replace(cloud, positions=jnp.asarray(points))
 
 
 def test_the_gradient_vanishes_at_the_true_poses_of_exact_planes(truth, scans) -> None:
     # Only points whose neighbourhood lies on one wall have its exact normal.
     exact = replace(scans, flatness=jnp.where(is_exact(scans, truth), scans.flatness, 0.0)).planes
 
-    def misfit(twists: jnp.ndarray, cloud: PlaneCloud) -> jnp.ndarray:
+    def misfit(twists: jnp.ndarray, cloud: SurfaceElements) -> jnp.ndarray:
         T = jnp.asarray(truth, jnp.float32) @ rigid.exp(twists)
         return misfit_of_pairs(T, cloud, cloud, all_pairs(NUM_SCANS), jnp.ones(10, bool), (0.1, scans.spacing))
 
@@ -117,7 +118,7 @@ def is_exact(scans: dm.CloudScans, truth: np.ndarray) -> jnp.ndarray:
 
 def test_no_plane_is_a_misfit_with_a_finite_gradient(scans) -> None:
     empty = replace(scans, mask=jnp.zeros_like(scans.mask)).planes
-    first = PlaneCloud(*(leaf[0] for leaf in empty))
+    first = jax.tree.map(lambda leaf: leaf[0], empty)
     value, gradient = jax.value_and_grad(plane_misfit)(jnp.eye(4), first, first, 0.1, 0.1)
     assert float(value) == 1.0
     assert np.isfinite(np.asarray(gradient)).all()
@@ -169,10 +170,10 @@ def test_long_sets_are_fitted_in_blocks_that_see_every_scan(scans) -> None:
     phase = replace(dm.preset("fast", "clouds").warm_phases[0], scans_per_step=64)
     seen = set()
     for step in range(60):
-        rows, block = map(np.asarray, scans_of_step(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
-        assert len(rows) == 64
-        assert all((np.diff(rows[block == number]) == 1).all() for number in (0, 1))
-        seen |= set(rows.tolist())
+        rows = np.asarray(blocks_of_step(phase, 100, jnp.int32(step), key=jax.random.fold_in(KEY, step)))
+        assert rows.shape == (2, 32)
+        assert (np.diff(rows, axis=1) == 1).all()
+        seen |= set(rows.ravel().tolist())
     assert seen == set(range(100))
 
 

@@ -17,7 +17,14 @@ from dpmjax.deepmapping.problem import MappingData
 from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
-from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, as_depth_scans, fit_pinhole, image_surface
+from dpmjax.registration_rgbd.depth_images import (
+    DepthScans,
+    PixelSample,
+    SampledImages,
+    as_depth_scans,
+    fit_pinhole,
+    image_surface,
+)
 from dpmjax.registration_rgbd.projective_consistency import (
     Agreement,
     explained_share,
@@ -208,7 +215,9 @@ def test_the_truth_is_more_consistent_than_a_walk_with_one_wrong_turn(walk, scan
 def test_a_point_is_explained_once(walk) -> None:
     def share(rows: list[int], T: np.ndarray) -> float:
         scans = as_depth_scans(walk.points[rows], walk.mask[rows])
-        return float(explained_share(jnp.asarray(T, jnp.float32), scans.pixels, scans, 3.0, jnp.float32(0.02)))
+        return float(
+            explained_share(jnp.asarray(T, jnp.float32), SampledImages(scans, scans.pixels, 3.0), jnp.float32(0.02))
+        )
 
     same = np.tile(np.eye(4), (4, 1, 1))
     np.testing.assert_allclose(share([0, 0, 0, 0], same), share([0, 0], same[:2]), **ROUNDING)
@@ -232,7 +241,11 @@ def test_near_points_have_the_leeway_of_farther_ones() -> None:
 
     def share(depth: float, unit: float) -> float:
         scans = as_depth_scans(np.stack([depth * rays] * 2))
-        return float(explained_share(jnp.asarray(moved, jnp.float32), scans.pixels, scans, unit, jnp.float32(0.02)))
+        return float(
+            explained_share(
+                jnp.asarray(moved, jnp.float32), SampledImages(scans, scans.pixels, unit), jnp.float32(0.02)
+            )
+        )
 
     assert share(0.3, unit=0.3) < -5.0
     assert abs(share(0.3, unit=4.0)) < 0.5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges, label_parts
+from dpmjax.pose_graph.graph import Edges, PoseGraph, join_rows, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.joint_alignment import solve_step
 from tests.tolerances import DOUBLE
@@ -85,7 +85,7 @@ def test_a_torn_loop_is_recovered_although_a_fifth_of_the_loops_lie() -> None:
     steps = steps_of(true)
     drifted = steps._replace(measurements=steps.measurements + np.array([0.0, 0.0, np.radians(1.0)]))
     start = se2.compose(true[:1], se2.chain(drifted.measurements))
-    graph = PoseGraph.create(start, join_edges(drifted, loops._replace(measurements=lies)))
+    graph = PoseGraph.create(start, join_rows(drifted, loops._replace(measurements=lies)))
     solved = optimize_pose_graph(graph, ROBUST, trust=np.repeat([30.0, 1.0], [39, len(source)]))
     found, weight = solved.graph.poses, solved.weights
     before = np.hypot(*(start - true)[:, :2].T).max()

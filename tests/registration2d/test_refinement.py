@@ -13,7 +13,7 @@ from dpmjax.registration2d import LoopConfig, RefinementConfig, correct_by_loops
 from dpmjax.registration2d.joint_alignment import choose_pairs
 from dpmjax.registration2d.loop_closure import LoopResult, count_support, find_candidates
 from dpmjax.registration2d.planar_scans import rounded_up
-from dpmjax.registration2d.step_prior import StepPrior
+from dpmjax.registration2d.steps import StepPrior
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -96,7 +96,7 @@ def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
     poses = np.concatenate([out, out[::-1] + np.array([0.0, 1.0, 0.0])])
     unit = walk_scans.typical_range
     config = RefinementConfig(radius=40.0 / unit)
-    source, target = choose_pairs(walk_scans, poses, config)
+    source, target = choose_pairs(walk_scans, poses, config.radius)
     temporal = {(s, t) for s, t in zip(source, target, strict=True) if 1 <= s - t <= 3}
     assert len(temporal) == 59 + 58 + 57
     assert (5, 54) in set(zip(source.tolist(), target.tolist(), strict=True))
@@ -104,7 +104,7 @@ def test_pairs_are_neighbours_in_time_and_of_other_visits(walk_scans) -> None:
     assert np.hypot(*(poses[source[away]] - poses[target[away]])[:, :2].T).max() <= 40.0
     # Of many visits eight are enough, and of each of them one scan.
     laps = np.concatenate([(out, out[::-1])[lap % 2] + np.array([0.0, lap, 0.0]) for lap in range(12)])
-    source, target = choose_pairs(walk_scans, laps, config)
+    source, target = choose_pairs(walk_scans, laps, config.radius)
     away = np.abs(source - target) > 3
     assert (np.bincount(source[away], minlength=len(laps)) == 8).all()
     for row in range(len(laps)):

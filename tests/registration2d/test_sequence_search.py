@@ -15,7 +15,7 @@ from dpmjax.registration2d.planar_scans import PlanarScans
 from dpmjax.registration2d.range_profiles import make_profiles, pair_scores, weak_steps
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_search import align_arcs
-from dpmjax.registration2d.step_prior import MotionPrior
+from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.simulation import make_world, scan_world, simulate_sequence
 
 NUM_SCANS, METRES_A_PX = 24, 0.05

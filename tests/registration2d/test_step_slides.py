@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d import PlanarScans, assess_trajectory, incremental_icp, planar_scans, refine
-from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, restore_torn
+from dpmjax.registration2d import (
+    PlanarScans,
+    RefinementConfig,
+    assess_trajectory,
+    incremental_icp,
+    planar_scans,
+    refine,
+)
+from dpmjax.registration2d.joint_alignment import restore_torn
 from dpmjax.registration2d.odometry import calibrate_odometry
 from dpmjax.registration2d.range_profiles import make_profiles
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_slides import slide_steps
+from dpmjax.registration2d.steps import StepPrior, slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 
 # A scan reaches the end rooms from none of the scans 8 to 15.
@@ -132,12 +138,12 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
 
 
 def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
-    profiles, config = make_profiles(scans), JointAlignmentConfig()
+    profiles, radius = make_profiles(scans), RefinementConfig().radius
     prior = StepPrior.of_poses(truth, scans.typical_range)
-    assert restore_torn(profiles, steps_of(truth), truth, config, prior) is None
+    assert restore_torn(profiles, steps_of(truth), truth, radius, prior) is None
     torn = truth.copy()
     torn[3] += [25.0, -20.0, 0.3]
-    found = restore_torn(profiles, steps_of(truth), torn, config, prior)
+    found = restore_torn(profiles, steps_of(truth), torn, radius, prior)
     assert found is not None
     off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0
@@ -149,7 +155,7 @@ def test_a_lost_step_is_put_back_and_not_slid(scans, truth) -> None:
     torn[10, 2] += 0.025
     prior = StepPrior(steps, np.full((NUM_SCANS - 1, 3), [2.0, 2.0, 0.01]))
     poses = np.asarray(se2.compose(truth[0], se2.chain(torn)))
-    found = restore_torn(make_profiles(scans), steps, poses, JointAlignmentConfig(), prior)
+    found = restore_torn(make_profiles(scans), steps, poses, RefinementConfig().radius, prior)
     np.testing.assert_allclose(steps_of(found)[10], steps[10], atol=1e-3)
 
 

@@ -22,15 +22,14 @@ from dpmjax.registration_rgbd import (
     projective_consistency,
     trajectory_search,
 )
-from dpmjax.registration_rgbd.depth_images import PixelSample, SampledImages
+from dpmjax.registration_rgbd.depth_images import PixelSample, SampledImages, Views
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     SearchCamera,
-    Views,
     propose_motions,
     surface_directions,
 )
-from dpmjax.registration_rgbd.pose_adjustment import adjust_poses
+from dpmjax.registration_rgbd.projective_consistency import adjust_poses
 from dpmjax.registration_rgbd.trajectory_search import _best_that_differ, _explained, _window
 from tests.tolerances import ROUNDING
 
@@ -156,9 +155,9 @@ def test_an_image_of_one_wall_is_slid_along_it_first() -> None:
 @pytest.mark.slow
 def test_what_a_wall_leaves_open_is_proposed_side_by_side() -> None:
     scans = two_views_of_a_wall()
-    views = Views(scans.pixels, scans.surfaces, jnp.asarray(surface_directions(scans, "planar")))
+    views, directions = Views(scans.pixels, scans.surfaces), jnp.asarray(surface_directions(scans, "planar"))
     config = DepthSearchConfig(num_candidates=256, num_varied=8)
-    T = propose_motions(np.eye(4)[None], views, SearchCamera(scans.pinhole, 2.0), config, key=KEY)
+    T = propose_motions(np.eye(4)[None], views, directions, SearchCamera(scans.pinhole, 2.0), config, key=KEY)
     assert T.shape == (16, 4, 4)
     np.testing.assert_allclose(T[:, :3, 3] @ ACROSS, 0.0, atol=0.005)
     np.testing.assert_allclose(T[:, 0, 2], 0.0, atol=0.005)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import flax.struct
 import jax
@@ -17,7 +16,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.scans import SurfaceConfig, scan_surface
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.types import AnyArray
+from dpmjax.types import SurfaceElements
 
 # In typical ranges: nearest and farthest point, side of the voxels, and reach of the neighbours for the normals.
 _NEAREST, _FARTHEST, _VOXEL, _NEIGHBOURS = 0.03, 3.0, 0.01, 0.1
@@ -32,15 +31,6 @@ _REACH_WIDTHS, _REACH_SPACINGS = 5.0, 2.0
 _MIN_COSINE = 0.3
 # Trajectories are compared by pairs of scans at these distances in time, and by this number of points of each scan.
 _COMPARED_OFFSETS, _COMPARED_POINTS = (1, 2, 4, 8), 512
-
-
-class PlaneCloud(NamedTuple):
-    """Points of one scan with their planes, or of several with a leading axis; as in CloudScans."""
-
-    points: Float[AnyArray, "... c 3"]
-    mask: Bool[AnyArray, "... c"]
-    normals: Float[AnyArray, "... c 3"]
-    flatness: Float[AnyArray, "... c"]
 
 
 @flax.struct.dataclass
@@ -64,20 +54,17 @@ class CloudScans:
     partners: Int[Array, "n p"]
 
     @property
-    def planes(self) -> PlaneCloud:
-        """Points of all scans with their planes."""
-        return PlaneCloud(self.points, self.mask, self.normals, self.flatness)
+    def planes(self) -> SurfaceElements:
+        """Points of all scans with their planes, in the unit of the points."""
+        return SurfaceElements(self.points, self.normals, self.flatness, self.mask)
 
 
-def as_cloud_scans(
-    scans: Sequence[ArrayLike], num_points: int = 2048, *, on_scan: Callable[[], object] | None = None
-) -> CloudScans:
+def as_cloud_scans(scans: Sequence[ArrayLike], num_points: int = 2048) -> CloudScans:
     """Thins lidar scans evenly, and estimates the plane around each point from the denser scan.
 
     Args:
         scans: (m_i, 3) points in the lidar frames, any unit, any number; points that are not finite are left out.
         num_points: capacity of each scan.
-        on_scan: called after each scan.
 
     Returns:
         The scans, in the unit of the points, without partners.
@@ -93,15 +80,12 @@ def as_cloud_scans(
         min_range_m=_NEAREST * unit, max_range_m=_FARTHEST * unit, voxel_size_m=_VOXEL * unit,
         num_neighbours=_NUM_NEIGHBOURS, neighbour_radius_m=_NEIGHBOURS * unit,
     )  # fmt: skip
-    rows = []
-    for number, cloud in enumerate(clouds):
-        rows.append(_thinned(cloud, number, config, num_points))
-        if on_scan is not None:
-            on_scan()
-    points, mask, normals, flatness = (jnp.asarray(np.stack(field)) for field in zip(*rows, strict=True))
+    rows = [_thinned(cloud, number, config, num_points) for number, cloud in enumerate(clouds)]
+    planes = jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *rows)
     partners = jnp.full((len(scans), _NUM_PARTNERS), -1, jnp.int32)
-    spacing = np.median([_spacing(np.asarray(row.points)[np.asarray(row.mask)]) for row in rows])
-    return CloudScans(points, mask, normals, flatness, jnp.asarray(spacing, jnp.float32), partners)
+    spacing = np.median([_spacing(np.asarray(row.positions)[np.asarray(row.mask)]) for row in rows])
+    fields = planes.positions, planes.mask, planes.normals, planes.planarity
+    return CloudScans(*fields, jnp.asarray(spacing, jnp.float32), partners)
 
 
 def _checked(scan: ArrayLike, number: int) -> NDArray[np.float32]:
@@ -114,8 +98,8 @@ def _checked(scan: ArrayLike, number: int) -> NDArray[np.float32]:
     return points
 
 
-def _thinned(cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int) -> PlaneCloud:
-    """Computes points, normals, flatness and mask of one scan."""
+def _thinned(cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num_points: int) -> SurfaceElements:
+    """Returns the evenly thinned points of one scan with their planes, in random order."""
     surface = scan_surface(cloud, config)
     if not len(surface.points):
         raise ValueError(f"scans: scan {number} has no point near the ranges of the others; leave it out")
@@ -126,7 +110,7 @@ def _thinned(cloud: NDArray[np.float32], number: int, config: SurfaceConfig, num
     flatness = np.pad(surface.flatness[rows], (0, missing)).astype(np.float32)
     # The two sides of a wall are different surfaces, so normals point to the lidar.
     normals[np.sum(normals * points, axis=1) > 0.0] *= -1.0
-    return PlaneCloud(points, np.arange(num_points) < len(rows), normals, flatness)
+    return SurfaceElements(points, normals, flatness, np.arange(num_points) < len(rows))
 
 
 def _spacing(points: NDArray[np.float32]) -> float:
@@ -177,22 +161,22 @@ def find_partners(T: NDArray[np.floating], unit: float) -> Int[Array, "n p"]:
     return jnp.asarray(partners)
 
 
-def rows_of(cloud: PlaneCloud, rows: Int[Array, " m"]) -> PlaneCloud:
+def rows_of(planes: SurfaceElements, rows: Int[Array, " m"]) -> SurfaceElements:
     """Returns the scans of these rows."""
-    return PlaneCloud(*(leaf[rows] for leaf in cloud))
+    return jax.tree.map(lambda leaf: leaf[rows], planes)
 
 
 def plane_misfit(
     T_target_source: Float[Array, "4 4"],
-    source: PlaneCloud,
-    target: PlaneCloud,
+    source: SurfaceElements,
+    target: SurfaceElements,
     width: Float[Array, ""] | float,
     spacing: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """Computes the soft share of the source's planes that match no plane of the target: 0 if all match, 1 if none.
 
     A point at the distance r from the plane through the nearest point of the target has the misfit r^2 / (r^2 +
-    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Weights are the flatness of the points.
+    width^2) (Geman and McClure 1985). The misfit is 1 without such a plane. Weights are the planarity of the points.
 
     Args:
         T_target_source: transform of source points into the frame of the target.
@@ -204,18 +188,18 @@ def plane_misfit(
     Returns:
         The misfit; 1 where the source has no plane. The choice of the nearest plane has no derivative.
     """
-    moved = rigid.transform_points(T_target_source, source.points)
+    moved = rigid.transform_points(T_target_source, source.positions)
     reach = jnp.maximum(_REACH_WIDTHS * width, _REACH_SPACINGS * spacing)
-    near = k_nearest(jax.lax.stop_gradient(moved), target.points, 1, target.mask)
+    near = k_nearest(jax.lax.stop_gradient(moved), target.positions, 1, target.mask)
     nearest = near.indices[:, 0]
     is_paired = source.mask & near.mask[:, 0] & (near.squared_distances[:, 0] <= reach**2)
     normals = target.normals[nearest]
-    gap = jnp.where(is_paired, jnp.sum((moved - target.points[nearest]) * normals, axis=-1), 0.0)
+    gap = jnp.where(is_paired, jnp.sum((moved - target.positions[nearest]) * normals, axis=-1), 0.0)
     turned = jnp.einsum("ij,pj->pi", T_target_source[:3, :3], source.normals, precision=jax.lax.Precision.HIGHEST)
     cosines = jnp.sum(turned * normals, axis=-1)
-    agreement = target.flatness[nearest] * jnp.maximum(cosines - _MIN_COSINE, 0.0) / (1.0 - _MIN_COSINE)
+    agreement = target.planarity[nearest] * jnp.maximum(cosines - _MIN_COSINE, 0.0) / (1.0 - _MIN_COSINE)
     agreement = jax.lax.stop_gradient(jnp.where(is_paired, agreement, 0.0))
-    weights = jnp.where(source.mask, source.flatness, 0.0)
+    weights = jnp.where(source.mask, source.planarity, 0.0)
     total = weights.sum()
     matched = jnp.sum(weights * agreement * width**2 / (width**2 + gap**2))
     return 1.0 - matched / jnp.where(total > 0.0, total, 1.0)
@@ -223,8 +207,8 @@ def plane_misfit(
 
 def misfit_of_pairs(
     T_world_scan: Float[Array, "m 4 4"],
-    samples: PlaneCloud,
-    scans: PlaneCloud,
+    samples: SurfaceElements,
+    scans: SurfaceElements,
     pairs: Int[Array, "p 2"],
     is_pair: Bool[Array, " p"],
     sizes: tuple[Float[Array, ""] | float, Float[Array, ""] | float],

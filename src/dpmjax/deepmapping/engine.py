@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
+from dpmjax.checks import require_count
 from dpmjax.deepmapping.problem import Problem
 
 
@@ -117,8 +118,7 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
     Raises:
         ValueError: there is no start.
     """
-    if num_starts < 1:
-        raise ValueError(f"num_starts: expected at least 1, got {num_starts}")
+    require_count("num_starts", num_starts)
     return _init(problem, data, key if num_starts == 1 else jax.random.split(key, num_starts))
 
 
@@ -217,8 +217,8 @@ def fit(
     *,
     key: jax.Array,
     num_starts: int = 1,
-    on_report: Callable[[Progress], None] | None = None,
-    stop: Callable[[], bool] | None = None,
+    on_report: Callable[[Progress], None] = lambda _progress: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Fit:
     """Runs all phases from a fresh state.
 
@@ -242,8 +242,8 @@ def resume(
     state: FitState,
     data: Any,
     *,
-    on_report: Callable[[Progress], None] | None = None,
-    stop: Callable[[], bool] | None = None,
+    on_report: Callable[[Progress], None] = lambda _progress: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Fit:
     """Runs the remaining phases of a state; a second fit of the same shapes compiles nothing.
 
@@ -260,7 +260,7 @@ def resume(
     total = sum(phase.num_steps for phase in problem.phases)
     run_s = compile_s = 0.0
     report = None
-    while not is_finished(problem, state) and not (stop is not None and stop()):
+    while not is_finished(problem, state) and not stop():
         begun = time.perf_counter()
         state = _enter_phase(problem, state, data)
         # Compiled ahead, so that compile time is counted apart; JAX keeps the program of each phase and number of
@@ -269,9 +269,8 @@ def resume(
         compiled = time.perf_counter()
         state, report = jax.block_until_ready(program(state, data))
         compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled
-        if on_report is not None:
-            share = min(1.0, _scalar(state.step) / total)
-            on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
+        share = min(1.0, _scalar(state.step) / total)
+        on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
     return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
 
 

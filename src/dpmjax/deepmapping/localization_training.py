@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.mapping import Fitted
-from dpmjax.deepmapping.planar_sensor import as_scan_set, choose_beams, localize_scans
 from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
+from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
@@ -224,12 +224,7 @@ def _train(
 
 
 def _draw_training_batch(
-    scans: ScanSet,
-    poses: Float[Array, "n 3"],
-    config: DeepMappingConfig,
-    count: int,
-    *,
-    key: jax.Array,
+    scans: ScanSet, poses: Float[Array, "n 3"], config: DeepMappingConfig, count: int, *, key: jax.Array
 ) -> tuple[ScanSet, Float[Array, "m 3"]]:
     """Draws scans that are turned, shifted and partly masked, and their poses."""
     row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)

@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
-from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Report, fit
-from dpmjax.deepmapping.planar_sensor import PLANAR, as_scan_set
-from dpmjax.deepmapping.presets import preset
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
-from dpmjax.deepmapping.spatial_sensors import CLOUDS, DEPTH
+from dpmjax.deepmapping.sensors import CLOUDS, DEPTH, PLANAR, as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
@@ -274,6 +272,8 @@ def map_picture(
     Returns:
         MapPicture in the frame of `fitted.poses`.
     """
+    from scipy.ndimage import binary_closing
+
     poses = fitted.poses
     world = se2.transform_points(poses, points)
     hits = world[mask]
@@ -292,11 +292,5 @@ def map_picture(
     occupied = jax.jit(lambda params, points: jax.nn.sigmoid(bind_map(params, fitted.config)(points)))
     probability = np.asarray(occupied(fitted.params, centres.astype(np.float32))).reshape(height, width)
     extent = (float(low[0]), float(low[0] + cell * width), float(low[1]), float(low[1] + cell * height))
-    return MapPicture(probability, _close_gaps(explored), extent)
-
-
-def _close_gaps(explored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Marks cells between two neighbouring beams as explored."""
-    from scipy.ndimage import binary_closing
-
-    return binary_closing(explored, iterations=2) | explored
+    # Cells between two neighbouring beams are explored, too.
+    return MapPicture(probability, binary_closing(explored, iterations=2) | explored, extent)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,26 +21,7 @@ from dpmjax.losses import chamfer_distance, occupancy_loss
 _BLOCK = 32
 
 
-def scans_in_block(phase: PhaseConfig, num_scans: int) -> int:
-    """Returns the number of neighbours in time in one block of a step.
-
-    Args:
-        phase: phase of the fit.
-        num_scans: number of scans of the set.
-
-    Returns:
-        Number of scans.
-    """
-    if phase.scans_per_window is not None:
-        return min(num_scans, phase.scans_per_window)
-    if num_scans <= phase.scans_per_step:
-        return num_scans
-    return phase.scans_per_step if phase.is_sampled_as_published else _BLOCK
-
-
-def scans_of_step(
-    phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array
-) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+def blocks_of_step(phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array) -> Int[Array, "w m"]:
     """Selects the scans of a step: all windows, or all scans if they are few, else random blocks of neighbours in time.
 
     Args:
@@ -50,22 +31,20 @@ def scans_of_step(
         key: key of the step.
 
     Returns:
-        Index of each scan in the set, and index of its block.
+        Indices of the scans of each block, neighbours in time.
     """
     if phase.scans_per_window is not None:
-        rows = window_rows(num_scans, phase.scans_per_window)
-        return jnp.asarray(rows.reshape(-1)), jnp.repeat(jnp.arange(len(rows)), rows.shape[1])
-    if num_scans <= phase.scans_per_step:
-        return jnp.arange(num_scans), jnp.zeros(num_scans, jnp.int32)
+        return jnp.asarray(window_rows(num_scans, phase.scans_per_window))
+    count = phase.scans_per_step
+    if num_scans <= count:
+        return jnp.arange(num_scans)[None]
     if phase.is_sampled_as_published:
         # The published order: batches follow each other in time. The last batch overlaps with the one before, so that
         # all have one length and no scan is left out.
-        first = step % -(-num_scans // phase.scans_per_step) * phase.scans_per_step
-        first = jnp.minimum(first, num_scans - phase.scans_per_step)
-        return first + jnp.arange(phase.scans_per_step), jnp.zeros(phase.scans_per_step, jnp.int32)
-    num_blocks = phase.scans_per_step // _BLOCK
-    first = jax.random.randint(key, (num_blocks, 1), 0, num_scans - _BLOCK + 1)
-    return (first + jnp.arange(_BLOCK)).reshape(-1), jnp.repeat(jnp.arange(num_blocks), _BLOCK)
+        first = step % -(-num_scans // count) * count
+        return jnp.minimum(first, num_scans - count) + jnp.arange(count)[None]
+    first = jax.random.randint(key, (count // _BLOCK, 1), 0, num_scans - _BLOCK + 1)
+    return first + jnp.arange(_BLOCK)
 
 
 def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Array, " o"]:
@@ -127,19 +106,6 @@ def join_windows(poses: Float[Array, "w m 3"], num_scans: int) -> Float[Array, "
     return joined[window, np.arange(num_scans) - rows[window, 0]]
 
 
-def in_windows(array: Any, rows: NDArray[np.intp]) -> Any:
-    """Reshapes rows of an array into windows.
-
-    Args:
-        array: (w * m, ...).
-        rows: (w, m) of `window_rows`.
-
-    Returns:
-        (w, m, ...).
-    """
-    return array.reshape(*rows.shape, *array.shape[1:])
-
-
 MapLogits = Callable[[Float[Array, "n d"]], Float[Array, " n"]]
 
 
@@ -150,16 +116,14 @@ class WorldBatch(NamedTuple):
         points: (m, b, d) hits.
         sensors: (m, d) centres of the sensors.
         mask: (m, b) False for beams that measured nothing.
-        rows: (m,) index of each scan in the set; consecutive within a block.
-        block: (m,) index of the block of each scan.
+        block_length: number of neighbours in time in each block of scans.
         progress: progress of the phase, 0 at its start, 1 at its end.
     """
 
     points: Float[Array, "m b d"]
     sensors: Float[Array, "m d"]
     mask: Bool[Array, "m b"]
-    rows: Int[Array, " m"]
-    block: Int[Array, " m"]
+    block_length: int
     progress: Float[Array, ""]
 
 
@@ -189,15 +153,12 @@ def interpolate_log(ends: tuple[float, float], progress: Float[Array, ""]) -> Fl
     return ends[0] * (ends[1] / ends[0]) ** progress
 
 
-def free_factors(
-    world: WorldBatch, phase: PhaseConfig, surface_distance: Float[Array, ""] | None, *, key: jax.Array
-) -> Float[Array, "m b s"]:
+def free_factors(world: WorldBatch, phase: PhaseConfig, *, key: jax.Array) -> Float[Array, "m b s"]:
     """Draws the positions of the free samples on each beam: 0 at the sensor, 1 at the hit.
 
     Args:
         world: the scans.
         phase: phase of the fit.
-        surface_distance: mean distance of one more sample from the hit; None: no such sample.
         key: key of this step.
 
     Returns:
@@ -209,9 +170,10 @@ def free_factors(
         factors = jnp.broadcast_to(jax.random.uniform(uniform_key, shape[2:]), shape)
     else:
         factors = jax.random.uniform(uniform_key, shape)
-    if surface_distance is None:
+    if phase.surface_distance is None:
         return factors
-    distance = surface_distance * jax.random.uniform(surface_key, world.mask.shape, minval=0.5, maxval=1.5)
+    mean_distance = interpolate_log(phase.surface_distance, world.progress)
+    distance = mean_distance * jax.random.uniform(surface_key, world.mask.shape, minval=0.5, maxval=1.5)
     beams = jax.lax.stop_gradient(world.points - world.sensors[:, None])
     ranges = jnp.linalg.norm(jnp.where(world.mask[..., None], beams, 1.0), axis=-1)
     near = jnp.maximum(1.0 - distance / ranges, 0.3)
@@ -254,12 +216,13 @@ def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Compa
     """
     if not isinstance(comparison, ChamferComparison):
         raise ValueError(f"comparison: expected a ChamferComparison of these scans, got {comparison}")
-    num_scans = world.rows.shape[0]
+    num_scans = world.mask.shape[0]
+    own = jnp.arange(num_scans)
     max_distance = None if comparison.limit is None else interpolate_log(comparison.limit, world.progress)
 
     def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
-        later = jnp.minimum(jnp.arange(num_scans) + offset, num_scans - 1)
-        is_pair = (world.rows[later] == world.rows + offset) & (world.block[later] == world.block)
+        later = jnp.minimum(own + offset, num_scans - 1)
+        is_pair = own % world.block_length + offset < world.block_length
         distance = jax.vmap(partial(chamfer_distance, max_distance=max_distance))(
             world.points, world.points[later], world.mask, world.mask[later]
         )

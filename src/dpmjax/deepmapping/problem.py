@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, interpolate_log, occupancy_term
+from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, occupancy_term
 from dpmjax.nets.mapping import make_map_net
 
 # Number of points that an MLP as M-Net evaluates at once: 16 MB for each layer of 512.
@@ -250,9 +250,7 @@ def mapping_loss(
     gamma, loss, occupancy = phase.occupancy_weight, pair_term, jnp.zeros(())
     if gamma > 0.0:
         logits = bind_map(params, config, level_weights(phase, config.occupancy.num_levels, world.progress))
-        distance = None if phase.surface_distance is None else interpolate_log(phase.surface_distance, world.progress)
-        factors = free_factors(world, phase, distance, key=key)
-        occupancy = occupancy_term(world, logits, factors)
+        occupancy = occupancy_term(world, logits, free_factors(world, phase, key=key))
         loss = gamma * occupancy + (1.0 - gamma) * pair_term
         if config.occupancy.kind == "grid":
             squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))

@@ -27,8 +27,8 @@ from dpmjax.deepmapping.localization_training import (
     turn_scan,
 )
 from dpmjax.deepmapping.mapping import Fitted
-from dpmjax.deepmapping.planar_sensor import as_scan_set, choose_beams, localize_scans
 from dpmjax.deepmapping.problem import MapFrame
+from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import is_number, read_lines, refusing, write_atomically
-from dpmjax.pose_graph.chordal import spanning_tree_poses
 from dpmjax.pose_graph.graph import Edges, PoseGraph, is_semidefinite, nearest_semidefinite
+from dpmjax.pose_graph.optimize import spanning_tree_poses
 from dpmjax.sequences import FloatArray, InputError, homogeneous, require
 
 

@@ -16,6 +16,8 @@ from dpmjax.types import AnyArray
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 _OPPOSITE_COSINE = -0.5
+# Largest difference between the times of a scan and of a relation.
+_SAME_TIME_S = 0.005
 
 
 class SegmentError(NamedTuple):
@@ -88,19 +90,16 @@ class RelationErrors(NamedTuple):
 
 
 def relation_errors(
-    relations: Relations,
-    times: Float[np.ndarray, " n"],
-    poses: Float[np.ndarray, "n 3"],
-    *,
-    tolerance_s: float = 0.005,
+    relations: Relations, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 3"]
 ) -> RelationErrors:
     """Compares a trajectory with relations; the benchmark reports the mean of each kind of error.
+
+    A relation is used where scans were taken within 5 ms of its times.
 
     Args:
         relations: relations of the same recording.
         times: times of the scans, seconds, of the same clock.
         poses: x, y, heading of T_world_scan, metres.
-        tolerance_s: largest difference between the times of a scan and of a relation.
 
     Returns:
         The errors.
@@ -116,7 +115,7 @@ def relation_errors(
         after = np.clip(np.searchsorted(times[order], wanted), 1, max(len(times) - 1, 1))
         pair = order[np.minimum(np.stack([after - 1, after]), len(times) - 1)]
         nearest = np.take_along_axis(pair, np.abs(times[pair] - wanted).argmin(axis=0)[None], axis=0)[0]
-        is_used &= np.abs(times[nearest] - wanted) <= tolerance_s
+        is_used &= np.abs(times[nearest] - wanted) <= _SAME_TIME_S
         rows.append(nearest)
     if not is_used.any():
         raise ValueError("relations: expected times of the scans, no relation has both of its scans")

@@ -187,8 +187,7 @@ def point_distance(
     if not is_traced(mask) and not np.asarray(mask).any():
         raise ValueError("mask: expected at least one valid point, got none")
     points = xp.where(mask[..., None], points, 0)
-    if not is_traced(points) and not np.isfinite(points).all():
-        raise ValueError("points: expected finite numbers where mask is True, got NaN or infinity")
+    require_finite("points", points)
     aligned = matmul(align_rigid(estimated[:, :dim, dim], reference[:, :dim, dim]), estimated)
     difference = _transform(aligned, points) - _transform(reference, points)
     return _number(_mean(safe_sqrt((difference**2).sum(axis=-1)), mask))

@@ -14,6 +14,10 @@ from dpmjax.types import AnyArray
 
 # Beams whose range changes faster than this jump between obstacles.
 _STEEPEST = 10.0
+# Half steps of the numeric derivatives of ranges by x and y, half a pixel in a world of pixels, and by the heading.
+_HALF_STEPS = (0.5, 0.5, 1e-3)
+# Number of bins of probabilities.
+_NUM_BINS = 10
 
 
 class Proportion(NamedTuple):
@@ -112,15 +116,12 @@ def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"
     return float(np.mean(errors**2)) if len(errors) else float("nan")
 
 
-def expected_calibration_error(
-    probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"], *, num_bins: int = 10
-) -> float:
-    """Computes the expected calibration error (Naeini et al. 2015).
+def expected_calibration_error(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"]) -> float:
+    """Computes the expected calibration error in ten bins of equal width (Naeini et al. 2015).
 
     Args:
         probability: probability of each event, in [0, 1].
         is_true: outcome of each event.
-        num_bins: number of bins of equal width.
 
     Returns:
         The difference between mean probability and share of true events in a bin, averaged over the events; 0 for a
@@ -129,17 +130,13 @@ def expected_calibration_error(
     probabilities, labels = np.asarray(probability, np.float64), np.asarray(is_true, np.float64)
     if len(labels) == 0:
         return float("nan")
-    bins = np.minimum((probabilities * num_bins).astype(int), num_bins - 1)
-    gaps = np.bincount(bins, probabilities - labels, num_bins)
+    bins = np.minimum((probabilities * _NUM_BINS).astype(int), _NUM_BINS - 1)
+    gaps = np.bincount(bins, probabilities - labels, _NUM_BINS)
     return float(np.abs(gaps).sum() / len(labels))
 
 
 def position_bound(
-    cast_ranges: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    poses: ArrayLike,
-    *,
-    range_noise: float,
-    step: float = 0.5,
+    cast_ranges: Callable[[NDArray[np.float64]], NDArray[np.float64]], poses: ArrayLike, *, range_noise: float
 ) -> Float[np.ndarray, " n"]:
     """Computes the least position error of an unbiased estimate from one scan in a known world (Cramér-Rao bound).
 
@@ -151,13 +148,12 @@ def position_bound(
         cast_ranges: ranges (m, b) of noise-free scans from poses (m, 3) in the world.
         poses: (n, 3) x, y in the unit of the ranges, heading in radians.
         range_noise: standard deviation of the noise of one range.
-        step: half step of the numeric derivative of ranges; in a world of pixels, half a pixel.
 
     Returns:
         (n,) root of the summed variances of x and y; infinite where the scan leaves a direction open.
     """
     at = np.asarray(poses, np.float64).reshape(-1, 3)
-    steps = np.diag([step, step, 1e-3])
+    steps = np.diag(_HALF_STEPS)
     jacobian = np.stack([(cast_ranges(at + d) - cast_ranges(at - d)) / (2.0 * d.sum()) for d in steps], axis=-1)
     # One radian of heading moves the end of a beam by the length of the beam.
     ranges = cast_ranges(at)

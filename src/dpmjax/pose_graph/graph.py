@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+# A record of arrays of equal length.
+Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
 # Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space.
 _TANGENT_SIZE = {(3,): 3, (4, 4): 6}
@@ -34,16 +37,16 @@ class Edges(NamedTuple):
     information: Floats
 
 
-def join_edges(*edges: Edges) -> Edges:
-    """Joins lists of edges into one list.
+def join_rows(*records: Rows) -> Rows:
+    """Joins records of arrays of one type, such as lists of edges, into one record.
 
     Args:
-        *edges: the lists, in the order of the result.
+        *records: the records, in the order of the result.
 
     Returns:
-        All edges.
+        A record with all rows.
     """
-    return Edges(*(np.concatenate(parts) for parts in zip(*edges, strict=True)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *records)
 
 
 def label_parts(size: int, source: NDArray[np.integer], target: NDArray[np.integer]) -> Indices:

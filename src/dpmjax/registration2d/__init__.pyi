@@ -1,5 +1,3 @@
-from .assessment import Assessment as Assessment
-from .assessment import assess_trajectory as assess_trajectory
 from .global_registration import GlobalConfig as GlobalConfig
 from .global_registration import nearest_tour as nearest_tour
 from .global_registration import register_globally as register_globally
@@ -19,7 +17,9 @@ from .pipeline import fit_in_order as fit_in_order
 from .pipeline import register_scans as register_scans
 from .planar_scans import PlanarScans as PlanarScans
 from .planar_scans import planar_scans as planar_scans
+from .quality import Assessment as Assessment
 from .quality import Score as Score
+from .quality import assess_trajectory as assess_trajectory
 from .quality import choose_trajectory as choose_trajectory
 from .recordings import Recording as Recording
 from .recordings import align_between as align_between

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.spatial
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import PoseGraph, join_edges, label_parts
+from dpmjax.pose_graph.graph import PoseGraph, join_rows, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.map_assembly import PoseScorer, agreeing_edges, assemble, settle
@@ -26,11 +25,10 @@ from dpmjax.registration2d.pair_search import (
     CorrelativeConfig,
     Hypotheses,
     chance_level,
-    join_candidates,
     noisy_share,
     search_pairs,
 )
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, spread_evenly
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, spread_evenly
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, weak_steps
 from dpmjax.registration2d.wall_directions import WallDirections
 
@@ -92,11 +90,11 @@ class _Task(NamedTuple):
         """Rows of the scans that are no keyframes."""
         return np.setdiff1d(np.arange(len(self.profiles)), self.keyframes)
 
-    def search(self, source: Indices, target: Indices, turns: NDArray[np.bool_] | None = None) -> Candidates:
+    def search(self, source: Indices, target: Indices, turns: Booleans | None = None) -> Candidates:
         """Returns candidates of pairs."""
         return search_pairs(self.profiles, source, target, self.config.search, turns=turns)
 
-    def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> NDArray[np.bool_]:
+    def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> Booleans:
         """Returns the headings of T_target_source at which the wall directions of both scans agree."""
         return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
 
@@ -135,7 +133,7 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     if len(keyframes) < len(scans):
         key_edges = agreeing_edges(poses, found, profiles)
         poses, more = place_others(task, poses, found, task.search(*_similar_pairs(task)))
-        edges = join_edges(key_edges, agreeing_edges(poses, more, profiles))
+        edges = join_rows(key_edges, agreeing_edges(poses, more, profiles))
         poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
 
@@ -162,34 +160,7 @@ def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
     return np.sort(np.array(chosen, np.int64))
 
 
-def place_in_map(poses: Floats, placed: Indices, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
-    """Places each remaining scan at its hypothesis with the best score against the placed scans.
-
-    Afterwards `settle` revises all poses.
-
-    Args:
-        poses: (n, 3) T_world_scan; those of `placed` are correct.
-        placed: rows.
-        hypotheses: of pairs; each scan that is not placed needs one with a placed scan.
-        scorer: of the map.
-
-    Returns:
-        (n, 3) poses. Scans without any hypothesis stay where `poses` has them.
-    """
-    is_placed = np.zeros(len(poses), bool)
-    is_placed[placed] = True
-    fresh = hypotheses.take(np.flatnonzero(is_placed[hypotheses.target] & ~is_placed[hypotheses.source]))
-    candidates = fresh.world_poses(poses)
-    # Only hypotheses of one scan are compared with each other, so the chance level is not subtracted.
-    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.source, candidates, placed, poses)
-    order = np.argsort(score, kind="stable")
-    poses = poses.copy()
-    # The best one of each scan is written last.
-    poses[fresh.source[order]] = candidates[order]
-    return settle(poses, hypotheses, scorer)
-
-
-def _similar_pairs(task: _Task) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+def _similar_pairs(task: _Task) -> tuple[Indices, Indices, Booleans]:
     """Pairs each other scan with similar keyframes and with near scans, and chooses the turns to try for each pair."""
     others, keyframes = task.others, task.keyframes
     if task.is_ordered:
@@ -217,14 +188,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     Returns:
         (n, 3) poses, and `more` with the candidates of scans that had to be searched again.
     """
-
-    def place(poses: Floats, more: Candidates) -> Floats:
-        candidates = join_candidates(found, more)
-        share = noisy_share(task.profiles, candidates)
-        scorer = PoseScorer(task.profiles, chance_level(found), share, task.is_ordered)
-        return place_in_map(poses, task.keyframes, Hypotheses.of(candidates, 0.0).in_both_directions(), scorer)
-
-    poses = place(poses, more)
+    poses = _place(task, poses, found, more)
     # A scan that overlaps with no keyframe has its neighbours among the remaining scans; so has a keyframe that
     # overlaps with no other keyframe.
     for partners in (task.keyframes, task.others):
@@ -234,9 +198,29 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
         # The likely turns of these scans were wrong, so all turns are tried, with the most similar partners.
         similar = task.walls.most_similar(lost, partners, len(task.keyframes))
         source, target = similar.reshape(-1), np.repeat(lost, similar.shape[1])
-        more = join_candidates(more, task.search(source, target))
-        poses = place(poses, more)
+        more = join_rows(more, task.search(source, target))
+        poses = _place(task, poses, found, more)
     return poses, more
+
+
+def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> Floats:
+    """Places each other scan at its hypothesis with the best score against the keyframes, and revises all poses.
+
+    Scans without any hypothesis stay where `poses` has them.
+    """
+    candidates = join_rows(found, more)
+    scorer = PoseScorer(task.profiles, chance_level(found), noisy_share(task.profiles, candidates), task.is_ordered)
+    hypotheses, keyframes = Hypotheses.of(candidates, 0.0).in_both_directions(), task.keyframes
+    is_fresh = np.isin(hypotheses.target, keyframes) & ~np.isin(hypotheses.source, keyframes)
+    fresh = hypotheses.take(np.flatnonzero(is_fresh))
+    worlds = fresh.world_poses(poses)
+    # Only hypotheses of one scan are compared with each other, so the chance level is not subtracted.
+    score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.source, worlds, keyframes, poses)
+    order = np.argsort(score, kind="stable")
+    poses = poses.copy()
+    # The best one of each scan is written last.
+    poses[fresh.source[order]] = worlds[order]
+    return settle(poses, hypotheses, scorer)
 
 
 def find_unregistered(profiles: RangeProfiles, poses: Floats) -> Indices:

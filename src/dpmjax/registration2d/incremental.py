@@ -10,7 +10,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.sequence_search import search_sequence
-from dpmjax.registration2d.step_prior import StepPrior, usual_motion
+from dpmjax.registration2d.steps import StepPrior, usual_motion
 
 # Residuals as shares of the typical range: of a coarse match, and along a direction that the scans leave unconstrained.
 _COARSE_RESIDUAL = 0.015
@@ -112,8 +112,6 @@ def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> P
     centre = np.asarray(prior.mean) * [1.0, 1.0, 0.0]
     for limit, fan, middle in ((_GOOD_FITNESS, near, centre), (_POOR_FITNESS, far, 0.0 * centre)):
         rows = np.flatnonzero(rough.fitness < limit)
-        if not len(rows):
-            continue
         belief = PairPrior(prior.mean[rows], prior.information[rows])
         guesses = middle[rows][:, None] + fan
         wide = match_pairs(source.take(rows), target.take(rows), guesses, COARSE, belief, metric=metric)

@@ -10,7 +10,6 @@ refinement and not after it. The pose graph is solved again with the previous re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -20,13 +19,12 @@ import scipy.spatial
 from jaxtyping import Array
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, join_edges
+from dpmjax.pose_graph.graph import Edges, join_rows
 from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration2d.pair_alignment import PairSystem, Schedule, linearise_pair
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, rounded_up
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans, rounded_up
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, RangeProfiles, make_profiles, pair_scores
-from dpmjax.registration2d.step_prior import StepPrior, pose_steps, prior_steps
-from dpmjax.registration2d.step_slides import held_steps, slide_steps
+from dpmjax.registration2d.steps import StepPrior, held_steps, pose_steps, prior_steps, slide_steps
 
 # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
@@ -48,24 +46,13 @@ _NUM_SPATIAL = 8
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
-@dataclass(frozen=True)
-class JointAlignmentConfig:
-    """Settings of the joint alignment. Lengths are in typical ranges of the scans.
-
-    Attributes:
-        radius: largest distance of neighbours in space.
-    """
-
-    radius: float = 0.6
-
-
-def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None) -> Floats:
+def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> Floats:
     """Aligns all scans from nearby poses, point to line.
 
     Args:
         scans: n scans.
         poses: (n, 3) initial poses T_world_scan; the first one is fixed.
-        config: settings.
+        radius: largest distance of neighbours in space, typical ranges.
         prior: of the steps of ordered scans; None: no prior.
 
     Returns:
@@ -77,31 +64,29 @@ def align_all(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig, p
     trust = 1e-9 if prior is None else max(scans.noise, 0.00075 * scans.typical_range) ** 2
     for round_number, scale in enumerate(zip(*scales, strict=True)):
         if round_number % _REFRESH == 0:
-            pairs = _choose_aligned(profiles, poses, config, prior)
-            steps = join_edges(expected, pairs.held)
+            pairs = _choose_aligned(profiles, poses, radius, prior)
+            steps = join_rows(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
         edges, gradient = _linearise(scans, pairs, poses, scale)
         held, pull = _linearise_edges(steps, poses)
-        poses = se2.compose(poses, solve_step(len(poses), join_edges(edges, held), np.concatenate([gradient, pull])))
+        poses = se2.compose(poses, solve_step(len(poses), join_rows(edges, held), np.concatenate([gradient, pull])))
     return poses
 
 
-def restore_open(
-    profiles: RangeProfiles, aligned: Floats, adjusted: Floats, config: JointAlignmentConfig, prior: StepPrior
-) -> Floats:
+def restore_open(profiles: RangeProfiles, aligned: Floats, adjusted: Floats, radius: float, prior: StepPrior) -> Floats:
     """Restores relative poses along their unconstrained directions after an adjustment without constraints there.
 
     Args:
         profiles: n scans in time order.
         aligned: (n, 3) poses before the adjustment.
         adjusted: (n, 3) poses after it.
-        config: settings.
+        radius: largest distance of neighbours in space, typical ranges.
         prior: of the steps.
 
     Returns:
         (n, 3) adjusted poses; along the unconstrained directions the relative poses are those of `aligned`.
     """
-    scans, pairs = profiles.scans, _choose_aligned(profiles, aligned, config, prior)
+    scans, pairs = profiles.scans, _choose_aligned(profiles, aligned, radius, prior)
     if not len(pairs.held.source):
         return adjusted
     gates, kernels = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
@@ -109,12 +94,12 @@ def restore_open(
     kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
     # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
-    edges = join_edges(edges, pairs.held._replace(measurements=kept, information=information))
+    edges = join_rows(edges, pairs.held._replace(measurements=kept, information=information))
     return _relax(edges, adjusted, _NUM_OPEN_ROUNDS)
 
 
 def restore_torn(
-    profiles: RangeProfiles, steps: Floats, poses: Floats, config: JointAlignmentConfig, prior: StepPrior
+    profiles: RangeProfiles, steps: Floats, poses: Floats, radius: float, prior: StepPrior
 ) -> Floats | None:
     """Restores torn steps and distributes the difference over the pairs that constrain the map.
 
@@ -122,7 +107,7 @@ def restore_torn(
         profiles: n scans in time order.
         steps: (n - 1, 3) T_scan_next before the refinement.
         poses: (n, 3) T_world_scan after the refinement.
-        config: of the pairs in space.
+        radius: largest distance of neighbours in space, typical ranges.
         prior: of the steps; a step that is torn in `Slides` with this prior is shifted to its mode.
 
     Returns:
@@ -137,15 +122,15 @@ def restore_torn(
         return None
     weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
     restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
-    edges = join_edges(_fitting_pairs(profiles, poses, config), Edges(later, later - 1, restored, weights))
+    edges = join_rows(_fitting_pairs(profiles, poses, radius), Edges(later, later - 1, restored, weights))
     scale = np.diag([1.0, 1.0, profiles.scans.typical_range**2])
     edges = edges._replace(information=edges.information[:, None, None] * scale)
     return _relax(edges, poses, _NUM_TORN_ROUNDS)
 
 
-def _fitting_pairs(profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig) -> Edges:
+def _fitting_pairs(profiles: RangeProfiles, poses: Floats, radius: float) -> Edges:
     """Returns edges of the pairs that fit, without steps; their information is the scores (e,)."""
-    source, target = choose_pairs(profiles.scans, poses, config)
+    source, target = choose_pairs(profiles.scans, poses, radius)
     is_pair = source != target + 1
     source, target = source[is_pair], target[is_pair]
     relative = np.asarray(se2.relative(poses[target], poses[source]))
@@ -184,11 +169,9 @@ class _AlignedPairs(NamedTuple):
     held: Edges
 
 
-def _choose_aligned(
-    profiles: RangeProfiles, poses: Floats, config: JointAlignmentConfig, prior: StepPrior | None
-) -> _AlignedPairs:
+def _choose_aligned(profiles: RangeProfiles, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
-    source, target = choose_pairs(profiles.scans, poses, config)
+    source, target = choose_pairs(profiles.scans, poses, radius)
     if prior is None:
         return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
     slides = slide_steps(profiles, se2.relative(poses[:-1], poses[1:]), prior)
@@ -220,7 +203,7 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
     return solve_blocks(np.stack([edges.target, edges.source], axis=1), blocks, gradients, num_poses)
 
 
-def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig) -> tuple[Indices, Indices]:
+def choose_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Pairs:
     """Returns pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
     num_scans = len(poses)
     temporal = _TEMPORAL if scans.is_ordered else ()
@@ -230,7 +213,7 @@ def choose_pairs(scans: PlanarScans, poses: Floats, config: JointAlignmentConfig
     # Of each visit of a place one scan is enough; without an order every scan is a visit.
     apart, visit = (max(temporal, default=0) + 2, 2) if scans.is_ordered else (0, 0)
     count = min(num_scans, 6 * _NUM_SPATIAL + 2 * apart)
-    nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=config.radius * scans.typical_range)
+    nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=radius * scans.typical_range)
     distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
     for scan in range(num_scans):
         near = rows[scan][np.isfinite(distances[scan])]

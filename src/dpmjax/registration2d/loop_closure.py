@@ -17,12 +17,12 @@ import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, PoseGraph, join_edges
+from dpmjax.pose_graph.graph import Edges, PoseGraph, join_rows
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior, Schedule, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, batches
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans, batches
 from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles, weak_steps
-from dpmjax.registration2d.step_prior import BEAM_DEVIATION, pose_steps
+from dpmjax.registration2d.steps import BEAM_DEVIATION, pose_steps
 
 _SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
 _REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
@@ -98,7 +98,7 @@ def correct_by_loops(
         if not len(loops.source):
             break
         trust = np.append(step_trust, np.ones(len(loops.source)))
-        solved = optimize_pose_graph(PoseGraph.create(poses, join_edges(steps, loops)), ROBUST, trust=trust)
+        solved = optimize_pose_graph(PoseGraph.create(poses, join_rows(steps, loops)), ROBUST, trust=trust)
         poses, weights = solved.graph.poses, solved.weights[len(steps.source) :]
     return LoopResult(poses, loops, weights)
 
@@ -121,7 +121,7 @@ def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
     return jax.tree.map(lambda x: x[is_supported], edges)
 
 
-def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> tuple[Indices, Indices]:
+def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> Pairs:
     """Finds pairs of scans that may overlap: a later one (source) and an earlier one (target)."""
     way, nearby = se2.driven_lengths(poses), 2.0 * _NEARBY * typical_range
     radius = min(_MAX_RADIUS * typical_range, nearby + config.drift * way[-1])

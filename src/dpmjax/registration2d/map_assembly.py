@@ -17,18 +17,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.pair_search import (
-    Candidates,
-    Hypotheses,
-    chance_level,
-    noisy_share,
-)
-from dpmjax.registration2d.planar_scans import Floats, Indices
+from dpmjax.registration2d.pair_search import Candidates, Hypotheses, chance_level, noisy_share
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs
 
 # A pair agrees with a map within this: translation in typical ranges, radians.
@@ -129,7 +123,7 @@ def add_up(scores: Floats) -> Floats:
     return np.where(ordered > 0.0, ordered / np.arange(1, scores.shape[-1] + 1), ordered).sum(axis=-1)
 
 
-def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> NDArray[np.bool_]:
+def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -> Booleans:
     """Returns True where a score exceeds a reference by more than 2 % of the reference's magnitude."""
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
@@ -264,7 +258,7 @@ def move_blocks(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tu
     return poses, num_moved
 
 
-def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
+def weakest_cuts(values: Floats, count: int) -> list[Booleans]:
     """Cuts the maximum spanning tree at each of its weakest edges, and returns the smaller component of each cut.
 
     Args:
@@ -286,7 +280,7 @@ def weakest_cuts(values: Floats, count: int) -> list[NDArray[np.bool_]]:
 
 
 def _better_motion(
-    poses: Floats, block: NDArray[np.bool_], hypotheses: Hypotheses, scorer: PoseScorer, values: Floats
+    poses: Floats, block: Booleans, hypotheses: Hypotheses, scorer: PoseScorer, values: Floats
 ) -> Floats | None:
     """Finds the best motion (3,) of the block in the world, proposed by a pair across the cut; None: none is better."""
     across = np.flatnonzero(block[hypotheses.source] & ~block[hypotheses.target])

@@ -17,8 +17,7 @@ from dpmjax.registration2d.incremental import match_near
 from dpmjax.registration2d.pair_alignment import COARSE, FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import make_profiles
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_slides import slide_steps
+from dpmjax.registration2d.steps import StepPrior, slide_steps
 
 # Score above which a step is clear.
 _CLEAR_SCORE = 0.45

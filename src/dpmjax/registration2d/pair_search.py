@@ -18,7 +18,8 @@ from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.planar_scans import Floats, Indices, Tolerances, batches, rounded_up
+from dpmjax.pose_graph.graph import join_rows
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, Tolerances, batches, rounded_up
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pair, compare_pairs
 
 # The number of pairs of one turn is rounded up to a power of two, at least this, so that few shapes compile; the number
@@ -80,11 +81,6 @@ class Candidates(NamedTuple):
     scores: Floats
 
 
-def join_candidates(*candidates: Candidates) -> Candidates:
-    """Joins candidates of different pairs, with the same number of poses in each pair."""
-    return Candidates(*(np.concatenate(parts) for parts in zip(*candidates, strict=True)))
-
-
 def chance_level(candidates: Candidates) -> float:
     """Estimates the score of a wrong pose of a pair: the median of second candidates, which are mostly wrong."""
     second = candidates.scores[:, 1]
@@ -115,14 +111,9 @@ class Hypotheses(NamedTuple):
         poses, scores = candidates.poses[row, column], candidates.scores[row, column]
         return cls(candidates.source[row], candidates.target[row], poses, scores)
 
-    @classmethod
-    def joined(cls, *hypotheses: Hypotheses) -> Hypotheses:
-        """Joins lists of hypotheses into one list."""
-        return cls(*(np.concatenate(parts) for parts in zip(*hypotheses, strict=True)))
-
     def in_both_directions(self) -> Hypotheses:
         """Returns each hypothesis, then each with its scans exchanged."""
-        return self.joined(self, Hypotheses(self.target, self.source, se2.inverse(self.poses), self.scores))
+        return join_rows(self, Hypotheses(self.target, self.source, se2.inverse(self.poses), self.scores))
 
     def take(self, rows: NDArray[Any]) -> Hypotheses:
         """Returns the hypotheses of these rows, or those where a mask is True."""
@@ -136,7 +127,7 @@ class Hypotheses(NamedTuple):
 @partial(jax.jit, static_argnames="config")
 def _spectra(
     profiles: RangeProfiles, turn: Float[Array, ""], cell: Float[Array, ""], config: CorrelativeConfig
-) -> tuple[Complex[Array, "n g f"], Complex[Array, "n g f"]]:
+) -> Complex[Array, "2 n g f"]:
     """Computes the spectra of the two images of each scan, turned by `turn`, its sensor in the middle."""
     inner = config.num_cells // 2
     axis = (jnp.arange(inner) - inner // 2) * cell
@@ -155,13 +146,12 @@ def _spectra(
     margin = (config.num_cells - inner) // 2
     images = jnp.pad(jnp.stack([hit, evidence]), ((0, 0), (0, 0), (margin, margin), (margin, margin)))
     # One transform of both, because two concurrent transforms deadlock on a CPU (XLA of JAX 0.11).
-    spectra = jnp.fft.rfft2(images)
-    return spectra[0], spectra[1]
+    return jnp.fft.rfft2(images)
 
 
 @partial(jax.jit, static_argnames="config")
 def _search_turn(
-    sources: tuple[Array, Array], targets: tuple[Array, Array], pairs: tuple[Array, Array], *, config: CorrelativeConfig
+    sources: Array, targets: Array, pairs: tuple[Array, Array], *, config: CorrelativeConfig
 ) -> tuple[Float[Array, "p k"], Int[Array, "p k 2"]]:
     """Finds the best scores and shifts (x, y in cells) of pairs of spectra, each from another block of cells."""
     size, block = config.num_cells, config.block
@@ -172,7 +162,7 @@ def _search_turn(
 
     def search(pair: tuple[Array, Array]) -> tuple[Array, Array]:
         i, j = pair
-        spectrum = jnp.conj(sources[0][i]) * targets[1][j] + jnp.conj(sources[1][i]) * targets[0][j]
+        spectrum = jnp.conj(sources[0, i]) * targets[1, j] + jnp.conj(sources[1, i]) * targets[0, j]
         score = jnp.fft.irfft2(spectrum, s=(size, size)) + outside
         score = score.reshape(num_blocks, block, num_blocks, block)
         value, which = jax.lax.top_k(score.max((1, 3)).reshape(-1), config.num_peaks)
@@ -187,12 +177,7 @@ def _search_turn(
 
 
 def search_pairs(
-    profiles: RangeProfiles,
-    source: Indices,
-    target: Indices,
-    config: CorrelativeConfig,
-    *,
-    turns: NDArray[np.bool_] | None = None,
+    profiles: RangeProfiles, source: Indices, target: Indices, config: CorrelativeConfig, turns: Booleans | None = None
 ) -> Candidates:
     """Finds the best-scored relative poses of pairs of scans, without initial poses.
 
@@ -212,12 +197,12 @@ def search_pairs(
         rows = order[start : start + _SEARCH_BATCH]
         tried = None if turns is None else turns[rows]
         found.append(_search_batch(profiles, (source[rows], target[rows]), config, tried))
-    joined, back = join_candidates(*found), np.argsort(order)
+    joined, back = join_rows(*found), np.argsort(order)
     return Candidates(joined.source[back], joined.target[back], joined.poses[back], joined.scores[back])
 
 
 def _search_batch(
-    profiles: RangeProfiles, pairs: tuple[Indices, Indices], config: CorrelativeConfig, turns: NDArray[np.bool_] | None
+    profiles: RangeProfiles, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None
 ) -> Candidates:
     """Finds candidates of one batch of pairs."""
     unit, (source, target) = profiles.scans.typical_range, pairs

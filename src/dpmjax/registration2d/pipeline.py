@@ -19,16 +19,16 @@ from dpmjax.checks import require_one_of, require_positive
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
-from dpmjax.deepmapping.planar_sensor import as_scan_set
+from dpmjax.deepmapping.sensors import as_scan_set
 from dpmjax.geometry import se2
-from dpmjax.registration2d.assessment import Assessment, assess_trajectory
 from dpmjax.registration2d.global_registration import nearest_tour, register_globally
 from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
 from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
-from dpmjax.registration2d.quality import Score, choose_trajectory
+from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, choose_trajectory
 from dpmjax.registration2d.recordings import Recording, choose_scans, take_scans
 from dpmjax.registration2d.refinement import refine
+from dpmjax.registration2d.steps import StepPrior
 from dpmjax.types import ScanSet
 
 StartName = Literal["auto", "odometry", "icp-plane", "icp-point", "global", "zero"]
@@ -86,16 +86,11 @@ class RegistrationConfig:
         require_positive("min_turn", self.min_turn)
 
 
-class _Stage(NamedTuple):
-    """Usual shares of a registration that are done where a stage begins and ends; stages may be left out."""
-
-    begins: float
-    ends: float
-
-
-_MOTION, _CALIBRATION, _START = _Stage(0.0, 0.1), _Stage(0.1, 0.15), _Stage(0.15, 0.3)
-_FIT, _REFINED_START, _REFINED_FIT = _Stage(0.3, 0.45), _Stage(0.45, 0.65), _Stage(0.65, 0.8)
-_CHOICE, _RETRIAL, _BETWEEN = _Stage(0.8, 0.85), _Stage(0.85, 0.95), _Stage(0.95, 1.0)
+# Usual shares of a registration that are done where a stage begins and ends; stages may be left out.
+_Stage = tuple[float, float]
+_MOTION, _CALIBRATION, _START = (0.0, 0.1), (0.1, 0.15), (0.15, 0.3)
+_FIT, _REFINED_START, _REFINED_FIT = (0.3, 0.45), (0.45, 0.65), (0.65, 0.8)
+_CHOICE, _RETRIAL, _BETWEEN = (0.8, 0.85), (0.85, 0.95), (0.95, 1.0)
 
 
 class RegistrationHooks(NamedTuple):
@@ -118,8 +113,9 @@ class RegistrationHooks(NamedTuple):
 
     def report(self, stage: _Stage, name: str, share: float = 0.0) -> None:
         """Reports the share of a stage that is done, and that of the registration."""
+        begins, ends = stage
         self.on_progress(name, share)
-        self.on_share(stage.begins + (stage.ends - stage.begins) * share)
+        self.on_share(begins + (ends - begins) * share)
 
 
 class Candidate(NamedTuple):
@@ -196,29 +192,33 @@ def register_scans(
     """
     config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
     all_scans = as_scan_set(scans)
-    odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, len(all_scans.points))
-    first_poses = _checked_start(start, odometry_poses, len(all_scans.points), config)
-    recording = _choose_scans(all_scans, odometry_poses, first_poses, config, hooks)
+    count = len(all_scans.points)
+    odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, count)
+    kind, given = _checked_start(start, odometry_poses, count, config)
+    recording = _choose_scans(all_scans, odometry_poses, kind, config, hooks)
     lines = planar_scans(take_scans(all_scans, recording.chosen), is_ordered=config.is_ordered)
-    evidence = _find_evidence(lines, first_poses, odometry_poses, recording, hooks)
-    start_name, poses = _start_poses(lines, first_poses, evidence, recording, hooks)
-    warm_start = None if start_name == START_NAMES["zero"] else poses
-    fitted = _fit(recording, warm_start, config, key=key, hooks=hooks)
+    evidence = None
+    # Initial poses from the scans alone, or zero, are no evidence.
+    if given is not None and len(lines) > 1 and config.is_ordered:
+        hooks.report(_CALIBRATION, "calibration of the odometry")
+        evidence = calibrate_odometry(lines, (given if odometry_poses is None else odometry_poses)[recording.chosen])
+    run = _Run(lines, recording, evidence, config, hooks)
+    start_name, poses = _start_poses(run, kind, given)
+    fitted = _fit(run, None if start_name == START_NAMES["zero"] else poses, key=key)
     found = {start_name: poses}
     if fitted.num_steps > 0:
         found[DEEPMAPPING] = fitted.poses
     if config.refine and not hooks.stop():
-        found |= _refined_candidates(lines, found, evidence, hooks)
+        found |= _refined_candidates(run, found)
     hooks.report(_CHOICE, "choice and assessment")
-    kept, scores, assessment = _choose(lines, found, evidence)
+    kept, scores, assessment = _choose(run, found)
     is_doubtful = evidence is not None and not evidence.is_mirrored and not assessment.is_trusted
     if is_doubtful and isinstance(start, str) and start == "auto" and config.refine and not hooks.stop():
-        retrial = "the map from odometry cannot be trusted: registration without it"
-        hooks.report(_RETRIAL, retrial)
-        name = START_NAMES["icp-plane"]
-        first = incremental_icp(lines).poses
-        found[f"{name}, refined"] = refine(lines, first, on_progress=partial(hooks.report, _RETRIAL, retrial)).poses
-        kept, scores, assessment = _choose(lines, found, evidence)
+        report = partial(hooks.report, _RETRIAL, "the map from odometry cannot be trusted: registration without it")
+        report()
+        poses = incremental_icp(lines).poses
+        found[f"{START_NAMES['icp-plane']}, refined"] = refine(lines, poses, on_progress=report).poses
+        kept, scores, assessment = _choose(run, found)
     if recording.motion is not None:
         hooks.report(_BETWEEN, "poses between the registered scans")
     poses = recording.aligned(found[kept])
@@ -229,57 +229,63 @@ def register_scans(
     return RegisteredScans(poses, kept, start_name, candidates, assessment, fitted, recording)
 
 
-def _choose(
-    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None
-) -> tuple[str, dict[str, Score], Assessment]:
+class _Run(NamedTuple):
+    """A registration after the choice of the scans, the input of its stages.
+
+    Attributes:
+        lines: the registered scans.
+        recording: all scans.
+        evidence: calibrated odometry or given poses; None for initial poses from the scans alone.
+        config: settings.
+        hooks: functions that are called.
+    """
+
+    lines: PlanarScans
+    recording: Recording
+    evidence: Odometry | None
+    config: RegistrationConfig
+    hooks: RegistrationHooks
+
+    @property
+    def prior(self) -> StepPrior | None:
+        """Prior of the steps by the evidence."""
+        return None if self.evidence is None else self.evidence.prior
+
+
+def _choose(run: _Run, candidates: dict[str, Floats]) -> tuple[str, dict[str, Score], Assessment]:
     """Returns the name of the best candidate, the scores of all, and the assessment of the best."""
-    prior = None if evidence is None else evidence.prior
+    fault = None if run.evidence is None else run.evidence.fault
+    kept, scores = choose_trajectory(run.lines, candidates, prior=run.prior)
     # Units are corrected; in a mirrored log either the scans or the odometry may be wrong.
-    fault = evidence.fault if evidence is not None and evidence.is_mirrored else None
-    kept, scores = choose_trajectory(scans, candidates, prior=prior)
-    assessment = assess_trajectory(scans, candidates[kept], prior=prior, fault=fault)
-    return kept, scores, assessment if evidence is None else assessment._replace(fault=evidence.fault)
-
-
-def _find_evidence(
-    scans: PlanarScans,
-    start: str | Floats,
-    odometry: Floats | None,
-    recording: Recording,
-    hooks: RegistrationHooks,
-) -> Odometry | None:
-    """Calibrates the odometry, or given initial poses; returns None for initial poses from the scans alone."""
-    given = odometry if isinstance(start, str) else (start if odometry is None else odometry)
-    if given is None or (isinstance(start, str) and start != "odometry") or len(scans) < 2 or not scans.is_ordered:
-        return None
-    hooks.report(_CALIBRATION, "calibration of the odometry")
-    return calibrate_odometry(scans, given[recording.chosen])
+    fatal = fault if run.evidence is not None and run.evidence.is_mirrored else None
+    assessment = assess_trajectory(run.lines, candidates[kept], prior=run.prior, fault=fatal)
+    return kept, scores, assessment._replace(fault=fault)
 
 
 def _checked_start(
     start: StartName | ArrayLike, odometry: Floats | None, count: int, config: RegistrationConfig
-) -> str | Floats:
-    """Returns the name of the initial poses with "auto" resolved, or the given initial poses."""
+) -> tuple[str, Floats | None]:
+    """Returns the name of the initial poses with "auto" resolved, and the given poses or odometry."""
     if not config.is_ordered and odometry is not None:
         raise ValueError("odometry: expected None, because the scans are not ordered")
     if not isinstance(start, str):
-        return se2.as_poses("start", start, count)
+        return GIVEN_POSES, se2.as_poses("start", start, count)
     require_one_of("start", start, get_args(StartName))
     if start == "auto":
         by_order = "icp-plane" if odometry is None else "odometry"
-        return by_order if config.is_ordered else "global"
+        start = by_order if config.is_ordered else "global"
     if start == "odometry" and odometry is None:
         raise ValueError("start: expected a start without odometry, because there is none, got 'odometry'")
     if start != "global" and not config.is_ordered:
         raise ValueError(f"start: expected 'global' or poses, because the scans are not ordered, got {start!r}")
-    return start
+    return start, odometry if start == "odometry" else None
 
 
 def _choose_scans(
-    scans: ScanSet, odometry: Floats | None, start: str | Floats, config: RegistrationConfig, hooks: RegistrationHooks
+    scans: ScanSet, odometry: Floats | None, start: str, config: RegistrationConfig, hooks: RegistrationHooks
 ) -> Recording:
     """Chooses the registered scans by the odometry, or by scan odometry for initial poses from the scans alone."""
-    motion = None if isinstance(start, str) and start in STARTS_FROM_SCANS else odometry
+    motion = None if start in STARTS_FROM_SCANS else odometry
     if not config.is_ordered:
         return Recording(scans, np.arange(len(scans.points)), None, np.arange(len(scans.points)))
     if config.min_distance is None:
@@ -290,21 +296,19 @@ def _choose_scans(
     return choose_scans(scans, motion, config.min_distance, config.min_turn)
 
 
-def _start_poses(
-    scans: PlanarScans, start: str | Floats, evidence: Odometry | None, recording: Recording, hooks: RegistrationHooks
-) -> tuple[str, Floats]:
+def _start_poses(run: _Run, start: str, given: Floats | None) -> tuple[str, Floats]:
     """Returns the name and the values of the initial poses of the registered scans."""
-    if not isinstance(start, str):
-        return GIVEN_POSES, start[recording.chosen]
+    if start == GIVEN_POSES and given is not None:
+        return GIVEN_POSES, given[run.recording.chosen]
     name = START_NAMES[start]
-    hooks.report(_START, f"start: {name}")
+    run.hooks.report(_START, f"start: {name}")
     match start:
         case "global":
-            return name, register_globally(scans).poses
+            return name, register_globally(run.lines).poses
         case "icp-plane" | "icp-point":
-            return name, incremental_icp(scans, "plane" if start == "icp-plane" else "point").poses
+            return name, incremental_icp(run.lines, "plane" if start == "icp-plane" else "point").poses
     # Zero poses, and one scan alone, have no odometry.
-    return name, np.zeros((len(scans), 3)) if evidence is None else evidence.poses
+    return name, np.zeros((len(run.lines), 3)) if run.evidence is None else run.evidence.poses
 
 
 def fit_in_order(
@@ -314,7 +318,7 @@ def fit_in_order(
     key: jax.Array,
     start: Floats | None,
     is_ordered: bool,
-    engine_of: EngineOf | None = None,
+    engine_of: EngineOf = lambda _order: fit,
 ) -> Fitted:
     """Fits scans by DeepMapping in an order with near neighbours: that of time, or a tour of the initial poses.
 
@@ -324,8 +328,7 @@ def fit_in_order(
         key: of the fit.
         start: (n, 3) initial x, y, heading; None: cold start, in the given order.
         is_ordered: True where the scans are in the order of time.
-        engine_of: called with the order, rows of the scans; returns the `engine` of `fit_deepmapping`. None:
-            `deepmapping.fit`.
+        engine_of: called with the order, rows of the scans; returns the `engine` of `fit_deepmapping`.
 
     Returns:
         The fit, its poses in the order of the scans.
@@ -335,15 +338,13 @@ def fit_in_order(
     """
     order = np.arange(len(scans.points)) if is_ordered or start is None else nearest_tour(start)
     first_poses = None if start is None else start[order]
-    engine = fit if engine_of is None else engine_of(order)
-    fitted = fit_deepmapping(take_scans(scans, order), config, key=key, start=first_poses, engine=engine)
+    fitted = fit_deepmapping(take_scans(scans, order), config, key=key, start=first_poses, engine=engine_of(order))
     return fitted._replace(poses=fitted.poses[np.argsort(order)])
 
 
-def _fit(
-    recording: Recording, start: Floats | None, config: RegistrationConfig, *, key: jax.Array, hooks: RegistrationHooks
-) -> Fitted:
+def _fit(run: _Run, start: Floats | None, *, key: jax.Array) -> Fitted:
     """Fits the registered scans by the engine of the hooks, or by one that reports to them."""
+    hooks, config, chosen = run.hooks, run.config, run.recording.chosen
     hooks.report(_FIT, DEEPMAPPING)
 
     def report(progress: Progress) -> None:
@@ -351,34 +352,31 @@ def _fit(
 
     def engine_of(order: Indices) -> Engine:
         if hooks.engine is not None:
-            return hooks.engine(recording.chosen[order])
+            return hooks.engine(chosen[order])
         return partial(fit, on_report=report, stop=hooks.stop)
 
-    scans = take_scans(recording.scans, recording.chosen)
+    scans = take_scans(run.recording.scans, chosen)
     return fit_in_order(scans, config.fit, key=key, start=start, is_ordered=config.is_ordered, engine_of=engine_of)
 
 
-def _refined_candidates(
-    scans: PlanarScans, candidates: dict[str, Floats], evidence: Odometry | None, hooks: RegistrationHooks
-) -> dict[str, Floats]:
+def _refined_candidates(run: _Run, candidates: dict[str, Floats]) -> dict[str, Floats]:
     """Returns the refined initial poses and fits, without fits whose map is worse than that of the initial poses.
 
     From good initial poses the fit gives the sharper map. The initial poses keep the motion that odometry has measured.
     """
     (start, start_poses), *fits = candidates.items()
-    prior = None if evidence is None else evidence.prior
     found: dict[str, Floats] = {}
 
     def add_refined(name: str, poses: Floats) -> None:
         stage = _REFINED_START if name == start else _REFINED_FIT
-        report = partial(hooks.report, stage, f"{name}, refined")
+        report = partial(run.hooks.report, stage, f"{name}, refined")
         report(0.0)
-        found[f"{name}, refined"] = refine(scans, poses, prior=prior, on_progress=report).poses
+        found[f"{name}, refined"] = refine(run.lines, poses, prior=run.prior, on_progress=report).poses
 
     if start != START_NAMES["zero"]:
         add_refined(start, start_poses)
     for name, poses in fits:
-        scores = choose_trajectory(scans, {name: poses, **found}, prior=prior)[1]
+        scores = choose_trajectory(run.lines, {name: poses, **found}, prior=run.prior)[1]
         nats = [score.code_length for score in scores.values()]
         if nats[0] <= _LEAST_PROMISING * nats[-1]:
             add_refined(name, poses)

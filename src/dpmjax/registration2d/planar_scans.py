@@ -12,7 +12,6 @@ The noise is estimated from the scans.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -30,6 +29,9 @@ from dpmjax.types import AnyArray, ScanSet
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
+# Rows (p,) of the sources and of the targets of pairs of scans.
+Pairs = tuple[Indices, Indices]
 
 # A run of beams counts as straight if it bends by less than this part of its length (0.03 degrees).
 _BEND = 5e-4
@@ -230,7 +232,7 @@ class _Moments:
     is_complete: Bool[Array, "... b"]
 
 
-def _shift(values: Any, offset: int) -> tuple[Any, NDArray[np.bool_]]:
+def _shift(values: Any, offset: int) -> tuple[Any, Booleans]:
     """Shifts arrays (n, b, ...) so that beam i is beam i + offset; the mask (b,) is True where this is in the scan."""
     moved = jax.tree.map(lambda x: jnp.roll(x, -offset, axis=1), values)
     size = jax.tree.leaves(values)[0].shape[1]
@@ -238,14 +240,12 @@ def _shift(values: Any, offset: int) -> tuple[Any, NDArray[np.bool_]]:
     return moved, (beam >= 0) & (beam < size)
 
 
-def _start_at(run: _Moments, offset: int) -> _Moments:
-    """Returns the runs that start `offset` beams later, incomplete where this is outside the scan."""
-    moved, is_inside = _shift(run, offset)
-    return dataclasses.replace(moved, is_complete=moved.is_complete & is_inside)
+def _join(first: _Moments, second: _Moments, offset: int) -> _Moments:
+    """Joins the moments of disjoint runs, the second ones `offset` beams later; incomplete outside the scan.
 
-
-def _join(first: _Moments, second: _Moments) -> _Moments:
-    """Joins the moments of two disjoint runs; stable, because only the difference of their means enters."""
+    It is stable, because only the difference of the means enters.
+    """
+    second, is_inside = _shift(second, offset)
     count = first.count + second.count
     step = second.mean - first.mean
     spread = (first.count * second.count / count) * step[..., :, None] * step[..., None, :]
@@ -253,17 +253,17 @@ def _join(first: _Moments, second: _Moments) -> _Moments:
         count=count,
         mean=first.mean + step * (second.count / count),
         scatter=first.scatter + second.scatter + spread,
-        is_complete=first.is_complete & second.is_complete,
+        is_complete=first.is_complete & second.is_complete & is_inside,
     )
 
 
 def _runs(scans: ScanSet) -> list[_Moments]:
     """Returns runs of 3, 4, 8, 16 and further powers of two beams, each run joined from two shorter ones."""
     one = _Moments(1.0, scans.points, jnp.zeros((*scans.mask.shape, 2, 2)), scans.mask)
-    two = _join(one, _start_at(one, 1))
-    runs = [_join(two, _start_at(one, 2))]
+    two = _join(one, one, 1)
+    runs = [_join(two, one, 2)]
     for k in range(1, _NUM_DOUBLINGS + 1):
-        two = _join(two, _start_at(two, 2**k))
+        two = _join(two, two, 2**k)
         runs.append(two)
     return runs
 

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, Tolerances, batches
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, Tolerances, batches
 from dpmjax.types import AnyArray
 
 # A bearing is not seen where the two beams around it are farther apart than this many times an even spread.
@@ -254,7 +253,7 @@ def pair_scores(profiles: RangeProfiles, source: Indices, target: Indices, poses
     return agreement / (visible + LEAST_VISIBLE)
 
 
-def weak_steps(profiles: RangeProfiles, poses: Floats, rows: Indices) -> NDArray[np.bool_]:
+def weak_steps(profiles: RangeProfiles, poses: Floats, rows: Indices) -> Booleans:
     """Returns True for each of the k - 1 steps whose scan-match score is below `WEAK_SCORE`."""
     before, after = rows[:-1], rows[1:]
     return pair_scores(profiles, after, before, se2.relative(poses[before], poses[after])) < WEAK_SCORE

@@ -12,12 +12,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from dpmjax.checks import require_positive
 from dpmjax.geometry import rigid, se2
 from dpmjax.registration2d.pair_alignment import FINE, PairPrior, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, PlanarScans, planar_scans
 from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
 from dpmjax.types import ScanSet
 
@@ -218,12 +217,8 @@ def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, 
 
 
 def _align_with(
-    scans: PlanarScans,
-    poses: Floats,
-    pairs: tuple[Indices, Indices],
-    turns: tuple[float, ...],
-    sigma: tuple[float, float],
-) -> tuple[Floats, NDArray[np.bool_]]:
+    scans: PlanarScans, poses: Floats, pairs: Pairs, turns: tuple[float, ...], sigma: tuple[float, float]
+) -> tuple[Floats, Booleans]:
     """Aligns sources with their targets from turns of the expected poses; returns poses, and True where they fit."""
     source, target = pairs
     expected = np.asarray(se2.relative(poses[target], poses[source]))

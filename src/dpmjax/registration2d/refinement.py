@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import as_beams
 from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import incremental_icp
-from dpmjax.registration2d.joint_alignment import JointAlignmentConfig, align_all, restore_open, restore_torn
+from dpmjax.registration2d.joint_alignment import align_all, restore_open, restore_torn
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
@@ -23,8 +23,7 @@ from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
-from dpmjax.registration2d.step_prior import StepPrior
-from dpmjax.registration2d.step_slides import matched_steps, settle_steps
+from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps
 from dpmjax.types import ScanSet
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
@@ -39,13 +38,15 @@ _STEPS_SHARE, _LOOPS_SHARE, _ALIGNED_SHARE = 0.1, 0.4, 0.9
 
 
 @dataclass(frozen=True)
-class RefinementConfig(JointAlignmentConfig):
-    """Settings of the refinement: those of the alignment, and of the loop search.
+class RefinementConfig:
+    """Settings of the refinement.
 
     Attributes:
+        radius: largest distance of neighbours in space, which are aligned, typical ranges.
         loops: settings of the loop search of ordered scans; None: no search.
     """
 
+    radius: float = 0.6
     loops: LoopConfig | None = field(default_factory=LoopConfig)
 
 
@@ -125,7 +126,7 @@ def refine(
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
-        best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config, prior)
+        best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config.radius, prior)
         best = best if prior is None else _put_back(scans, fitting_steps, best, config, prior)
     return Refined(best, num_loops[kept])
 
@@ -134,14 +135,14 @@ def _align(
     scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
 ) -> Floats:
     """Aligns all scans, restores torn steps and aligns again, as long as the code length does not grow."""
-    best = align_all(scans, poses, config, prior)
+    best = align_all(scans, poses, config.radius, prior)
     if prior is None:
         return best
     for _ in range(_NUM_REPAIRS):
-        restored = restore_torn(make_profiles(scans), steps, best, config, prior)
+        restored = restore_torn(make_profiles(scans), steps, best, config.radius, prior)
         if restored is None:
             break
-        again = align_all(scans, restored, config, prior)
+        again = align_all(scans, restored, config.radius, prior)
         if map_code_length(scans, again) > map_code_length(scans, best):
             break
         best = again
@@ -150,7 +151,7 @@ def _align(
 
 def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
     """Restores torn steps, unless the code length of the map grows."""
-    restored = restore_torn(make_profiles(scans), steps, poses, config, prior)
+    restored = restore_torn(make_profiles(scans), steps, poses, config.radius, prior)
     is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
     return restored if restored is not None and is_better else poses
 

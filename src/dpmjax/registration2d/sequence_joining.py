@@ -18,7 +18,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, planar_scans, spread_evenly
 from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores, weak_steps
-from dpmjax.registration2d.step_prior import MotionPrior
+from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Length of the submaps on either side of a weak step along the trajectory, typical ranges, so that both may see the end

@@ -13,12 +13,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
+from dpmjax.pose_graph.graph import join_rows
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
 from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import (
     LEAST_VISIBLE,
     WEAK_SCORE,
@@ -31,7 +31,7 @@ from dpmjax.registration2d.range_profiles import (
 )
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_joining import join_parts
-from dpmjax.registration2d.step_prior import MotionPrior
+from dpmjax.registration2d.steps import MotionPrior
 
 # Turns of a step that are searched, radians for each scan that it spans.
 _MAX_TURN = 1.7
@@ -85,7 +85,7 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
     return interpolate(len(scans), rows[kept], poses[kept])
 
 
-def _is_alone(is_weak: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _is_alone(is_weak: Booleans) -> Booleans:
     """Returns True (k,) for one or two scans between two weak steps."""
     part = np.append(0, np.cumsum(is_weak))
     return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
@@ -122,11 +122,11 @@ def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMat
         for source, target, score in zip(found[-1].source, found[-1].target, found[-1].scores, strict=True):
             across = slice(target, source)
             best[across] = np.maximum(best[across], score)
-    joined = Hypotheses.joined(*found)
+    joined = join_rows(*found)
     return joined.take(np.lexsort((-joined.scores, joined.source)))
 
 
-def _search(scans: PlanarScans, profiles: RangeProfiles, pairs: NDArray[np.int64]) -> Hypotheses:
+def _search(scans: PlanarScans, profiles: RangeProfiles, pairs: Indices) -> Hypotheses:
     """Finds candidates of pairs (p, 2), each aligned by ICP where the score does not fall."""
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(_SEARCH.num_turns) / _SEARCH.num_turns)
@@ -171,7 +171,7 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     shifted = refine_candidates(profiles, near, _SEARCH).poses[:, 0]
     after = pair_scores(profiles, found.source, found.target, shifted)
     is_better = after > found.scores
-    return Hypotheses.joined(found, found._replace(poses=shifted, scores=after).take(is_better))
+    return join_rows(found, found._replace(poses=shifted, scores=after).take(is_better))
 
 
 class _Sequences(NamedTuple):
@@ -184,7 +184,7 @@ class _Sequences(NamedTuple):
     """
 
     poses: Floats
-    is_placed: NDArray[np.bool_]
+    is_placed: Booleans
     scores: Floats
 
 
@@ -204,7 +204,7 @@ class _Beam:
         self.unit = profiles.scans.typical_range
         self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
 
-    def run(self) -> tuple[Floats, NDArray[np.bool_]]:
+    def run(self) -> tuple[Floats, Booleans]:
         """Runs the search over all scans and returns the best sequence: poses (n, 3), and True for registered scans."""
         now = _Sequences(np.zeros((1, 1, 3)), np.ones((1, 1), bool), np.zeros(1))
         for scan in range(1, len(self.profiles)):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
-from numpy.typing import NDArray
 
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
 
@@ -124,7 +123,7 @@ def _spectra(scans: PlanarScans) -> Complex[np.ndarray, "n f"]:
 def _histogram(angles: Floats, weights: Floats) -> Floats:
     """Computes weighted histograms of angles; each angle adds to the two directions next to it."""
     place = np.mod(angles, 2 * np.pi) * (NUM_DIRECTIONS / (2 * np.pi))
-    below: NDArray[np.int64] = np.floor(place).astype(np.int64)
+    below: Indices = np.floor(place).astype(np.int64)
     share, histogram = place - below, np.zeros((len(angles), NUM_DIRECTIONS))
     rows = np.broadcast_to(np.arange(len(angles))[:, None], place.shape)
     np.add.at(histogram, (rows, below % NUM_DIRECTIONS), weights * (1 - share))

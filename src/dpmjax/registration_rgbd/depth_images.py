@@ -65,6 +65,18 @@ class DepthScans:
         return PixelSample(self.points.reshape(count, -1, 3), self.mask.reshape(count, -1))
 
 
+class Views(NamedTuple):
+    """Images that are compared with each other; without the leading axis for one image.
+
+    Attributes:
+        sample: (r, p, 3) points of each image.
+        surfaces: (r, 4, h - 1, w - 1) surfaces of `image_surface`.
+    """
+
+    sample: PixelSample
+    surfaces: Float[Array, "... 4 r c"]
+
+
 class SampledImages(NamedTuple):
     """Depth images with some points of each.
 
@@ -150,10 +162,7 @@ def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhol
 
 
 def surface_gap(
-    T_other_camera: Float[Array, "4 4"],
-    sample: PixelSample,
-    surface_other: Float[Array, "4 r c"],
-    pinhole: Pinhole,
+    T_other_camera: Float[Array, "4 4"], sample: PixelSample, surface_other: Float[Array, "4 r c"], pinhole: Pinhole
 ) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
     """Computes the distances of points in front of the surface of another camera's image.
 

@@ -21,9 +21,14 @@ from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import image_normals
 from dpmjax.geometry.se3 import Motion, motion_matrices
-from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, surface_gap
-from dpmjax.registration_rgbd.pose_adjustment import gap_equations, improve_motions, motion_scales
-from dpmjax.registration_rgbd.projective_consistency import Agreement, both_ways
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, Views, surface_gap
+from dpmjax.registration_rgbd.projective_consistency import (
+    Agreement,
+    both_ways,
+    gap_equations,
+    improve_motions,
+    motion_scales,
+)
 
 # Largest translation between neighbouring images along each axis, metres.
 MAX_TRANSLATION = 0.7
@@ -124,20 +129,6 @@ class SearchCamera(NamedTuple):
     unit: Float[Array, ""] | float
 
 
-class Views(NamedTuple):
-    """Images as inputs of the search; without the leading axis for one image.
-
-    Attributes:
-        sample: (r, p, 3) points of each image.
-        surfaces: (r, 4, h - 1, w - 1) surfaces of `image_surface`.
-        directions: (r, a, 3) axes of the surfaces in the camera frame, the least constrained direction first.
-    """
-
-    sample: PixelSample
-    surfaces: Float[Array, "... 4 r c"]
-    directions: Float[Array, "... a 3"]
-
-
 class References(NamedTuple):
     """Earlier images that an image is compared with, the last one first.
 
@@ -173,6 +164,7 @@ def surface_directions(scans: DepthScans, motion: Motion) -> NDArray[np.float32]
 def propose_motions(
     T_world_camera: NDArray[np.float64],
     views: Views,
+    directions: Float[Array, "n a 3"],
     camera: SearchCamera,
     config: DepthSearchConfig,
     *,
@@ -183,6 +175,7 @@ def propose_motions(
     Args:
         T_world_camera: (m, 4, 4) poses of the images before the next one.
         views: all images, n > m.
+        directions: axes of the surfaces in the camera frames, the least constrained direction first.
         camera: camera of the images.
         config: settings of the search.
         key: key of the search.
@@ -200,7 +193,7 @@ def propose_motions(
         jnp.asarray(before >= 0, jnp.float32),
         _take(views, rows),
     )
-    found = _search(references, _take(views, scan), camera, key, config=config)
+    found = _search(references, _take(views, scan), directions[scan], camera, key, config=config)
     return np.asarray(found, np.float64)
 
 
@@ -228,33 +221,71 @@ def _turn_of(T: Float[Array, "... 4 4"]) -> Float[Array, "..."]:
     return jnp.arccos(jnp.clip(0.5 * (jnp.trace(T[..., :3, :3], axis1=-2, axis2=-1) - 1.0), -1.0, 1.0))
 
 
-def _score_motion(
-    T_last_scan: Float[Array, "4 4"],
-    references: References,
-    view: Views,
-    pinhole: Pinhole,
-    tolerance: Array,
-    config: DepthSearchConfig,
-) -> Float[Array, ""]:
-    """Computes the consistency of an image with its references at a motion, less the cost of the motion."""
+class _Comparison(NamedTuple):
+    """An image, and the earlier images that it is compared with.
 
-    def against(T_last_ref: Array, reference: Views) -> Agreement:
-        T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_scan)
-        samples, surfaces = (view.sample, reference.sample), (view.surfaces, reference.surfaces)
-        return both_ways(T_ref_scan, samples, surfaces, pinhole, tolerance)
+    Attributes:
+        references: earlier images.
+        view: the image.
+        camera: camera of all images.
+        config: settings of the search.
+    """
 
-    agreements = jax.vmap(against)(references.T_last_reference, references.views)
-    agreement = Agreement(*(references.weights * values for values in agreements))
-    length = jnp.linalg.norm(T_last_scan[:3, 3])
-    score = agreement.consistency() - motion_cost(length, _turn_of(T_last_scan), config)
-    return jnp.where(length > _LONGEST * MAX_TRANSLATION, -jnp.inf, score)
+    references: References
+    view: Views
+    camera: SearchCamera
+    config: DepthSearchConfig
+
+    def score(self, T_last_scan: Float[Array, "4 4"], tolerance: Float[Array, ""]) -> Float[Array, ""]:
+        """Computes the consistency of the image with its references at a motion, less the cost of the motion."""
+        references, view = self.references, self.view
+
+        def against(T_last_ref: Array, reference: Views) -> Agreement:
+            T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_scan)
+            return both_ways(T_ref_scan, view, reference, self.camera.pinhole, tolerance)
+
+        agreements = jax.vmap(against)(references.T_last_reference, references.views)
+        agreement = Agreement(*(references.weights * values for values in agreements))
+        length = jnp.linalg.norm(T_last_scan[:3, 3])
+        score = agreement.consistency() - motion_cost(length, _turn_of(T_last_scan), self.config)
+        return jnp.where(length > _LONGEST * MAX_TRANSLATION, -jnp.inf, score)
+
+    def scores(self, T: Float[Array, "m 4 4"], tolerance: Float[Array, ""]) -> Float[Array, " m"]:
+        """Computes the scores of motions, some at a time."""
+        return jax.lax.map(lambda one: self.score(one, tolerance), T, batch_size=128)
+
+    def adjusted(self, T_last_scan: Float[Array, "4 4"], tolerance: Float[Array, ""]) -> Float[Array, "4 4"]:
+        """Adjusts a motion to the distances between points and surfaces of the image and its references."""
+        references, view, pinhole = self.references, self.view, self.camera.pinhole
+        scales = motion_scales(self.config.motion, self.camera.unit, tolerance)
+
+        def gaps(values: Float[Array, " k"], T: Float[Array, "4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+            T_last_moved = rigid.compose(T, motion_matrices((scales * values)[None])[0])
+
+            def against(T_last_ref: Array, reference: Views) -> tuple[Float[Array, " q"], Bool[Array, " q"]]:
+                T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_moved)
+                there = surface_gap(T_ref_scan, view.sample, reference.surfaces, pinhole)
+                back = surface_gap(rigid.inverse(T_ref_scan), reference.sample, view.surfaces, pinhole)
+                return jnp.concatenate([there[0], back[0]]) / tolerance, jnp.concatenate([there[1], back[1]])
+
+            gap, is_visible = jax.vmap(against)(references.T_last_reference, references.views)
+            return gap.ravel(), (is_visible * references.weights[:, None]).ravel()
+
+        def equations(motions: Float[Array, "1 4 4"]) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
+            T, here = rigid.compose(T_last_scan, motions[0]), jnp.zeros(len(scales))
+            gap, weight = gaps(here, T)
+            slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, T)
+            return gap_equations(gap, weight, slopes)
+
+        def score(motions: Float[Array, "1 4 4"]) -> Float[Array, ""]:
+            return self.score(rigid.compose(T_last_scan, motions[0]), tolerance)
+
+        motions = improve_motions(equations, score, scales, count=1, num_iterations=_NUM_ITERATIONS)
+        return rigid.compose(T_last_scan, motions[0])
 
 
 def _distinct(
-    T: Float[Array, "m 4 4"],
-    scores: Float[Array, " m"],
-    count: int,
-    shares: tuple[float, float],
+    T: Float[Array, "m 4 4"], scores: Float[Array, " m"], count: int, shares: tuple[float, float]
 ) -> Float[Array, "k 4 4"]:
     """Selects the best motions that differ by these shares of the largest translation or turn from better ones."""
     far, turn = shares[0] * MAX_TRANSLATION, shares[1] * np.deg2rad(MAX_TURN_DEG)
@@ -277,47 +308,11 @@ def _slid(T: Float[Array, "k 4 4"], directions: Float[Array, "a 3"]) -> Float[Ar
     return jnp.concatenate([T, slid])
 
 
-def _adjusted(
-    T_last_scan: Float[Array, "4 4"],
-    references: References,
-    view: Views,
-    camera: SearchCamera,
-    tolerance: Float[Array, ""],
-    config: DepthSearchConfig,
-) -> Float[Array, "4 4"]:
-    """Adjusts a motion to the distances between points and surfaces of the image and its references."""
-    pinhole = camera.pinhole
-    scales = motion_scales(config.motion, camera.unit, tolerance)
-
-    def gaps(values: Float[Array, " k"], T: Float[Array, "4 4"]) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        T_last_moved = rigid.compose(T, motion_matrices((scales * values)[None])[0])
-
-        def against(T_last_ref: Array, reference: Views) -> tuple[Float[Array, " q"], Bool[Array, " q"]]:
-            T_ref_scan = rigid.compose(rigid.inverse(T_last_ref), T_last_moved)
-            there = surface_gap(T_ref_scan, view.sample, reference.surfaces, pinhole)
-            back = surface_gap(rigid.inverse(T_ref_scan), reference.sample, view.surfaces, pinhole)
-            return jnp.concatenate([there[0], back[0]]) / tolerance, jnp.concatenate([there[1], back[1]])
-
-        gap, is_visible = jax.vmap(against)(references.T_last_reference, references.views)
-        return gap.ravel(), (is_visible * references.weights[:, None]).ravel()
-
-    def equations(motions: Float[Array, "1 4 4"]) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-        T, here = rigid.compose(T_last_scan, motions[0]), jnp.zeros(len(scales))
-        gap, weight = gaps(here, T)
-        slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, T)
-        return gap_equations(gap, weight, slopes)
-
-    def score(motions: Float[Array, "1 4 4"]) -> Float[Array, ""]:
-        return _score_motion(rigid.compose(T_last_scan, motions[0]), references, view, pinhole, tolerance, config)
-
-    motions = improve_motions(equations, score, scales, count=1, num_iterations=_NUM_ITERATIONS)
-    return rigid.compose(T_last_scan, motions[0])
-
-
 @partial(jax.jit, static_argnames="config")
 def _search(
     references: References,
     view: Views,
+    directions: Float[Array, "a 3"],
     camera: SearchCamera,
     key: jax.Array,
     *,
@@ -330,28 +325,19 @@ def _search(
     values = widths * jax.random.uniform(first_key, (config.num_candidates, len(widths)), minval=-1.0, maxval=1.0)
     T = motion_matrices(values.at[0].set(0.0))
     tolerances = jnp.geomspace(*config.scales.tolerance, _NUM_ROUNDS + _NUM_TOLERANCES)
-    nearest = _take(references, slice(_NUM_REFERENCES))
-
-    def scores_of(T: Float[Array, "m 4 4"], compared: References, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
-        return jax.lax.map(
-            lambda one: _score_motion(one, compared, view, camera.pinhole, tolerance, config), T, batch_size=128
-        )
-
+    comparison = _Comparison(references, view, camera, config)
+    nearest = comparison._replace(references=_take(references, slice(_NUM_REFERENCES)))
     for step in range(_NUM_ROUNDS - 1):
-        best = T[jax.lax.top_k(scores_of(T, nearest, tolerances[step]), _NUM_KEPT)[1]]
+        best = T[jax.lax.top_k(nearest.scores(T, tolerances[step]), _NUM_KEPT)[1]]
         noise = jax.random.normal(jax.random.fold_in(round_key, step), (config.num_varied, len(best), len(widths)))
         # The kept motions themselves are candidates of the next round.
         spread = _FIRST_SPREAD * 0.5**step * widths
         moves = motion_matrices((spread * noise.at[0].set(0.0)).reshape(-1, len(widths)))
         T = rigid.compose(best, moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
-    scores = scores_of(T, nearest, tolerances[_NUM_ROUNDS - 1])
-    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
+    scores = nearest.scores(T, tolerances[_NUM_ROUNDS - 1])
+    T = _slid(_distinct(T, scores, _NUM_SLID, _DIFFERENT), directions)
     adjusted_at = tolerances[_NUM_ROUNDS:]
-    T = _distinct(T, scores_of(T, references, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART)
+    T = _distinct(T, comparison.scores(T, adjusted_at[0]), _NUM_ADJUSTED, _SLID_APART)
     for tolerance in adjusted_at:
-
-        def adjust(one: Float[Array, "4 4"], tolerance: Float[Array, ""] = tolerance) -> Float[Array, "4 4"]:
-            return _adjusted(one, references, view, camera, tolerance, config)
-
-        T = jax.lax.map(adjust, T, batch_size=16)
-    return _distinct(T, scores_of(T, references, adjusted_at[-1]), _NUM_DISTINCT, _SLID_APART)
+        T = jax.lax.map(partial(comparison.adjusted, tolerance=tolerance), T, batch_size=16)
+    return _distinct(T, comparison.scores(T, adjusted_at[-1]), _NUM_DISTINCT, _SLID_APART)

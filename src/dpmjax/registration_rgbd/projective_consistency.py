@@ -1,19 +1,27 @@
-"""Projective consistency of depth images at given poses: share of matching pixels less the cost of contradictions.
+"""Projective consistency of depth images at given poses, and adjustment of the poses by it.
+
+The consistency is the share of matching pixels less the cost of contradictions.
 
 Correspondences come from projection instead of a nearest-neighbour search. Two images are compared by one projection in
 each direction. A point is compared with the interpolated surface between the pixels, not with the nearest pixel.
+
+The adjustment is Levenberg-Marquardt on the distances along z of points to the surfaces that they are projected to,
+with a robust weight. A step counts only if it improves the consistency.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import rigid
-from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, surface_gap
+from dpmjax.geometry.se3 import Motion, motion_matrices
+from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, SampledImages, Views, surface_gap
 
 # Cost of a contradiction in matches, and least cost, at coarse tolerances; tolerance up to which the full cost holds.
 # Along a bare wall a wrong pose matches nearly everywhere. At a coarse tolerance inexact poses cause contradictions.
@@ -25,6 +33,11 @@ _CONTRADICTED_POINT, _CLEAR, _NEAR = 20.0, 0.04, 0.25
 # Matches are normalised by the visible points, because normalisation by all points would favour overlap. This share of
 # all points is added to the visible ones, so that matches in a small overlap have a low score.
 _UNSEEN = 0.1
+# Damping as a share of the mean information: initial value, least value, divisor after an accepted step, and factor
+# after a rejected step.
+_DAMPING, _LEAST_DAMPING, _BETTER, _WORSE = 1e-3, 1e-5, 4.0, 8.0
+# Longest step, in tolerances: of the typical range, and radians.
+_LONGEST_STEP = 4.0
 
 
 class Agreement(NamedTuple):
@@ -82,26 +95,22 @@ def _match_and_contradiction(gap: Float[Array, "*n"]) -> tuple[Float[Array, "*n"
 
 
 def both_ways(
-    T_other_camera: Float[Array, "4 4"],
-    samples: tuple[PixelSample, PixelSample],
-    surfaces: tuple[Float[Array, "4 r c"], Float[Array, "4 r c"]],
-    pinhole: Pinhole,
-    tolerance: Float[Array, ""],
+    T_other_camera: Float[Array, "4 4"], view: Views, other: Views, pinhole: Pinhole, tolerance: Float[Array, ""]
 ) -> Agreement:
     """Computes the agreement of a pair of images, in both directions.
 
     Args:
         T_other_camera: motion of points of the first image into the frame of the second camera.
-        samples: points of the first and of the second image.
-        surfaces: `image_surface` of the first and of the second camera.
+        view: the first image.
+        other: the second image.
         pinhole: pinhole of both cameras.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
         The sum of both agreements.
     """
-    there = image_agreement(T_other_camera, samples[0], surfaces[1], pinhole, tolerance)
-    back = image_agreement(rigid.inverse(T_other_camera), samples[1], surfaces[0], pinhole, tolerance)
+    there = image_agreement(T_other_camera, view.sample, other.surfaces, pinhole, tolerance)
+    back = image_agreement(rigid.inverse(T_other_camera), other.sample, view.surfaces, pinhole, tolerance)
     return Agreement(there.total + back.total, there.comparable + back.comparable)
 
 
@@ -133,7 +142,7 @@ def consistency_of_pairs(
         T_other_camera = rigid.compose(rigid.inverse(T_world_camera[other]), T_world_camera)
         others = PixelSample(sample.points[other], sample.mask[other])
         agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
-            T_other_camera, (sample, others), (surfaces, surfaces[other]), scans.pinhole, tolerance
+            T_other_camera, Views(sample, surfaces), Views(others, surfaces[other]), scans.pinhole, tolerance
         )
         # At offset n / 2 the second half of the images repeats the pairs of the first half.
         is_new = (2 * offset != count) | (jnp.arange(count) < offset)
@@ -143,11 +152,7 @@ def consistency_of_pairs(
 
 
 def explained_share(
-    T_world_camera: Float[Array, "n 4 4"],
-    sample: PixelSample,
-    scans: DepthScans,
-    unit: Float[Array, ""] | float,
-    tolerance: Float[Array, ""],
+    T_world_camera: Float[Array, "n 4 4"], images: SampledImages, tolerance: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Computes the share of the points that another image explains, less the cost of contradicted points.
 
@@ -157,14 +162,13 @@ def explained_share(
 
     Args:
         T_world_camera: poses.
-        sample: sampled points of each image.
-        scans: depth images, unit of the poses.
-        unit: typical range of the images, unit of the points.
+        images: depth images, unit of the poses.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:
         -20 to 1.
     """
+    scans, sample, unit = images
     rows, surfaces = jnp.arange(T_world_camera.shape[0]), scans.surfaces
 
     def explain(row: Int[Array, ""]) -> Float[Array, ""]:
@@ -202,3 +206,152 @@ def projective_consistency(
     offsets = jnp.arange(1, scans.mask.shape[0] // 2 + 1)
     T = jnp.asarray(T_world_camera, scans.points.dtype)
     return consistency_of_pairs(T, scans.pixels, scans, offsets, jnp.asarray(tolerance))
+
+
+@partial(jax.jit, static_argnames=("num_iterations", "motion"))
+def adjust_poses(
+    T_world_camera: Float[Array, "n 4 4"],
+    images: SampledImages,
+    tolerance: Float[Array, ""] | float,
+    *,
+    num_iterations: int,
+    motion: Motion,
+) -> Float[Array, "n 4 4"]:
+    """Adjusts poses to the surfaces of all other images, as long as the projective consistency grows.
+
+    Args:
+        T_world_camera: initial poses, with errors of few tolerances.
+        images: depth images, unit of the poses.
+        tolerance: share of the depth; unit of the residuals in `gap_equations`.
+        num_iterations: number of steps.
+        motion: degrees of freedom of the camera.
+
+    Returns:
+        Motions to right-multiply to the poses, T_world_camera @ motion; that of the first image is the identity.
+    """
+    scans, sample, unit = images
+    tolerance, count = jnp.asarray(tolerance), T_world_camera.shape[0]
+    scales, offsets = motion_scales(motion, unit, tolerance), jnp.arange(1, count // 2 + 1)
+    # The first image is fixed.
+    free = slice(len(scales), None)
+
+    def with_first(motions: Float[Array, "m 4 4"]) -> Float[Array, "n 4 4"]:
+        return jnp.concatenate([jnp.eye(4)[None], motions])
+
+    def equations(motions: Float[Array, "m 4 4"]) -> tuple[Float[Array, "mk mk"], Float[Array, " mk"]]:
+        T = rigid.compose(T_world_camera, with_first(motions))
+        matrix, gradient = _normal_equations(T, images, scales, tolerance)
+        return matrix[free, free], gradient[free]
+
+    def score(motions: Float[Array, "m 4 4"]) -> Float[Array, ""]:
+        T = rigid.compose(T_world_camera, with_first(motions))
+        return consistency_of_pairs(T, sample, scans, offsets, tolerance)
+
+    return with_first(improve_motions(equations, score, scales, count=count - 1, num_iterations=num_iterations))
+
+
+def _normal_equations(
+    T: Float[Array, "n 4 4"], images: SampledImages, scales: Float[Array, " k"], tolerance: Float[Array, ""]
+) -> tuple[Float[Array, "nk nk"], Float[Array, " nk"]]:
+    """Computes the normal equations of the residuals of all pairs of images, in both directions."""
+    scans, sample, _ = images
+    count, freedom, surfaces = T.shape[0], len(scales), scans.surfaces
+
+    def gaps(values: Float[Array, "2 k"], pair: Int[Array, "2"]) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
+        camera, other = rigid.compose(T[pair], motion_matrices(scales * values))
+        points = PixelSample(sample.points[pair[0]], sample.mask[pair[0]])
+        T_other_camera = rigid.compose(rigid.inverse(other), camera)
+        gap, is_visible = surface_gap(T_other_camera, points, surfaces[pair[1]], scans.pinhole)
+        return gap / tolerance, is_visible
+
+    def of_pair(pair: Int[Array, "2"]) -> tuple[Float[Array, "2 k 2 k"], Float[Array, "2 k"]]:
+        here = jnp.zeros((2, freedom))
+        gap, is_visible = gaps(here, pair)
+        slopes, _ = jax.jacfwd(gaps, has_aux=True)(here, pair)
+        return gap_equations(gap, is_visible, slopes)
+
+    camera, other = jnp.nonzero(~jnp.eye(count, dtype=bool), size=count * (count - 1))
+    pairs = jnp.stack([camera, other], axis=-1)
+    blocks, slopes = jax.lax.map(of_pair, pairs, batch_size=count)
+    matrix = jnp.zeros((count, freedom, count, freedom))
+    rows, columns = pairs[:, :, None], pairs[:, None, :]
+    matrix = matrix.at[rows, :, columns].add(blocks.transpose(0, 1, 3, 2, 4))
+    gradient = jnp.zeros((count, freedom)).at[pairs].add(slopes)
+    return matrix.reshape(count * freedom, -1), gradient.reshape(-1)
+
+
+class _Progress(NamedTuple):
+    """Current motions, the score of these, and the damping of the next step."""
+
+    motions: Float[Array, "n 4 4"]
+    score: Float[Array, ""]
+    damping: Float[Array, ""]
+
+
+def motion_scales(motion: Motion, unit: Float[Array, ""] | float, tolerance: Float[Array, ""]) -> Float[Array, " k"]:
+    """Returns the unit of each value of a motion in an adjustment: translations in tolerances, angles in radians.
+
+    Args:
+        motion: degrees of freedom of the camera.
+        unit: typical range of the images, unit of the points.
+        tolerance: share of the depth.
+
+    Returns:
+        Three values, or six of a full motion.
+    """
+    return tolerance * (jnp.array([unit] * 2 + [1.0]) if motion == "planar" else jnp.array([unit] * 3 + [1.0] * 3))
+
+
+def gap_equations(
+    gap: Float[Array, " p"], weight: Float[Array, " p"] | Bool[Array, " p"], slopes: Float[Array, "p *k"]
+) -> tuple[Float[Array, "*kk"], Float[Array, "*k"]]:
+    """Computes the Gauss-Newton normal equations of surface residuals with Welsch weights.
+
+    Args:
+        gap: residuals in tolerances; the Welsch weight is 0.6 at 1 and 0.14 at 2.
+        weight: further weight of each residual, 0 for invalid ones.
+        slopes: derivatives of the residuals with respect to each value.
+
+    Returns:
+        The normal equations, (*k, *k) and (*k).
+    """
+    robust = weight * jnp.exp(-0.5 * gap**2)
+    weighted = robust.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes
+    return jnp.tensordot(weighted, slopes, (0, 0)), jnp.tensordot(gap, weighted, (0, 0))
+
+
+def improve_motions(
+    equations: Callable[[Float[Array, "n 4 4"]], tuple[Float[Array, "nk nk"], Float[Array, " nk"]]],
+    score: Callable[[Float[Array, "n 4 4"]], Float[Array, ""]],
+    scales: Float[Array, " k"],
+    *,
+    count: int,
+    num_iterations: int,
+) -> Float[Array, "n 4 4"]:
+    """Optimises motions from zero by Levenberg-Marquardt; a step is accepted only if the score grows.
+
+    Args:
+        equations: normal equations of values in `scales`, applied after given motions.
+        score: score of motions; more is better.
+        scales: unit of each value of a motion.
+        count: number of motions.
+        num_iterations: number of steps.
+
+    Returns:
+        The motions.
+    """
+
+    def iterate(progress: _Progress, _: None) -> tuple[_Progress, None]:
+        matrix, gradient = equations(progress.motions)
+        size = len(gradient)
+        matrix += (progress.damping * jnp.trace(matrix) / size + _LEAST_DAMPING) * jnp.eye(size)
+        values = jnp.linalg.solve(matrix, -gradient).reshape(count, -1)
+        values *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.abs(values).max(), 1e-6))
+        motions = rigid.compose(progress.motions, motion_matrices(scales * values))
+        tried = _Progress(motions, score(motions), jnp.maximum(progress.damping / _BETTER, _LEAST_DAMPING))
+        rejected = progress._replace(damping=progress.damping * _WORSE)
+        return jax.tree.map(partial(jnp.where, tried.score > progress.score), tried, rejected), None
+
+    none = jnp.broadcast_to(jnp.eye(4), (count, 4, 4))
+    start = _Progress(none, score(none), jnp.asarray(_DAMPING))
+    return jax.lax.scan(iterate, start, length=num_iterations)[0].motions

@@ -16,20 +16,18 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.geometry.se3 import Motion
-from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, SampledImages
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample, SampledImages, Views
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     MAX_TURN_DEG,
     DepthSearchConfig,
     SearchCamera,
-    Views,
     depth_search,
     motion_cost,
     propose_motions,
     surface_directions,
 )
-from dpmjax.registration_rgbd.pose_adjustment import adjust_poses
-from dpmjax.registration_rgbd.projective_consistency import explained_share
+from dpmjax.registration_rgbd.projective_consistency import adjust_poses, explained_share
 
 # Least root mean square difference of two trajectories, as shares of the largest translation and of the largest turn.
 _APART = (0.085, 0.075)
@@ -70,7 +68,7 @@ def initialize_depth(
     images = SampledImages(scans, _sample(scans, _NUM_COMPARED, key=sample_key), unit)
     camera = SearchCamera(scans.pinhole, unit)
     views = [
-        Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces, directions)
+        Views(_sample(scans, _NUM_POINTS, key=jax.random.fold_in(sample_key, k)), surfaces)
         for k in range(config.num_trajectories + _NUM_TRIES)
     ]
     T = np.eye(4)[None, None]
@@ -80,7 +78,7 @@ def initialize_depth(
         continued = []
         for k, search_key_k in enumerate(jax.random.split(jax.random.fold_in(search_key, scan), num_searches)):
             before = T[k % len(T)]
-            T_last_next = propose_motions(before, views[k], camera, config, key=search_key_k)
+            T_last_next = propose_motions(before, views[k], directions, camera, config, key=search_key_k)
             poses = np.broadcast_to(before, (len(T_last_next), *before.shape))
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
@@ -96,10 +94,9 @@ def initialize_depth(
 def _sample(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
     """Draws points of each image."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
-    num_scans = scans.mask.shape[0]
-    points, mask = np.asarray(scans.points).reshape(num_scans, -1, 3), np.asarray(scans.mask).reshape(num_scans, -1)
+    points, mask = (np.asarray(values) for values in scans.pixels)
     some = [p[rng.choice(np.flatnonzero(m), count)] for p, m in zip(points, mask, strict=True)]
-    return PixelSample(jnp.asarray(np.stack(some)), jnp.ones((num_scans, count), bool))
+    return PixelSample(jnp.asarray(np.stack(some)), jnp.ones((len(some), count), bool))
 
 
 def _window(num_placed: int, images: SampledImages, num_window: int) -> tuple[NDArray[np.intp], SampledImages]:
@@ -128,7 +125,7 @@ def _turns(T: NDArray[np.float64]) -> NDArray[np.float64]:
 @jax.jit
 def _explained(T: Float[Array, "m n 4 4"], images: SampledImages, tolerance: Float[Array, ""]) -> Float[Array, " m"]:
     """Computes the explained share of each trajectory."""
-    return jax.lax.map(lambda one: explained_share(one, images.sample, images.scans, images.unit, tolerance), T)
+    return jax.lax.map(lambda one: explained_share(one, images, tolerance), T)
 
 
 def _best_that_differ(T: NDArray[np.float64], images: SampledImages, config: DepthSearchConfig) -> NDArray[np.float64]:

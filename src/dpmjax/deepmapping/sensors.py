@@ -1,0 +1,375 @@
+"""The sensors of DeepMapping: their poses, and the losses of their scans (sections 3 and 4.2).
+
+Planar scans have poses x, y, heading, by one L-Net or by one for each window. Depth images and lidar clouds have poses
+T_start @ motion in SE(3). T_start is constant in a phase; the motion is L-Net's output or a free parameter. Images are
+compared by projection, clouds by planes, all sensors also by the Chamfer distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.checks import as_beams
+from dpmjax.deepmapping.cloud_scans import CloudScans, misfit_of_pairs, rows_of
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison, ProjectiveComparison
+from dpmjax.deepmapping.objective import (
+    Terms,
+    WorldBatch,
+    blocks_of_step,
+    chamfer_term,
+    draw_offsets,
+    interpolate_log,
+    join_windows,
+    window_rows,
+)
+from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Sensor, choose_frame, mapping_loss, phases_of
+from dpmjax.geometry import rigid, se2
+from dpmjax.geometry.se3 import motion_matrices
+from dpmjax.nets.mapping import LocalizationNet, init_map_net
+from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
+from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
+from dpmjax.types import ScanSet, SurfaceElements
+
+SpatialScans = DepthScans | CloudScans
+_ALL = slice(None)
+# Number of scans near in space but not in time that each cloud is compared to by planes.
+_NUM_REVISITS = 1
+
+
+def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
+    """Checks scans; beams with coordinates that are not finite, or both zero, are invalid.
+
+    Args:
+        scans: (n, b, 2) in the sensor frames, any unit; or a ScanSet.
+        min_scans: the smallest number of scans.
+
+    Returns:
+        The scans, zeros at invalid beams.
+
+    Raises:
+        ValueError: the shape is not (n, b, 2), there are too few scans, a scan has no valid beam, or a valid beam of a
+            ScanSet is not finite.
+    """
+    beams = as_beams("scans", scans)
+    if beams.points.shape[0] < min_scans:
+        raise ValueError(f"scans: expected at least {min_scans}, got {beams.points.shape[0]}")
+    empty = np.flatnonzero(~np.asarray(beams.mask).any(-1))
+    if len(empty):
+        raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
+    return beams
+
+
+def localize_scans(
+    params: Any, points: Float[Array, "m b 2"], mask: Bool[Array, "m b"], config: DeepMappingConfig
+) -> Float[Array, "m 3"]:
+    """Computes L-Net's outputs for scans.
+
+    Args:
+        params: weights of L-Net.
+        points: points in the sensor frames, in typical ranges, beams thinned as in the fit.
+        mask: False for beams that measured nothing.
+        config: settings of the fit.
+
+    Returns:
+        x, y, heading in typical ranges and radians.
+    """
+    return jax.vmap(LocalizationNet(config.localization).apply, in_axes=(None, 0, 0))(params, points, mask)  # type: ignore[return-value]
+
+
+def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int = 0) -> Int[Array, " c"]:
+    """Selects about `beams_per_step` evenly spaced beams.
+
+    Args:
+        num_beams: number of beams of a scan.
+        phase: phase of the fit.
+        first: offset of the first beam, modulo the spacing.
+
+    Returns:
+        The indices.
+    """
+    stride = max(1, -(-num_beams // phase.beams_per_step))
+    return first % stride + stride * jnp.arange(num_beams // stride)
+
+
+def _planar_init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
+    """Makes initial parameters for planar scans (`Problem.init`); without initial poses the start is zero."""
+    net_key, map_key = jax.random.split(key)
+    scans, phase = data.scans, phases_of(config, data)[0]
+    poses = start = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
+    make_net = partial(LocalizationNet(config.localization).init, points=scans.points[0], mask=scans.mask[0])
+    if phase.scans_per_window is None:
+        localization = make_net(net_key)
+    else:
+        rows = window_rows(len(start), phase.scans_per_window)
+        localization = jax.vmap(make_net)(jax.random.split(net_key, len(rows)))
+        poses = start[rows] if phase.poses == "free" else start
+    return Params(
+        localization=localization,
+        poses=poses,
+        occupancy=init_map_net(config.occupancy, key=map_key),
+        start=start,
+        frame=_planar_frame(config, scans, start),
+    )
+
+
+def _planar_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array, "n 3"]) -> MapFrame:
+    """Computes the square that the scans cover at these poses, with the margin of the map."""
+    if config.occupancy.kind == "mlp":
+        return MapFrame(centre=jnp.zeros(2), half_side=jnp.ones(()))
+    return choose_frame(se2.transform_points(poses, scans.points), scans.mask, config.map_margin)
+
+
+def _planar_next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
+    """Starts the next phase for planar scans (`Problem.next_phase`): poses as estimated, the map frame re-centred."""
+    poses = _planar_poses(config, phase, params, data)
+    return replace(params, poses=poses, frame=_planar_frame(config, data.scans, poses))
+
+
+def _planar_poses(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData
+) -> Float[Array, "n 3"]:
+    """Computes the poses of all planar scans (`Problem.poses`), from the same number of beams as in training."""
+    scans, count = data.scans, data.scans.mask.shape[0]
+    poses = params.poses
+    if phase.poses == "network":
+        rows = np.arange(count)[None] if phase.scans_per_window is None else window_rows(count, phase.scans_per_window)
+        poses = _localize(config, phase, params, _thinned(scans, choose_beams(scans.mask.shape[1], phase)), rows)
+    return poses.reshape(count, 3) if phase.scans_per_window is None else join_windows(poses, count)
+
+
+def _thinned(scans: ScanSet, beams: Int[Array, " c"]) -> ScanSet:
+    """Returns the scans with these beams alone."""
+    return ScanSet(scans.points[:, beams], scans.mask[:, beams])
+
+
+def _localize(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet, rows: Array | NDArray[np.intp]
+) -> Float[Array, "w m 3"]:
+    """Computes the poses of the scans `rows` (w, m) by L-Net, or of all windows by the L-Net of each window."""
+    localize = partial(localize_scans, config=config)
+    if phase.scans_per_window is None:
+        flat = rows.reshape(-1)
+        outputs = localize(params.localization, scans.points[flat], scans.mask[flat]).reshape(*rows.shape, 3)
+    else:
+        outputs = jax.vmap(localize)(params.localization, scans.points[rows], scans.mask[rows])
+    return se2.compose(params.start[rows], outputs)
+
+
+def _planar_loss(
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    data: MappingData,
+    step: Int[Array, ""],
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """Computes eq. 6 of DeepMapping for planar scans (`Problem.loss`): a batch of scans and beams."""
+    scans, progress = data.scans, step / phase.num_steps
+    batch_key, loss_key = jax.random.split(key)
+    beam_key, row_key = jax.random.split(batch_key)
+    num_scans, num_beams = scans.mask.shape
+    some = _thinned(scans, choose_beams(num_beams, phase, jax.random.randint(beam_key, (), 0, num_beams)))
+    rows = blocks_of_step(phase, num_scans, step, key=row_key)
+    if phase.poses == "network":
+        poses = _localize(config, phase, params, some, rows)
+    else:
+        poses = params.poses[rows] if phase.scans_per_window is None else params.poses
+    poses, flat = poses.reshape(-1, 3), rows.reshape(-1)
+    points = se2.transform_points(poses, some.points[flat])
+    world = WorldBatch(points, poses[:, :2], some.mask[flat], rows.shape[1], progress)
+    free_key, offset_key = jax.random.split(loss_key)
+    offsets = draw_offsets(phase, rows.shape[1] - 1, key=offset_key)
+    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)
+
+
+def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
+    """Checks initial poses x, y, heading and scales them from the unit of the points to typical ranges."""
+    return jnp.asarray(se2.as_poses("start", start, num_scans) / [unit, unit, 1.0], jnp.float32)
+
+
+def _planar_unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
+    """Scales poses x, y, heading from typical ranges to the unit of the points."""
+    return np.asarray(poses, np.float64) * [unit, unit, 1.0]
+
+
+# DeepMapping of planar scans; poses are (n, 3) x, y, heading.
+PLANAR = Sensor(_planar_start, _planar_unscaled, _planar_init, _planar_loss, _planar_poses, _planar_next_phase)
+
+
+def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
+    """Checks initial poses and scales them from the unit of the points to typical ranges."""
+    T = np.array(poses, np.float64)
+    if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"start: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
+    T[:, :3, 3] /= unit
+    return jnp.asarray(T, jnp.float32)
+
+
+def _unscaled(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
+    """Scales poses from typical ranges to the unit of the points."""
+    T = np.array(poses, np.float64)
+    T[..., :3, 3] *= unit
+    return T
+
+
+def _net(config: DeepMappingConfig) -> LocalizationNet:
+    return LocalizationNet(config.localization, 3 if config.motion == "planar" else 6)
+
+
+def _motions(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | slice
+) -> Float[Array, "m k"]:
+    if phase.poses == "free":
+        return params.poses[rows]
+    localize = jax.vmap(_net(config).apply, in_axes=(None, 0, 0))
+    return localize(params.localization, scans.points[rows], scans.mask[rows])  # type: ignore[return-value]
+
+
+def _poses(
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    data: MappingData,
+    rows: Int[Array, " m"] | slice = _ALL,
+) -> Float[Array, "m 4 4"]:
+    """Computes the poses of these scans, by default of all (`Problem.poses`): T_start @ motion, in typical ranges."""
+    return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
+
+
+def _choose_frame(config: DeepMappingConfig, scans: SpatialScans, T: Float[Array, "n 4 4"]) -> MapFrame:
+    """Computes the cube that the scans cover at these poses, with the margin of the map."""
+    count = scans.mask.shape[0]
+    world = rigid.transform_points(T, scans.points.reshape(count, -1, 3))
+    return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
+
+
+def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
+    """Makes initial parameters (`Problem.init`); without initial poses all poses are the identity."""
+    net_key, map_key = jax.random.split(key)
+    scans, start = data
+    count, net = scans.mask.shape[0], _net(config)
+    T_start = jnp.tile(jnp.eye(4), (count, 1, 1)) if start is None else start
+    localization: Any = net.init(net_key, scans.points[0], scans.mask[0])
+    params = Params(
+        localization=localization,
+        poses=jnp.zeros((count, net.num_outputs)),
+        occupancy=init_map_net(config.occupancy, key=map_key, num_dimensions=3),
+        start=T_start,
+        frame=_choose_frame(config, scans, T_start),
+    )
+    first = config.cold_phases[0]
+    if first.poses == "free" and start is None:
+        # The paper's direct baseline starts from the output of an untrained L-Net.
+        params = replace(params, poses=_motions(config, replace(first, poses="network"), params, scans, _ALL))
+    return params
+
+
+def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
+    """Starts the next phase (`Problem.next_phase`): poses as estimated, motions zero, the map frame re-centred."""
+    T = _poses(config, phase, params, data)
+    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))
+
+
+def _draw_pixels(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
+    """Draws different pixels from each image, because equal pixels would favour equal rays in the Chamfer distance."""
+    points, mask = scans.pixels
+    num_scans, num_pixels = mask.shape
+    if count >= num_pixels:
+        return scans.pixels
+    keys = jax.random.split(key, num_scans)
+    pixels = jax.vmap(lambda key: jax.random.randint(key, (count,), 0, num_pixels))(keys)
+    points = jnp.take_along_axis(points, pixels[..., None], axis=1)
+    return PixelSample(points, jnp.take_along_axis(mask, pixels, axis=1))
+
+
+def _depth_loss(
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    data: MappingData,
+    step: Int[Array, ""],
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """Computes eq. 6 of DeepMapping for depth images (`Problem.loss`): pixels by the Chamfer distance or projection."""
+    batch_key, loss_key = jax.random.split(key)
+    scans, progress = data.scans, step / phase.num_steps
+    count = scans.mask.shape[0]
+    sample = _draw_pixels(scans, phase.beams_per_step, key=batch_key)
+    T = _poses(config, phase, params, data)
+    world = WorldBatch(rigid.transform_points(T, sample.points), T[:, :3, 3], sample.mask, count, progress)
+    free_key, offset_key = jax.random.split(loss_key)
+    if isinstance(phase.comparison, ProjectiveComparison):
+        tolerance = interpolate_log(phase.comparison.tolerance, progress)
+        offsets = draw_offsets(phase, count // 2, key=offset_key)
+        pair_term = 1.0 - consistency_of_pairs(T, sample, scans, offsets, tolerance)
+    else:
+        pair_term = chamfer_term(world, draw_offsets(phase, count - 1, key=offset_key), phase.comparison)
+    return mapping_loss(config, phase, params, world, pair_term, key=free_key)
+
+
+def _draw_points(scans: SurfaceElements, count: int, *, key: jax.Array) -> SurfaceElements:
+    """Draws a random run of the shuffled points of each scan."""
+    num_scans, capacity = scans.mask.shape
+    if count >= capacity:
+        return scans
+    first = jax.random.randint(key, (num_scans, 1), 0, capacity)
+    rows = (first + jnp.arange(count)) % capacity
+    return jax.vmap(rows_of)(scans, rows)
+
+
+def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:
+    """Draws revisit partners of each scan; -1: none."""
+    columns = jax.random.choice(key, scans.partners.shape[1], (count,), replace=False)
+    return scans.partners[rows][:, columns].T
+
+
+def _cloud_loss(
+    config: DeepMappingConfig,
+    phase: PhaseConfig,
+    params: Params,
+    data: MappingData,
+    step: Int[Array, ""],
+    key: jax.Array,
+) -> tuple[Float[Array, ""], Terms]:
+    """Computes eq. 6 of DeepMapping for lidar clouds (`Problem.loss`): points by planes or the Chamfer distance."""
+    row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
+    scans, progress = data.scans, step / phase.num_steps
+    blocks = blocks_of_step(phase, scans.mask.shape[0], step, key=row_key)
+    rows, length = blocks.reshape(-1), blocks.shape[1]
+    offsets = draw_offsets(phase, length - 1, key=offset_key)
+    comparison = phase.comparison
+    num_revisits = _NUM_REVISITS if isinstance(comparison, PlaneComparison) else 0
+    partners = _draw_partners(scans, rows, num_revisits, key=partner_key)
+    seen = jnp.concatenate([rows, jnp.maximum(partners, 0).reshape(-1)])
+    T = _poses(config, phase, params, data, seen)
+    clouds = rows_of(scans.planes, seen)
+    samples = _draw_points(clouds, phase.beams_per_step, key=point_key)
+    own = jnp.arange(len(rows))
+    points = rigid.transform_points(T[own], samples.positions[own])
+    world = WorldBatch(points, T[own, :3, 3], samples.mask[own], length, progress)
+    if not isinstance(comparison, PlaneComparison):
+        pair_term = chamfer_term(world, offsets, comparison)
+    else:
+        later = jnp.minimum(own + offsets[:, None], len(rows) - 1)
+        is_later = own % length + offsets[:, None] < length
+        others = jnp.concatenate([later.reshape(-1), jnp.arange(len(rows), len(seen))])
+        pairs = jnp.stack([jnp.resize(own, others.shape), others], axis=-1)
+        is_pair = jnp.concatenate([is_later.reshape(-1), partners.reshape(-1) >= 0])
+        width = interpolate_log(comparison.width, progress)
+        pair_term = misfit_of_pairs(T, samples, clouds, pairs, is_pair, (width, scans.spacing))
+    return mapping_loss(config, phase, params, world, pair_term, key=free_key)
+
+
+# DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
+DEPTH = Sensor(_scaled_start, _unscaled, _init, _depth_loss, _poses, _next_phase)
+
+# DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
+CLOUDS = DEPTH._replace(loss=_cloud_loss)
