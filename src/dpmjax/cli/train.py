@@ -45,7 +45,19 @@ SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class ProcessOptions(cli.RunOptions):
+    """Options of a run of several processes."""
+
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
+    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
+    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    """How many processes there are."""
+    process_id: Annotated[int | None, arg(metavar="I")] = None
+    """Which of them this one is, from 0; process 0 alone writes and prints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(ProcessOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
@@ -86,12 +98,6 @@ class Config(cli.RunOptions):
     """Folders of real scans with poses: their recall is drawn beside that of the towns, and chooses nothing."""
     recall_every: Annotated[int, arg(metavar="N")] = 200
     """Measure recall every N steps, and at the end."""
-    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
-    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
-    num_processes: Annotated[int | None, arg(metavar="N")] = None
-    """How many processes there are."""
-    process_id: Annotated[int | None, arg(metavar="I")] = None
-    """Which of them this one is, from 0; process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
