@@ -204,10 +204,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
 
 
 def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> Floats:
-    """Places each other scan at its hypothesis with the best score against the keyframes, and revises all poses.
-
-    Scans without any hypothesis stay where `poses` has them.
-    """
+    """Places each other scan at its hypothesis with the best score against the keyframes, and revises all poses."""
     candidates = join_rows(found, more)
     scorer = PoseScorer(task.profiles, chance_level(found), noisy_share(task.profiles, candidates), task.is_ordered)
     hypotheses, keyframes = Hypotheses.of(candidates, 0.0).in_both_directions(), task.keyframes
@@ -218,7 +215,7 @@ def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> F
     score = scorer._replace(chance=0.0, is_ordered=False).score(fresh.source, worlds, keyframes, poses)
     order = np.argsort(score, kind="stable")
     poses = poses.copy()
-    # The best one of each scan is written last.
+    # The best one of each scan is written last; scans without any hypothesis keep their poses.
     poses[fresh.source[order]] = worlds[order]
     return settle(poses, hypotheses, scorer)
 

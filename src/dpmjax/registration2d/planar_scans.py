@@ -241,10 +241,8 @@ def _shift(values: Any, offset: int) -> tuple[Any, Booleans]:
 
 
 def _join(first: _Moments, second: _Moments, offset: int) -> _Moments:
-    """Joins the moments of disjoint runs, the second ones `offset` beams later; incomplete outside the scan.
-
-    It is stable, because only the difference of the means enters.
-    """
+    """Joins the moments of disjoint runs, the second ones `offset` beams later; incomplete outside the scan."""
+    # Stable, because only the difference of the means enters.
     second, is_inside = _shift(second, offset)
     count = first.count + second.count
     step = second.mean - first.mean

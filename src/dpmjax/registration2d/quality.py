@@ -24,7 +24,7 @@ import scipy.special
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.pair_search import Hypotheses
-from dpmjax.registration2d.planar_scans import Floats, Pairs, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, slide_steps
 
