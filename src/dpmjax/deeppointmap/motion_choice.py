@@ -13,10 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
+from dpmjax.deeppointmap.verification import (
+    EVIDENCE,
+    MeasuredScan,
+    VerificationConfig,
+    compare_scans,
+    verify_motions,
+)
 from dpmjax.geometry import rigid
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
-from dpmjax.scans.view_correlation import correlate_views
+from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
 from dpmjax.types import Pose, Poses, Verification
 
@@ -54,6 +60,9 @@ FACING_CONTRADICTED = 3.0
 FACING_VISIBLE = 0.2
 
 HYPOTHESES_AT_ONCE = 4
+
+# Largest number of motions to other places that look alike, which compete with a clearly right one.
+NUM_LOOKALIKES = 8
 
 # Motions that differ by less end in the same place.
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
@@ -100,6 +109,8 @@ def choose_motion(
         tried += pair.aligned(some, COARSE)
         tried.sort(key=lambda motion: -motion.verification.score)
         if tried[0].verification.score > CLEAR_SCORE:
+            tried += pair.aligned(pair.lookalikes(tried[0].T_target_source), COARSE)
+            tried.sort(key=lambda motion: -motion.verification.score)
             break
     finalists, remaining = pair.aligned(tried[:NUM_FINE], FINE), tried[NUM_FINE:]
     axes = wall_axis(source.surface), wall_axis(target.surface)
@@ -119,7 +130,8 @@ def choose_motion(
     if chosen.row is None:
         agreeing = np.flatnonzero(~_is_apart(hypotheses, T[best]))
         chosen = chosen._replace(row=int(agreeing[0]) if len(agreeing) else None)
-    gap, facing_gap = (float(values[best] - values[is_other].max(initial=0.0)) for values in (scores, facing))
+    gap = float(scores[best] - scores[is_other].max(initial=EVIDENCE.bias))
+    facing_gap = float(facing[best] - facing[is_other].max(initial=0.0))
     found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=num_slid, facing_gap=facing_gap)
     return chosen._replace(verification=found)
 
@@ -147,6 +159,14 @@ class _Pair(NamedTuple):
         for start in range(0, max(len(searched), len(further)), HYPOTHESES_AT_ONCE):
             some = slice(start, start + HYPOTHESES_AT_ONCE)
             yield from filter(None, (searched[some], further[some]))
+
+    def lookalikes(self, T_target_source: Pose) -> list[_Candidate]:
+        """Returns motions under which the scans look like under this one: in equal rooms, and rows of houses."""
+        if self.config.views.num_motions == 0:
+            return []
+        views = ViewCorrelationConfig(NUM_LOOKALIKES)
+        found = correlate_views(self.source.surface, self.target.surface, views, beside=T_target_source)
+        return [_Candidate(None, T) for T in found]
 
     def aligned(
         self, candidates: Sequence[_Candidate | VerifiedMotion], alignment: AlignmentConfig

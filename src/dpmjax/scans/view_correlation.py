@@ -20,8 +20,8 @@ from dpmjax.geometry import rigid
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.types import Pose, Poses
 
-# Two motions are also distinct if they differ by more steps of the turn than this.
-DISTINCT_TURNS = 1.5
+# Two motions are also distinct if they differ by a larger turn than this, radians: one and a half steps.
+DISTINCT_RAD = 1.5 * 2 * np.pi / 60
 
 # Two motions are distinct if they differ by more cells than this.
 DISTINCT_CELLS = 2.0
@@ -68,7 +68,13 @@ class ViewCorrelationConfig:
         require_fields(self, "num_motions", low=0)
 
 
-def correlate_views(source: Surface, target: Surface, config: ViewCorrelationConfig = ViewCorrelationConfig()) -> Poses:
+def correlate_views(
+    source: Surface,
+    target: Surface,
+    config: ViewCorrelationConfig = ViewCorrelationConfig(),
+    *,
+    beside: Pose | None = None,
+) -> Poses:
     """Finds the motions under which two scans look alike from above.
 
     Each scan is first turned until its ground is level; the ground of both then has one height.
@@ -77,6 +83,8 @@ def correlate_views(source: Surface, target: Surface, config: ViewCorrelationCon
         source: surface of a scan.
         target: the second surface.
         config: resolution and extent.
+        beside: T_target_source of which only copies by other shifts, quarter-turns and half-turns are searched; None
+            searches all turns. Rooms, and rows of equal houses, look alike under these.
 
     Returns:
         T_target_source, best first; at most `config.num_motions`, none where a scan has no upright surface.
@@ -86,6 +94,9 @@ def correlate_views(source: Surface, target: Surface, config: ViewCorrelationCon
     levels = T_level_lidar(source), T_level_lidar(target)
     cell_m = CELL_M * _extent_share(source, target)
     turns = np.arange(NUM_TURNS) * (2 * np.pi / NUM_TURNS)
+    if beside is not None:
+        R = levels[1][:3, :3] @ beside[:3, :3] @ levels[0][:3, :3].T
+        turns = np.arctan2(R[1, 0], R[0, 0]) + np.arange(4) * (np.pi / 2)
     images = _images(source, levels[0], turns, cell_m)
     fixed = _images(target, levels[1], np.zeros(1), cell_m)[0]
     fixed = gaussian_filter(fixed, (0, BLUR_CELLS, BLUR_CELLS), mode="wrap")
@@ -171,8 +182,7 @@ def _best_peaks(
     while remaining.any() and len(found) < num_motions:
         k = int(np.argmax(remaining))
         found.append((float(turns[turn[k]]), float(x[k]), float(y[k])))
-        steps = np.abs(turn - turn[k])
-        is_same = np.minimum(steps, len(turns) - steps) <= DISTINCT_TURNS
+        is_same = np.cos(turns[turn] - turns[turn[k]]) >= np.cos(DISTINCT_RAD)
         remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= DISTINCT_CELLS * cell_m))
     return found
 
