@@ -6,6 +6,7 @@ valid entries. Masked entries may hold any finite number and never take part in 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import flax.struct
@@ -141,6 +142,8 @@ class Verification(NamedTuple):
         num_slid: number of further motions along a weak axis; 0 where the walls constrain all directions.
         facing_gap: lead over the best other motion, or over 0, in elements that face the weak axis: those that meet,
             less a penalty of those that contradict. It is 0 where no axis is weak.
+        lookalike_gap: lead of `score` over the best motion to another place where the scans look alike from above;
+            infinite where no such motion was tried.
     """
 
     visible_share: float
@@ -151,6 +154,7 @@ class Verification(NamedTuple):
     num_tried: int = 1
     num_slid: int = 0
     facing_gap: float = 0.0
+    lookalike_gap: float = math.inf
 
 
 @flax.struct.dataclass

@@ -72,6 +72,23 @@ def test_points_that_are_not_there_change_nothing(model, scans) -> None:
         np.testing.assert_array_equal(cloud.features, expected.features)
 
 
+@pytest.mark.parametrize("num", [1, 3, 4, 19])
+def test_a_handful_of_points_has_no_motion(model, scans, num: int) -> None:
+    few = np.random.default_rng(num).uniform(-9, 9, (num, 3)).astype(np.float32)
+    for source, target in ((few, few), (few, scans[0]), (scans[0], np.tile(few[:1], (500, 1)))):
+        match = dpmjax.register(model, source, target)
+        assert match.confidence == 0
+        np.testing.assert_array_equal(match.T_target_source, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "message"), [(True, 1.0, "model: expected one from"), (False, "big", "scale: expected a number")]
+)
+def test_what_is_no_model_or_no_scale_is_named(as_user, model, scans, name, scale, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        dpmjax.register("dpm_small" if name else model, *scans[:2], scale=scale)
+
+
 def test_an_empty_scan_is_a_failure_as_data(model, scans) -> None:
     empty = np.zeros((0, 3), np.float32)
     assert not dpmjax.encode(model, empty).mask.any()

@@ -67,10 +67,10 @@ def test_matrices_and_triples_are_the_same_poses(tmp_path):
 
 def test_nan_points_and_the_mask_are_invalid_beams(tmp_path):
     holed, mask = POINTS.copy(), np.ones((6, NUM_BEAMS), bool)
-    holed[0, 1], mask[1, 2] = np.nan, False
+    holed[0, 1], holed[2, 3], mask[1, 2] = np.nan, 0.0, False
     scans = read_sequence(save(tmp_path, "a.npz", points=holed, mask=mask))
-    assert not scans.mask[[0, 1], [1, 2]].any()
-    assert scans.mask.sum() == 6 * NUM_BEAMS - 2
+    assert not scans.mask[[0, 1, 2], [1, 2, 3]].any()
+    assert scans.mask.sum() == 6 * NUM_BEAMS - 3
     assert (scans.points[~scans.mask] == 0).all()
 
 

@@ -106,6 +106,8 @@ def test_a_line_slides_along_itself_only() -> None:
             {"T_init": np.full((3, 3), np.nan)},
             "T_init: expected finite numbers, got NaN",
         ),
+        (np.ones((5, 2)), np.ones((5, 2)), {"T_init": np.diag([2.0, 2.0, 1.0])}, "T_init: expected a rigid motion"),
+        (np.ones((5, 2)), np.ones((5, 2)), {"T_init": np.diag([1.0, -1.0, 1.0])}, "T_init: expected a rigid motion"),
     ],
 )
 def test_bad_input_is_named(as_user, source, target, options, message) -> None:

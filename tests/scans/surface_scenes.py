@@ -31,22 +31,28 @@ def seen_from(points_world: np.ndarray, T_world_scan: np.ndarray) -> np.ndarray:
     return (points_world - T_world_scan[:3, 3]) @ T_world_scan[:3, :3]
 
 
+def rectangle(
+    rng: np.random.Generator,
+    corner: tuple[float, float, float],
+    first: tuple[float, ...],
+    second: tuple[float, ...],
+    density: float = 60.0,
+) -> np.ndarray:
+    """(n, 3) points of a rectangle with two sides from a corner; `density` is points a square metre."""
+    num = int(density * np.linalg.norm(first) * np.linalg.norm(second))
+    u, v = rng.uniform(0, 1, (2, num, 1))
+    return np.array(corner) + u * np.array(first) + v * np.array(second) + 0.01 * rng.normal(size=(num, 3))
+
+
 def corridor(
     seed: int, pillars_m: tuple[float, ...] = (), length_m: float = 120.0, density: float = 60.0
 ) -> np.ndarray:
     """(n, 3) points of the floor, the ceiling and the walls of a corridor along x, and of pillars at the left wall."""
     rng = np.random.default_rng(seed)
 
-    def rectangle(
-        corner: tuple[float, float, float], first: tuple[float, ...], second: tuple[float, ...]
-    ) -> np.ndarray:
-        num = int(density * np.linalg.norm(first) * np.linalg.norm(second))
-        u, v = rng.uniform(0, 1, (2, num, 1))
-        return np.array(corner) + u * np.array(first) + v * np.array(second) + 0.01 * rng.normal(size=(num, 3))
-
     start, long, high = -length_m / 2, (length_m, 0.0, 0.0), (0.0, 0.0, 2.6)
-    parts = [rectangle((start, -1.1, z), long, (0.0, 2.5, 0.0)) for z in (-1.2, 1.4)]
-    parts += [rectangle((start, y, -1.2), long, high) for y in (-1.1, 1.4)]
-    parts += [rectangle((x, 0.9, -1.2), (0.0, 0.5, 0.0), high) for x in pillars_m]
-    parts += [rectangle((x + 0.6, 0.9, -1.2), (0.0, 0.5, 0.0), high) for x in pillars_m]
+    parts = [rectangle(rng, (start, -1.1, z), long, (0.0, 2.5, 0.0), density) for z in (-1.2, 1.4)]
+    parts += [rectangle(rng, (start, y, -1.2), long, high, density) for y in (-1.1, 1.4)]
+    parts += [rectangle(rng, (x, 0.9, -1.2), (0.0, 0.5, 0.0), high, density) for x in pillars_m]
+    parts += [rectangle(rng, (x + 0.6, 0.9, -1.2), (0.0, 0.5, 0.0), high, density) for x in pillars_m]
     return np.concatenate(parts)

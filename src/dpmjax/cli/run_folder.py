@@ -208,7 +208,7 @@ def load_config(path: Path, config_type: type[ConfigT]) -> ConfigT:
     try:
         return config_from_json(stored, config_type)
     except ValueError as error:
-        raise ValueError(f"{path / CONFIG} holds options that this version does not know: {error}") from error
+        raise ValueError(f"{path / CONFIG} holds options of another command or version: {error}") from error
 
 
 def write_metrics(

@@ -113,11 +113,13 @@ class MatchEvidence(NamedTuple):
         of_clouds: `CLOUD_FEATURES`.
         of_scans: `SCAN_FEATURES`; None without scans.
         of_weak_scans: `WEAK_FEATURES`; None where the walls constrain all directions, and without scans.
+        lookalike_gap: lead over other places that look alike, as log odds; infinite without such places.
     """
 
     of_clouds: Float[np.ndarray, " f"]
     of_scans: Float[np.ndarray, " g"] | None
     of_weak_scans: Float[np.ndarray, " w"] | None = None
+    lookalike_gap: float = np.inf
 
 
 def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> MatchEvidence:
@@ -142,7 +144,8 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
         return MatchEvidence(of_clouds, None)
     of_scans = verification[: verification._fields.index("num_tried")]
     of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
-    return MatchEvidence(of_clouds, np.concatenate([of_clouds, of_scans]), of_weak_scans)
+    of_scans = np.concatenate([of_clouds, of_scans])
+    return MatchEvidence(of_clouds, of_scans, of_weak_scans, verification.lookalike_gap)
 
 
 def weak_features(verification: Verification) -> Float[np.ndarray, "2"]:
@@ -170,7 +173,9 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
     if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
         return float(logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans))
     if evidence.of_scans is not None:
-        return float(logistic_probability(calibration.of_scans, evidence.of_scans))
+        # Of two places under which the scans agree, one is right: the odds are those of their scores.
+        is_right_of_both = expit(evidence.lookalike_gap)
+        return float(is_right_of_both * logistic_probability(calibration.of_scans, evidence.of_scans))
     return float(logistic_probability(calibration.of_clouds, evidence.of_clouds))
 
 

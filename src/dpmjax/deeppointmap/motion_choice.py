@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dpmjax.deeppointmap.verification import (
-    EVIDENCE,
     MeasuredScan,
     VerificationConfig,
     compare_scans,
@@ -61,14 +60,11 @@ FACING_VISIBLE = 0.2
 
 HYPOTHESES_AT_ONCE = 4
 
-# Largest number of motions to other places that look alike, which compete with a clearly right one.
-NUM_LOOKALIKES = 8
-
 # Motions that differ by less end in the same place.
 DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
 
 # Fields of `Verification` that rest on all motions that were tried.
-OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap")
+OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap", "lookalike_gap")
 
 
 class VerifiedMotion(NamedTuple):
@@ -104,15 +100,15 @@ def choose_motion(
         The best hypothesis, aligned.
     """
     pair, hypotheses = _Pair(source, target, config), np.asarray(T_target_source, float)
-    tried: list[VerifiedMotion] = []
+    tried, lookalikes = list[VerifiedMotion](), list[VerifiedMotion]()
     for some in pair.candidates(hypotheses):
         tried += pair.aligned(some, COARSE)
-        tried.sort(key=lambda motion: -motion.verification.score)
+        tried.sort(key=_badness)
         if tried[0].verification.score > CLEAR_SCORE:
-            tried += pair.aligned(pair.lookalikes(tried[0].T_target_source), COARSE)
-            tried.sort(key=lambda motion: -motion.verification.score)
+            lookalikes = sorted(pair.aligned(pair.lookalikes(tried[0].T_target_source), COARSE), key=_badness)
             break
     finalists, remaining = pair.aligned(tried[:NUM_FINE], FINE), tried[NUM_FINE:]
+    lookalikes = pair.aligned(lookalikes[:NUM_FINE], FINE)
     axes = wall_axis(source.surface), wall_axis(target.surface)
     num_slid = 0
     if is_weak := weak_share(*axes) < config.max_weak_share:
@@ -121,19 +117,26 @@ def choose_motion(
         slid = align_surfaces(source.surface, target.surface, starts, COARSE)
         order = np.argsort(-pair.facing_elements(axes, slid), kind="stable")
         finalists += pair.aligned([_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE)
-    motions = [*finalists, *remaining]
+    motions = [*lookalikes, *finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
     facing = pair.facing_elements(axes, T) if is_weak else np.zeros(len(motions))
-    best = int(np.argmax((facing if is_weak else scores)[: len(finalists)]))
+    best = int(np.argmax((facing if is_weak else scores)[: len(lookalikes) + len(finalists)]))
     chosen, is_other = motions[best], _is_apart(T, T[best])
     if chosen.row is None:
         agreeing = np.flatnonzero(~_is_apart(hypotheses, T[best]))
         chosen = chosen._replace(row=int(agreeing[0]) if len(agreeing) else None)
-    gap = float(scores[best] - scores[is_other].max(initial=EVIDENCE.bias))
-    facing_gap = float(facing[best] - facing[is_other].max(initial=0.0))
-    found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=num_slid, facing_gap=facing_gap)
-    return chosen._replace(verification=found)
+    # In corridors shifts along the axis look alike, and the elements that face the axis have the say.
+    is_compared = len(lookalikes) > 0 and not is_weak
+    lookalike_gap = float(scores[best] - scores[is_other].max(initial=-np.inf)) if is_compared else np.inf
+    is_other[: len(lookalikes)] &= best < len(lookalikes)
+    gap, facing_gap = (float(values[best] - values[is_other].max(initial=0.0)) for values in (scores, facing))
+    of_search = dict(zip(OF_THE_SEARCH, (gap, len(tried), num_slid, facing_gap, lookalike_gap), strict=True))
+    return chosen._replace(verification=chosen.verification._replace(**of_search))
+
+
+def _badness(motion: VerifiedMotion) -> float:
+    return -motion.verification.score
 
 
 class _Candidate(NamedTuple):
@@ -162,9 +165,9 @@ class _Pair(NamedTuple):
 
     def lookalikes(self, T_target_source: Pose) -> list[_Candidate]:
         """Returns motions under which the scans look like under this one: in equal rooms, and rows of houses."""
-        if self.config.views.num_motions == 0:
+        if self.config.num_lookalikes == 0:
             return []
-        views = ViewCorrelationConfig(NUM_LOOKALIKES)
+        views = ViewCorrelationConfig(self.config.num_lookalikes)
         found = correlate_views(self.source.surface, self.target.surface, views, beside=T_target_source)
         return [_Candidate(None, T) for T in found]
 
@@ -172,6 +175,8 @@ class _Pair(NamedTuple):
         self, candidates: Sequence[_Candidate | VerifiedMotion], alignment: AlignmentConfig
     ) -> list[VerifiedMotion]:
         """Aligns the surfaces of both scans from each candidate, and verifies the motions."""
+        if not candidates:
+            return []
         starts = np.stack([candidate.T_target_source for candidate in candidates])
         T = align_surfaces(self.source.surface, self.target.surface, starts, alignment)
         verified = verify_motions(self.source, self.target, T, self.config)

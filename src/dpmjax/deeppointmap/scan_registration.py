@@ -29,6 +29,9 @@ from dpmjax.types import AnyArray, DescriptorCloud, Pose, Poses, Registration, V
 # Number of surface elements of a scan that is refined against a cloud.
 NUM_ELEMENTS = 1024
 
+# Fewer descriptors fit each other by chance: any two sets of three points have a motion.
+MIN_DESCRIPTORS = 20
+
 # Fields of `Registration` that are 0 for a motion that no pairs of descriptors support.
 OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
 
@@ -67,12 +70,12 @@ def register(
         (`model.config.calibration`) is the probability that the motion is right within 2 m and 5 degrees. Without
         calibration it is the mean score of the pairs, which is no probability. A motion that only the views from above
         suggested has no inliers, and without calibration the confidence 0. Failure is data: without any pair and
-        without a view the motion is the identity and the confidence 0; with fewer than three distinct pairs `rmse` is
-        infinite.
+        without a view, or with fewer than 20 descriptors on either side, the motion is the identity and the confidence
+        0; with fewer than three distinct pairs `rmse` is infinite.
 
     Raises:
-        ValueError: if the points are no real numbers (n, 3), if features have another width than the model, if both
-            have another scale, or if "auto" meets descriptors.
+        ValueError: if the model is none, the points are no real numbers (n, 3), features have another width than the
+            model, both have another scale, the scale is another word than "auto", or "auto" meets descriptors.
     """
     return register_each(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
 
@@ -100,6 +103,8 @@ def register_each(
     Raises:
         ValueError: see `register`.
     """
+    if not isinstance(model, Model):
+        raise ValueError(f"model: expected one from load_model, got {type(model).__name__}")
     refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
@@ -113,7 +118,9 @@ def register_each(
             in_cloud_units = match_clouds(model, *clouds, config=matching)
             pair_scale = _shared_scale(source, target, scale)
             hypotheses = _in_metres(in_cloud_units, pair_scale)
-            if isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
+            if min(int(np.sum(cloud.described.mask)) for cloud in clouds) < MIN_DESCRIPTORS:
+                motion = pool.submit(_RegisteredMotion, None, np.eye(4))
+            elif isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
                 motion = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
             elif refine and all(cloud.normals is not None for cloud in clouds):
@@ -196,6 +203,8 @@ class _RegisteredMotion(NamedTuple):
 def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
     """Returns the scale of all raw scans; "auto" chooses it from their extents."""
     if scale != "auto":
+        if isinstance(scale, str):
+            raise ValueError(f'scale: expected a number or "auto", got {scale!r}')
         return scale
     scans = [scan for pair in pairs for scan in pair if not isinstance(scan, PreparedScan)]
     if any(isinstance(scan, DescriptorCloud) for scan in scans):

@@ -72,6 +72,8 @@ class VerificationConfig:
         plane_radius_m: largest distance of a point from the nearest point of a plane that it meets.
         max_weak_share: motions along an axis are tried if its share of the information of the walls is smaller. The
             share is 0.25 or more in streets and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
+        num_lookalikes: largest number of motions to other places that compete with a clearly right one: the scans look
+            alike from above under them, too, as in bare rooms and in rows of equal houses. 0 switches this off.
     """
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
@@ -79,11 +81,12 @@ class VerificationConfig:
     num_samples: int = 1000
     plane_radius_m: float = 1.0
     max_weak_share: float = 0.22
+    num_lookalikes: int = 8
 
     def __post_init__(self) -> None:
         require_fields(self, "num_samples", low=1)
         require_fields(self, "plane_radius_m", low=1e-9)
-        require_fields(self, "max_weak_share", low=0)
+        require_fields(self, "max_weak_share", "num_lookalikes", low=0)
 
 
 class MeasuredScan(NamedTuple):

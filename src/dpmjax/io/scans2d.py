@@ -175,9 +175,9 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     ahead. Optional arrays are `mask` (n, b), `times` (n,) in seconds, and `unit`, "px" or "m". Also optional are
     `poses` (the reference) and `odometry`, as (n, 3) x, y, heading or (n, 3, 3) `T_world_scan`.
 
-    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, or where both
-    coordinates are NaN or one is infinite. It is also invalid where its range is NaN, infinite or not positive, as
-    scanner drivers write a beam without echo. A beam with one NaN coordinate and a finite one is an error.
+    Angles that span more than a turn are taken as degrees. A beam is invalid where `mask` is False, where both
+    coordinates are NaN or 0, or where one is infinite. It is also invalid where its range is NaN, infinite or not
+    positive, as scanner drivers write a beam without echo. A beam with one NaN coordinate and a finite one is an error.
 
     Args:
         path: the file.
@@ -222,7 +222,8 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
     require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
     planar = points[..., :2].astype(np.float64)
-    return planar, (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2)
+    is_measured = (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2) & planar.any(axis=2)
+    return planar, is_measured
 
 
 def _from_ranges(table: Table, path: str | Path) -> tuple[tuple[FloatArray, BoolArray], tuple[Note, ...]]:

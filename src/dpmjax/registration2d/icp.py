@@ -22,6 +22,7 @@ _NORMAL_NEIGHBOURS = 6
 """Points that a normal is fitted to, as in the published DeepMapping program."""
 
 _MAX_ITERATIONS = 100
+_MAX_ROTATION_ERROR = 1e-3
 _OPEN_SHARE = 1e-5
 """Share of the largest singular value of the balance's derivative below which a direction counts as unconstrained."""
 
@@ -75,7 +76,8 @@ def icp(
         IcpResult. With too few points to constrain the motion, the result stays near `T_init`, with `converged` True.
 
     Raises:
-        ValueError: wrong shapes, unknown metric, an empty cloud, or numbers that are not finite (where not traced).
+        ValueError: wrong shapes, unknown metric, an empty cloud, and where not traced: numbers that are not finite, or
+            a `T_init` that is no rigid motion.
     """
     source = as_points("source", source, dimensions=(2, 3))
     target = as_points("target", target, dimensions=source.shape[1:]).astype(source.dtype)
@@ -89,8 +91,8 @@ def icp(
     )
     _require_finite_cloud("source", clouds[0])
     _require_finite_cloud("target", clouds[1])
-    if not isinstance(start, jax.core.Tracer) and not np.isfinite(np.asarray(start)).all():
-        raise ValueError("T_init: expected finite numbers, got NaN or infinity")
+    if not isinstance(start, jax.core.Tracer):
+        _require_motion(np.asarray(start))
     return _icp(*clouds, start.astype(source.dtype), metric=metric)
 
 
@@ -125,6 +127,15 @@ def _require_finite_cloud(name: str, cloud: _Cloud) -> None:
     is_known = not any(isinstance(value, jax.core.Tracer) for value in cloud)
     if len(cloud.points) == 0 or (is_known and not np.isfinite(np.asarray(cloud.points)[np.asarray(cloud.mask)]).all()):
         raise ValueError(f"{name}: expected one point or more and finite numbers; leave invalid points out")
+
+
+def _require_motion(T_init: np.ndarray) -> None:
+    if not np.isfinite(T_init).all():
+        raise ValueError("T_init: expected finite numbers, got NaN or infinity")
+    R = T_init[:-1, :-1]
+    last_row = np.abs(T_init[-1] - np.eye(len(T_init))[-1]).max()
+    if max(np.abs(R @ R.T - np.eye(len(R))).max(), last_row) > _MAX_ROTATION_ERROR or np.linalg.det(R) < 0:
+        raise ValueError("T_init: expected a rigid motion, got a matrix that scales, shears or reflects")
 
 
 @partial(jax.jit, static_argnames="metric")

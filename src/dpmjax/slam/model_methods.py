@@ -226,7 +226,8 @@ class NetworkMatcher:
     """
 
     def __init__(self, model: Model) -> None:
-        verification = replace(model.config.verification, plane_radius_m=ELEMENT_RADIUS_M)
+        # Other keyframes and the map confirm a motion, so no other place needs to be tried for it.
+        verification = replace(model.config.verification, plane_radius_m=ELEMENT_RADIUS_M, num_lookalikes=0)
         self._model = replace(model, config=replace(model.config, verification=verification))
         self.fingerprint = model_fingerprint(model)
 
