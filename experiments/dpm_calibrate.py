@@ -192,7 +192,7 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
         Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
         true distance, metres.
     """
-    found: cli.Row = {name: [] for name in (*KINDS, "is_right_of_clouds", "is_right", "distance_m")}
+    found: cli.Row = {name: [] for name in (*KINDS, "lookalike_gap", "is_right_of_clouds", "is_right", "distance_m")}
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
     for pair in pairs:
         result = dpm.register_in_stages(model, pair)
@@ -200,8 +200,11 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
         of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
         motions = np.stack([of_clouds, result.verified])
         is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
-        for name, features in result.evidence._asdict().items():
+        for name in KINDS:
+            features = getattr(result.evidence, name)
             found[name].append(None if features is None else features.tolist())
+        gap = result.evidence.lookalike_gap
+        found["lookalike_gap"].append(gap if np.isfinite(gap) else None)
         found["is_right_of_clouds"].append(bool(is_right[0]))
         found["is_right"].append(bool(is_right[1]))
         found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))

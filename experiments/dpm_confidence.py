@@ -90,9 +90,13 @@ def rate(rows: list[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.R
     confidence, is_right, distance_m = [], [], []
     for row in rows:
         for number, of_clouds in enumerate(row["of_clouds"]):
-            of_scans = (row[name][number] if rated == "scans" else None for name in ("of_scans", "of_weak_scans"))
-            arrays = (None if values is None else np.asarray(values) for values in (of_clouds, *of_scans))
-            confidence.append(dpm.calibrated_probability(calibration, dpm.MatchEvidence(*arrays)))
+            evidence = dpm.MatchEvidence(np.asarray(of_clouds), None)
+            if rated == "scans":
+                arrays = {name: row[name][number] for name in ("of_scans", "of_weak_scans")}
+                evidence = evidence._replace(**{name: np.asarray(some) for name, some in arrays.items() if some})
+                gap = row["lookalike_gap"][number]
+                evidence = evidence._replace(lookalike_gap=np.inf if gap is None else gap)
+            confidence.append(dpm.calibrated_probability(calibration, evidence))
         is_right += row[RATED[rated]]
         distance_m += row["distance_m"]
     probability, right, distance = np.array(confidence), np.array(is_right), np.array(distance_m)
