@@ -142,9 +142,8 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
         of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
     if verification is None:
         return MatchEvidence(of_clouds, None)
-    of_scans = verification[: verification._fields.index("num_tried")]
+    of_scans = np.concatenate([of_clouds, verification[: verification._fields.index("num_tried")]])
     of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
-    of_scans = np.concatenate([of_clouds, of_scans])
     return MatchEvidence(of_clouds, of_scans, of_weak_scans, verification.lookalike_gap)
 
 

@@ -131,8 +131,8 @@ def choose_motion(
     lookalike_gap = float(scores[best] - scores[is_other].max(initial=-np.inf)) if is_compared else np.inf
     is_other[: len(lookalikes)] &= best < len(lookalikes)
     gap, facing_gap = (float(values[best] - values[is_other].max(initial=0.0)) for values in (scores, facing))
-    of_search = dict(zip(OF_THE_SEARCH, (gap, len(tried), num_slid, facing_gap, lookalike_gap), strict=True))
-    return chosen._replace(verification=chosen.verification._replace(**of_search))
+    found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=num_slid)
+    return chosen._replace(verification=found._replace(facing_gap=facing_gap, lookalike_gap=lookalike_gap))
 
 
 def _badness(motion: VerifiedMotion) -> float:

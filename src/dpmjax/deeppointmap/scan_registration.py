@@ -24,7 +24,7 @@ from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, Verifica
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
 from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
-from dpmjax.types import AnyArray, DescriptorCloud, Pose, Poses, Registration, Verification
+from dpmjax.types import DescriptorCloud, Pose, Poses, Registration, Verification
 
 # Number of surface elements of a scan that is refined against a cloud.
 NUM_ELEMENTS = 1024
@@ -203,7 +203,7 @@ class _RegisteredMotion(NamedTuple):
 def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
     """Returns the scale of all raw scans; "auto" chooses it from their extents."""
     if scale != "auto":
-        if isinstance(scale, str):
+        if np.asarray(scale).dtype.kind not in "fiu":
             raise ValueError(f'scale: expected a number or "auto", got {scale!r}')
         return scale
     scans = [scan for pair in pairs for scan in pair if not isinstance(scan, PreparedScan)]
@@ -248,9 +248,10 @@ def _refined(
     """Refines the best motion of two descriptor clouds by their surface elements."""
     # The elements alone cannot choose among hypotheses: in a corridor, or after a half-turn, wrong ones meet the same
     # number of planes.
-    T_target_source: AnyArray = np.array(hypotheses.T_target_source[0], np.float64)
+    T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
-        T_target_source = align_elements_on_host(source.elements, target.elements, T_target_source).T_target_source
+        aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
+        T_target_source = np.array(aligned.T_target_source)
     T_target_source[:3, 3] /= scale
     return _RegisteredMotion(0, T_target_source)
 
