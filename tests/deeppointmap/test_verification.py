@@ -130,7 +130,8 @@ def test_empty_scans_leave_the_hypothesis(scans) -> None:
         found = choose_motion(*pair, T_TRUE[None], CONFIG)
         np.testing.assert_allclose(found.T_target_source, T_TRUE)
         assert found.verification.matched_share == 0
-        assert np.isfinite(found.verification).all()
+        assert np.isfinite(found.verification._replace(lookalike_gap=0.0)).all()
+        assert found.verification.lookalike_gap == np.inf
         assert isinstance(refine_motion(*pair, found, CONFIG), VerifiedMotion)
 
 

@@ -144,6 +144,7 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
         "of_clouds": [[0.0] * 4] * 4,
         "of_scans": [[0.0] * 7 + [score, 0.0] for score in scores],
         "of_weak_scans": [None] * 4,
+        "lookalike_gap": [None] * 4,
         "is_right": [True, True, False, False],
         "is_right_of_clouds": [False] * 4,
         "distance_m": [2.0, 8.0, 3.0, 4.0],
@@ -153,6 +154,8 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
     assert (numbers["num_near"], numbers["num_near_sure_right"]) == (3, 1)
     assert numbers["calibration_error"] == pytest.approx(0.25, abs=1e-3)
     assert dpm_confidence.rate([row], calibration, "clouds")["num_sure"] == 0
+    shared = dpm_confidence.rate([{**row, "lookalike_gap": [0.0, None, None, None]}], calibration, "scans")
+    assert shared["num_sure"] == 2
     lines = dpm_confidence.table([{"model": "m", "rated": "scans", "kind": "all", **numbers}]).splitlines()
     assert len({line.count("|") for line in lines}) == 1
 

@@ -129,7 +129,7 @@ def choose_motion(
     # In corridors shifts along the axis look alike, and the elements that face the axis have the say.
     is_compared = len(lookalikes) > 0 and not is_weak
     lookalike_gap = float(scores[best] - scores[is_other].max(initial=-np.inf)) if is_compared else np.inf
-    is_other[: len(lookalikes)] &= best < len(lookalikes)
+    is_other[: len(lookalikes)] = False
     gap, facing_gap = (float(values[best] - values[is_other].max(initial=0.0)) for values in (scores, facing))
     found = chosen.verification._replace(gap=gap, num_tried=len(tried), num_slid=num_slid)
     return chosen._replace(verification=found._replace(facing_gap=facing_gap, lookalike_gap=lookalike_gap))
