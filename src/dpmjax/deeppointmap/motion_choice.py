@@ -105,7 +105,7 @@ def choose_motion(
         tried += pair.aligned(some, COARSE)
         tried.sort(key=_badness)
         if tried[0].verification.score > CLEAR_SCORE:
-            lookalikes = sorted(pair.aligned(pair.lookalikes(tried[0].T_target_source), COARSE), key=_badness)
+            lookalikes = pair.lookalikes(tried[0].T_target_source)
             break
     finalists, remaining = pair.aligned(tried[:NUM_FINE], FINE), tried[NUM_FINE:]
     lookalikes = pair.aligned(lookalikes[:NUM_FINE], FINE)
@@ -163,13 +163,15 @@ class _Pair(NamedTuple):
             some = slice(start, start + HYPOTHESES_AT_ONCE)
             yield from filter(None, (searched[some], further[some]))
 
-    def lookalikes(self, T_target_source: Pose) -> list[_Candidate]:
-        """Returns motions under which the scans look like under this one: in equal rooms, and rows of houses."""
+    def lookalikes(self, T_target_source: Pose) -> list[VerifiedMotion]:
+        """Returns motions to other places under which the views look like under this one, aligned, the best first."""
         if self.config.num_lookalikes == 0:
             return []
         views = ViewCorrelationConfig(self.config.num_lookalikes)
         found = correlate_views(self.source.surface, self.target.surface, views, beside=T_target_source)
-        return [_Candidate(None, T) for T in found]
+        similar = self.aligned([_Candidate(None, T) for T in found], COARSE)
+        others = [one for one in similar if _is_apart(one.T_target_source[None], T_target_source)[0]]
+        return sorted(others, key=_badness)
 
     def aligned(
         self, candidates: Sequence[_Candidate | VerifiedMotion], alignment: AlignmentConfig

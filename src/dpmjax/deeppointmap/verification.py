@@ -81,7 +81,7 @@ class VerificationConfig:
     num_samples: int = 1000
     plane_radius_m: float = 1.0
     max_weak_share: float = 0.22
-    num_lookalikes: int = 8
+    num_lookalikes: int = 12
 
     def __post_init__(self) -> None:
         require_fields(self, "num_samples", low=1)

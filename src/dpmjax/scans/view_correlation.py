@@ -107,7 +107,12 @@ def correlate_views(
     fixed /= np.where(norms > 0, norms, 1)[:, None, None]
     spectra = np.conj(fft.rfft2(images)) * fft.rfft2(fixed)
     scores = fft.irfft2(spectra.sum(axis=1), s=images.shape[2:])
-    found = _best_peaks(scores, turns, cell_m, config.num_motions)
+    if beside is None:
+        found = _best_peaks(scores, turns, cell_m, config.num_motions)
+    else:  # each turn has its share, because one wide peak would fill the list
+        share = -(-config.num_motions // len(turns))
+        of_turns = zip(scores[:, None], turns[:, None], strict=True)
+        found = [peak for of_turn, turn in of_turns for peak in _best_peaks(of_turn, turn, cell_m, share)]
     return np.stack([rigid.inverse(levels[1]) @ planar_motion(*row) @ levels[0] for row in found])
 
 
