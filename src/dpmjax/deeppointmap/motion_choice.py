@@ -1,5 +1,6 @@
 """Choice among motion hypotheses: each is aligned by the surfaces of both scans, and compared by them.
 
+A clearly right motion competes with motions to other places under which the scans look alike from above.
 In corridors wrong motions agree with the scans, too. There, motions along the axis and half-turns are tried, and the
 surface elements that face the axis decide.
 """
@@ -88,7 +89,8 @@ def choose_motion(
     """Chooses the hypothesis under which two scans agree best.
 
     The walls of a corridor constrain one horizontal direction only. There, motions along its axis are tried too, with
-    and without a half-turn, and the elements that face the axis decide.
+    and without a half-turn, and the elements that face the axis decide. Elsewhere a clearly right hypothesis ends the
+    search, and competes with motions to other places that look alike; the best of all is chosen.
 
     Args:
         source: a scan.
@@ -97,7 +99,7 @@ def choose_motion(
         config: alignments and tolerances.
 
     Returns:
-        The best hypothesis, aligned.
+        The best motion, aligned.
     """
     pair, hypotheses = _Pair(source, target, config), np.asarray(T_target_source, float)
     tried, lookalikes = list[VerifiedMotion](), list[VerifiedMotion]()
@@ -126,7 +128,7 @@ def choose_motion(
     if chosen.row is None:
         agreeing = np.flatnonzero(~_is_apart(hypotheses, T[best]))
         chosen = chosen._replace(row=int(agreeing[0]) if len(agreeing) else None)
-    # In corridors shifts along the axis look alike, and the elements that face the axis have the say.
+    # In corridors shifts along the axis look alike, and the elements that face the axis decide.
     is_compared = len(lookalikes) > 0 and not is_weak
     lookalike_gap = float(scores[best] - scores[is_other].max(initial=-np.inf)) if is_compared else np.inf
     is_other[: len(lookalikes)] = False
@@ -164,7 +166,7 @@ class _Pair(NamedTuple):
             yield from filter(None, (searched[some], further[some]))
 
     def lookalikes(self, T_target_source: Pose) -> list[VerifiedMotion]:
-        """Returns motions to other places under which the views look like under this one, aligned, the best first."""
+        """Returns aligned motions to other places under which the views look alike, too, the best first."""
         if self.config.num_lookalikes == 0:
             return []
         views = ViewCorrelationConfig(self.config.num_lookalikes)

@@ -83,11 +83,12 @@ def correlate_views(
         source: surface of a scan.
         target: the second surface.
         config: resolution and extent.
-        beside: T_target_source of which only copies by other shifts, quarter-turns and half-turns are searched; None
-            searches all turns. Rooms, and rows of equal houses, look alike under these.
+        beside: T_target_source whose turn is searched alone, with its quarter-turns and half-turn; rooms, and rows of
+            equal houses, look alike under these. None searches all turns.
 
     Returns:
-        T_target_source, best first; at most `config.num_motions`, none where a scan has no upright surface.
+        T_target_source, best first; at most `config.num_motions`, none where a scan has no upright surface. With
+        `beside` an equal number for each turn, rounded up, turn by turn.
     """
     if len(source.points) == 0 or len(target.points) == 0:
         return np.zeros((0, 4, 4))
