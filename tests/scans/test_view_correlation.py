@@ -33,6 +33,14 @@ def test_one_of_the_best_motions_is_true_whatever_turn_shift_and_tilt(yaw: float
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
 
 
+def test_beside_a_motion_each_quarter_turn_has_an_equal_share() -> None:
+    surfaces = [scan_surface(seen_from(street(seed), np.eye(4))) for seed in (0, 1)]
+    found = correlate_views(*surfaces, ViewCorrelationConfig(8), beside=motion(33, (4, 0, 0)))
+    yaws = np.degrees(np.arctan2(found[:, 1, 0], found[:, 0, 0])) % 360
+    np.testing.assert_allclose(np.sort(yaws), np.repeat([33, 123, 213, 303], 2), atol=1)
+    assert len(np.unique(found.round(3), axis=0)) == 8
+
+
 def test_a_scan_looks_like_itself() -> None:
     surface = scan_surface(seen_from(street(0), np.eye(4)))
     np.testing.assert_allclose(correlate_views(surface, surface, CONFIG)[0], np.eye(4), atol=1e-9)
