@@ -10,7 +10,7 @@ from dpmjax.scans.surface_alignment import (
     align_surfaces,
     nearest_planes,
 )
-from dpmjax.scans.surfaces import MIN_FLATNESS, SurfaceConfig, scan_surface, surface_at
+from dpmjax.scans.surfaces import MIN_FLATNESS, SurfaceConfig, firm_surface, scan_surface, surface_at
 from tests.scans.surface_scenes import motion, seen_from, street
 
 ALIGNMENT = AlignmentConfig(
@@ -153,3 +153,14 @@ def test_points_of_no_surface_are_the_last_samples_and_are_paired_with_any_plane
     assert not some.normals[some.samples[num_flat:]].any()
     planes = nearest_planes(some, whole, np.eye(4)[None], AlignmentLevel(3.0, len(some.points), 1))
     assert (planes.cosines[0, num_flat:] == 1).all()
+
+
+def test_a_firm_surface_has_fewer_normals_and_the_same_points() -> None:
+    whole = scan_surface(street_under_foliage())
+    firm = firm_surface(whole, 0.4)
+    has_normal = firm.normals.any(axis=1)
+    np.testing.assert_array_equal(has_normal, whole.flatness > 0.4)
+    np.testing.assert_array_equal(firm.normals[has_normal], whole.normals[has_normal])
+    np.testing.assert_array_equal(firm.points, whole.points)
+    assert sorted(firm.samples) == list(range(len(whole.points)))
+    assert not has_normal[firm.samples[has_normal.sum() :]].any()

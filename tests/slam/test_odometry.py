@@ -11,7 +11,7 @@ from dpmjax import model_preset
 from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_elements, compact_image
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.weak_directions import diagonal_information
+from dpmjax.scans.weak_directions import diagonal_information, sigma_along
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
 from dpmjax.slam.keyframe_map import Keyframe, add_keyframe
 from dpmjax.slam.local_map import local_map_of
@@ -118,6 +118,39 @@ def test_a_corridor_is_weak_along_its_axis(geometry) -> None:
         weakness.append(covariance[0, 0] / covariance[1, 1])
         np.testing.assert_allclose(found.information, found.information.T)
     assert weakness[1] > 5 * weakness[0]
+
+
+def beams_in_corridor(x: float, end_m: float) -> np.ndarray:
+    """A lidar of 64 beams in a bare corridor of 3 m, which sees the end wall within 60 m."""
+    elevation, azimuth = np.meshgrid(
+        np.deg2rad(np.linspace(-15, 15, 64)), np.linspace(-np.pi, np.pi, 900), indexing="ij"
+    )
+    rays = np.column_stack(
+        [part.ravel() for part in (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth))]
+        + [np.sin(elevation).ravel()]
+    )
+    least, most = np.array([-500 - x, -1.5, -1.0]), np.array([end_m - x, 1.5, 1.8])
+    with np.errstate(divide="ignore"):
+        ranges = np.where(rays > 0, most / rays, np.where(rays < 0, least / rays, np.inf)).min(axis=1)
+    ranges += np.random.default_rng(round(100 * x)).normal(0, 0.02, len(ranges))
+    return (rays * ranges[:, None])[ranges < 60]
+
+
+def test_slices_of_a_corridor_do_not_hold_a_scan_back(geometry) -> None:
+    # Beams meet far walls in slices across the corridor, which move with the lidar. The end wall does not.
+    first, second = (geometry.thin(beams_in_corridor(x, 40.0)) for x in (0.0, 0.5))
+    assert abs(second.weak_axis[0]) > 0.999
+    found = geometry.align(map_of_one(first), second, np.eye(4))
+    assert_is_at(found, motion(0.5, 0, 0), 0.05, 0.005)
+    assert sigma_along(found.information, second.weak_axis) < 0.1
+
+
+def test_without_an_end_in_sight_the_way_along_a_corridor_is_unknown(geometry) -> None:
+    first, second = (geometry.thin(beams_in_corridor(x, 500.0)) for x in (0.0, 0.5))
+    found = geometry.align(map_of_one(first), second, np.eye(4))
+    assert sigma_along(found.information, second.weak_axis) > 1
+    assert sigma_along(found.information, np.array([0.0, 1.0, 0.0])) < 0.1
+    assert geometry.thin(planes(np.random.default_rng(0))).weak_axis is None
 
 
 def test_a_scan_of_another_place_scores_low(geometry, room) -> None:

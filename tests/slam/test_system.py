@@ -229,6 +229,39 @@ def test_lost_scans_that_see_the_same_room_keep_their_relative_poses() -> None:
     assert np.linalg.norm(result.T_world_scan[:, :3, 3] - expected, axis=1).max() < 0.5
 
 
+@dataclass(frozen=True)
+class CorridorGeometry(TruthGeometry):
+    """In a corridor without an end, alignments are 0.3 m off along its axis, and know it."""
+
+    corridor: range = range(0)
+
+    def thin(self, points: np.ndarray) -> ThinnedScan | None:
+        scan = super().thin(points)
+        assert scan is not None
+        is_in_corridor = number_of_scan(scan) in self.corridor
+        return scan._replace(weak_axis=np.array([1.0, 0.0, 0.0])) if is_in_corridor else scan
+
+    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+        found = super().search(local_map, scan, T_map_scan)
+        if scan.weak_axis is None:
+            return found
+        information = found.information.copy()
+        information[0, 0] = 0.01
+        return found._replace(T_map_scan=found.T_map_scan @ pose(0.3, 0, 0), information=information)
+
+
+def test_in_a_corridor_without_an_end_the_last_speed_goes_on() -> None:
+    truth = np.array([pose(float(x), 0.0, 0.0) for x in range(60)])
+    corridor = range(20, 40)
+    result = run(truth, geometry=CorridorGeometry(truth, sigma_m=1e-4, sigma_rad=1e-5, corridor=corridor))
+    np.testing.assert_allclose(result.T_world_scan[:, :3, 3], truth[:, :3, 3], atol=0.1)
+    assert [report.scan for report in result.reports if report.is_unknown_along] == list(corridor)
+    assert all((report.weak_sigma_m is None) == (report.scan not in corridor) for report in result.reports)
+    # A loop may stretch such edges.
+    sigmas_m = [np.linalg.inv(edge.information)[0, 0] ** 0.5 for edge in result.map.edges]
+    assert max(sigmas_m) == pytest.approx(10, rel=0.01)
+
+
 def test_the_network_helps_where_geometry_fails() -> None:
     # Of each ten scans nine are dropped for a while: the prediction is wrong by more than geometry can do.
     truth = laps(1, side_m=60.0)

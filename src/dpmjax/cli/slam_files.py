@@ -19,7 +19,8 @@ MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
 LOOP_CELLS = ("found_by", "status", "overlap", "probability", "rmse_m")
 SCAN_COLUMNS = (
-    "scan", "status", "is_keyframe", "keyframe_scan", "score", "probability", "num_accepted", "reason", "source"
+    "scan", "status", "is_keyframe", "keyframe_scan", "score", "probability", "weak_sigma_m", "num_accepted", "reason",
+    "source",
 )  # fmt: skip
 
 
@@ -106,6 +107,7 @@ def write_scans(
             "keyframe_scan": int(keyframes[report.keyframe]) if len(keyframes) else "",
             "score": _number(report.score),
             "probability": _number(report.probability),
+            "weak_sigma_m": _number(report.weak_sigma_m),
             "num_accepted": report.num_accepted,
             "reason": report.reason,
             "source": source,

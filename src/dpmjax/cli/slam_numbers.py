@@ -160,6 +160,7 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
         **trajectory_errors(T, reference),
         **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
         "scan_statuses": dict(statuses),
+        "num_unknown_along": sum(report.is_unknown_along for report in result.reports),
         "loop_statuses": dict(loops),
         "scans_per_s": run.num_done / run.run_s if run.num_done else None,
         "run_s": run.run_s,
@@ -221,6 +222,9 @@ def summary(numbers: Mapping[str, Any]) -> str:
         for status, text in UNSURE.items()
         if status in numbers["scan_statuses"]
     ]
+    if numbers["num_unknown_along"]:
+        unknown = counted(numbers["num_unknown_along"], "scan")
+        lines.append(f"{unknown} where nothing faces the axis of a corridor: the last speed goes on there, uncertain")
     if len(lines) > 1:
         lines[-1] += " (scans.csv has the reason for each)"
     if numbers["num_parts"] > 1:

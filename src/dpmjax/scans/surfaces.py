@@ -123,10 +123,23 @@ def surface_at(
     """
     chosen = points[rows].astype(np.float64)
     normals, flatness = _normals(chosen, HostTree(points), config)
-    is_flat = flatness > MIN_FLATNESS
-    normals = np.where(is_flat[:, None], normals, 0)
-    samples = np.concatenate([_samples(normals, flatness), np.flatnonzero(~is_flat)])
-    return Surface(chosen, normals, np.where(is_flat, flatness, 0), samples, HostTree(chosen))
+    return firm_surface(Surface(chosen, normals, flatness, np.arange(len(chosen)), HostTree(chosen)), MIN_FLATNESS)
+
+
+def firm_surface(surface: Surface, min_flatness: float) -> Surface:
+    """Takes the normals from elements that are not flat enough; these become the last samples.
+
+    Args:
+        surface: surface of a scan.
+        min_flatness: least flatness of an element with a normal, at least `MIN_FLATNESS`.
+
+    Returns:
+        The surface with fewer normals.
+    """
+    is_firm = surface.flatness > min_flatness
+    normals, flatness = np.where(is_firm[:, None], surface.normals, 0), np.where(is_firm, surface.flatness, 0)
+    samples = np.concatenate([_samples(normals, flatness), np.flatnonzero(~is_firm)])
+    return surface._replace(normals=normals, flatness=flatness, samples=samples)
 
 
 def surface_of_elements(elements: SurfaceElements) -> Surface:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
@@ -23,7 +23,6 @@ from dpmjax.types import Information, Pose, Poses
 NUM_INDEPENDENT = 200
 
 MIN_SIGMA_M = 0.01
-MIN_FACING_COSINE = 0.6
 
 # One normal of each voxel counts, so that many points of a near wall do not outweigh a far one.
 VOXEL_M = 1.0
@@ -31,6 +30,9 @@ VOXEL_M = 1.0
 # Walls are parallel to an axis if the cosine between their normal and the horizontal direction across it is larger.
 # Elements face the axis if the cosine between their normal and the axis is larger.
 PARALLEL_COSINE, FACING_COSINE = 0.9, 0.6
+
+# A smaller share of elements may face an axis by chance.
+MIN_FACING_SHARE = 0.01
 
 BIN_M, NUM_BINS, MAX_COUNT = 0.2, 301, 20.0
 # Elements nearer to each other along the axis have one position.
@@ -113,10 +115,28 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
 
     horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]
     direction = np.linalg.eigh(horizontal @ covariance_in_target(pairs) @ horizontal.T)[1][:, 1] @ horizontal
-    along = pairs.normals @ direction
-    noise = np.where(np.abs(along) < MIN_FACING_COSINE, along, 0)
-    held = pairs._replace(normals=pairs.normals - noise[:, None] * direction)
+    held = without_noise_along(pairs, direction, np.ones(len(pairs.residuals), bool))
     return WeakDirection(direction, float(np.sqrt(direction @ covariance_in_target(held) @ direction)))
+
+
+def without_noise_along(
+    pairs: PlanePairs, direction: Float[np.ndarray, "3"], is_firm: Bool[np.ndarray, " p"]
+) -> PlanePairs:
+    """Removes from normals the component along a direction that they do not face: it is noise.
+
+    Args:
+        pairs: pairs under a motion.
+        direction: unit vector in the frame of the target.
+        is_firm: False for pairs whose planes may be wrong; these do not face the direction.
+
+    Returns:
+        The pairs with normals that are shorter where they are noisy.
+    """
+    along = pairs.normals @ direction
+    is_facing = is_firm & (np.abs(along) > FACING_COSINE)
+    is_enough = is_facing.sum() > MIN_FACING_SHARE * is_firm.sum()
+    noise = np.where(is_facing & is_enough, 0, along)
+    return pairs._replace(normals=pairs.normals - noise[:, None] * direction)
 
 
 def with_least_covariance(information: Information, sigma_m: float, sigma_rad: float) -> Information:
@@ -133,6 +153,19 @@ def with_least_covariance(information: Information, sigma_m: float, sigma_rad: f
     covariance = np.linalg.inv(information) + np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
     after = np.linalg.inv(covariance)
     return np.asarray((after + after.T) / 2)
+
+
+def sigma_along(information: Information, direction: Float[np.ndarray, "3"]) -> float:
+    """Computes the standard deviation of a translation along a direction, for any rotation.
+
+    Args:
+        information: inverse covariance, translation first.
+        direction: unit vector in the same frame.
+
+    Returns:
+        The standard deviation, metres.
+    """
+    return float(np.sqrt(direction @ np.linalg.inv(information)[:3, :3] @ direction))
 
 
 class WallAxis(NamedTuple):

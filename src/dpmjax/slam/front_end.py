@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
-from dpmjax.scans.weak_directions import diagonal_information
+from dpmjax.scans.weak_directions import diagonal_information, sigma_along
 from dpmjax.slam.interfaces import Alignment, PreparedInput, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframe_map import Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
@@ -83,6 +84,7 @@ class ScanReport(NamedTuple):
         num_accepted: number of loops that were accepted at this scan.
         num_points: number of points of the scan.
         T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
+        weak_sigma_m: standard deviation of the position along a corridor, metres; None elsewhere, and for a guess.
     """
 
     scan: int
@@ -96,6 +98,12 @@ class ScanReport(NamedTuple):
     num_accepted: int = 0
     num_points: int = 0
     T_turn: Pose | None = None
+    weak_sigma_m: float | None = None
+
+    @property
+    def is_unknown_along(self) -> bool:
+        """True where nothing faces the axis of a corridor: along it, the last motion goes on."""
+        return self.weak_sigma_m is not None and self.weak_sigma_m > GUESS_M
 
 
 class FrontEndState(NamedTuple):
@@ -218,9 +226,15 @@ class _Search(NamedTuple):
             T = self._guess(tried)
             status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
             information = diagonal_information(GUESS_M, GUESS_RAD)
+        elif self.scan.weak_axis is not None:
+            report = report._replace(weak_sigma_m=sigma_along(information, self.scan.weak_axis))
+            if report.is_unknown_along:
+                T = _with_guess_along(T, state.predicted, self.scan.weak_axis)
         reason = f"score {best.score:.2f} of usually {usual:.2f}"
         if probability is not None:
             reason += f", P {probability:.2f} by the network"
+        if report.is_unknown_along:
+            reason += ", nothing faces the axis of the corridor"
         # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
         report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
         return _Located(report._replace(score=best.score, probability=probability), information, tried.compact)
@@ -263,6 +277,13 @@ class _Search(NamedTuple):
             lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
             best = _better_of(tracked, matched, lead if state.scores else 0.0)
         return _Attempt(best, tracked, starts[0], proposal.probability, compact, proposal.is_calibrated)
+
+
+def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
+    """Returns the pose moved along an axis of the scan to where the guess is: noise alone would change the speed."""
+    held, along = T_map_scan.copy(), T_map_scan[:3, :3] @ axis
+    held[:3, 3] += along @ (guess - T_map_scan)[:3, 3] * along
+    return held
 
 
 def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:

@@ -26,11 +26,13 @@ class ThinnedScan(NamedTuple):
         cloud: thinned points, metres, in the frame of the lidar; input of the encoder.
         measured: surface and free space of the thinned points.
         extent_m: median range of the thinned points.
+        weak_axis: unit vector along a corridor, which few walls face, in the frame of the lidar; None elsewhere.
     """
 
     cloud: PointCloud
     measured: MeasuredScan
     extent_m: float
+    weak_axis: Float[np.ndarray, "3"] | None = None
 
 
 class Alignment(NamedTuple):
