@@ -63,16 +63,19 @@ def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found:
 
 
 @pytest.mark.parametrize(
-    ("statuses", "is_interrupted", "status"),
+    ("statuses", "num_unknown_along", "is_interrupted", "status"),
     [
-        ({"first": 1, "tracked": 9}, False, "done"),
-        ({"first": 1, "tracked": 1, "predicted": 9}, False, "uncertain"),
-        ({"empty": 3}, False, "failed"),
-        ({"empty": 3}, True, "interrupted"),
+        ({"first": 1, "tracked": 9}, 0, False, "done"),
+        ({"first": 1, "tracked": 9}, 4, False, "done"),
+        ({"first": 1, "tracked": 9}, 6, False, "uncertain"),
+        ({"first": 1, "tracked": 1, "predicted": 9}, 0, False, "uncertain"),
+        ({"empty": 3}, 0, False, "failed"),
+        ({"empty": 3}, 0, True, "interrupted"),
     ],
 )
-def test_run_status_a_run(statuses: dict[str, int], is_interrupted: bool, status: str) -> None:
-    assert run_status({"scan_statuses": statuses, "is_interrupted": is_interrupted}) == status
+def test_run_status_a_run(statuses: dict[str, int], num_unknown_along: int, is_interrupted: bool, status: str) -> None:
+    numbers = {"scan_statuses": statuses, "num_unknown_along": num_unknown_along, "is_interrupted": is_interrupted}
+    assert run_status(numbers) == status
 
 
 def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(

@@ -195,14 +195,16 @@ def run_status(numbers: Mapping[str, Any]) -> str:
         numbers: of the run.
 
     Returns:
-        done; uncertain: less than half of the scans were aligned; failed: none; interrupted: before its end.
+        done; uncertain: less than half of the scans were aligned in all directions; failed: none aligned; interrupted:
+        before its end.
     """
     statuses = numbers["scan_statuses"]
     if numbers["is_interrupted"]:
         return "interrupted"
     if why_failed(statuses) is not None:
         return "failed"
-    num_sure = sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
+    num_placed = sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
+    num_sure = num_placed - numbers["num_unknown_along"]
     return "done" if 2 * num_sure >= sum(statuses.values()) else "uncertain"
 
 
