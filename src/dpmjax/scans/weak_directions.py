@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from dpmjax.geometry import rigid
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, AlignmentLevel, PlanePairs, nearest_planes
-from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
+from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, firm_surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.types import Information, Pose, Poses
 
@@ -30,6 +30,13 @@ VOXEL_M = 1.0
 # Walls are parallel to an axis if the cosine between their normal and the horizontal direction across it is larger.
 # Elements face the axis if the cosine between their normal and the axis is larger.
 PARALLEL_COSINE, FACING_COSINE = 0.9, 0.6
+
+# In a corridor, the axis of the walls has a smaller share of the information of their normals.
+CORRIDOR_SHARE = 0.1
+
+# Least flatness of an element in a corridor. Beams graze its far walls and floor, and meet them in slices across the
+# corridor. The corners of a slice seem to face the axis, and they move with the lidar.
+FIRM_FLATNESS = 0.3
 
 # A smaller share of elements may face an axis by chance.
 MIN_FACING_SHARE = 0.01
@@ -108,15 +115,12 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
     # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
     level = AlignmentLevel(radius_m, max(1, len(source.samples)), 1)
     pairs = nearest_planes(source, target, T_target_source[None], level).pairs
-
-    def covariance_in_target(some: PlanePairs) -> Float[np.ndarray, "3 3"]:
-        inverse = np.linalg.inv(plane_information(some, T_target_source))
-        return T_target_source[:3, :3] @ inverse[:3, :3] @ T_target_source[:3, :3].T
-
+    R = T_target_source[:3, :3]
+    covariance = R @ np.linalg.inv(plane_information(pairs, T_target_source))[:3, :3] @ R.T
     horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]
-    direction = np.linalg.eigh(horizontal @ covariance_in_target(pairs) @ horizontal.T)[1][:, 1] @ horizontal
+    direction = np.linalg.eigh(horizontal @ covariance @ horizontal.T)[1][:, 1] @ horizontal
     held = without_noise_along(pairs, direction, np.ones(len(pairs.residuals), bool))
-    return WeakDirection(direction, float(np.sqrt(direction @ covariance_in_target(held) @ direction)))
+    return WeakDirection(direction, sigma_along(plane_information(held, T_target_source), R.T @ direction))
 
 
 def without_noise_along(
@@ -230,6 +234,20 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
         return 0.5
     along, across = source.information + target.information
     return float(along / (along + across))
+
+
+def surface_in_corridor(surface: Surface) -> tuple[Surface, Float[np.ndarray, "3"] | None]:
+    """Leaves normals only to firm elements where a scan was measured in a corridor.
+
+    Args:
+        surface: surface of a scan.
+
+    Returns:
+        The surface, and the axis of the corridor as a unit vector; elsewhere the given surface, and None.
+    """
+    firm = firm_surface(surface, FIRM_FLATNESS)
+    axis = wall_axis(firm)
+    return (firm, axis.axis) if weak_share(axis, axis) < CORRIDOR_SHARE else (surface, None)
 
 
 def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Poses:

@@ -29,11 +29,10 @@ from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces, nearest_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, firm_surface, range_image, surface_at, view_points
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
 from dpmjax.scans.weak_directions import (
     plane_information,
-    wall_axis,
-    weak_share,
+    surface_in_corridor,
     with_least_covariance,
     without_noise_along,
 )
@@ -82,13 +81,6 @@ MAX_ELEMENTS = 3000
 # In scans of 1,000 points neighbours are farther away.
 NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
 
-# In a corridor, the axis of the walls has a smaller share of the information of their normals.
-CORRIDOR_SHARE = 0.1
-
-# Least flatness of an element in a corridor. Beams graze its far walls and floor, and meet them in slices across the
-# corridor. The corners of a slice seem to face the axis, and they move with the lidar.
-FIRM_FLATNESS = 0.3
-
 # One element of each voxel of this size is chosen first, because ground near the lidar is dense.
 SPREAD_M = 1.5
 
@@ -124,10 +116,7 @@ class SurfaceGeometry:
         surface = surface_at(thinned, _spread_rows(thinned), NEIGHBOURHOODS)
         if np.count_nonzero(surface.flatness) < MIN_NUM_POINTS:
             return None
-        firm, weak_axis = firm_surface(surface, FIRM_FLATNESS), None
-        axis = wall_axis(firm)
-        if weak_share(axis, axis) < CORRIDOR_SHARE:
-            surface, weak_axis = firm, axis.axis
+        surface, weak_axis = surface_in_corridor(surface)
         extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
         return ThinnedScan(cloud, MeasuredScan(surface, range_image(thinned)), extent_m, weak_axis)
 
@@ -194,9 +183,8 @@ class SurfaceGeometry:
         matched, contradicted = _matched_share(surface, planes), _contradicted_share(local_map, scan.measured, T)
         pairs = planes.pairs
         if scan.weak_axis is not None:
-            has_normal = surface.flatness[surface.samples[: planes.meets.shape[1]]] > 0
-            is_firm = (planes.meets & has_normal)[planes.is_paired]
-            pairs = without_noise_along(pairs, T[:3, :3] @ scan.weak_axis, is_firm)
+            is_firm = planes.meets & (surface.flatness[surface.samples[: planes.meets.shape[1]]] > 0)
+            pairs = without_noise_along(pairs, T[:3, :3] @ scan.weak_axis, is_firm[planes.is_paired])
         information = with_least_covariance(plane_information(pairs, T), FLOOR_M, FLOOR_RAD)
         return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
 
