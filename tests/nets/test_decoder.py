@@ -158,6 +158,19 @@ def test_shared_layers_are_one_layer_applied_again(model: Model) -> None:
         np.testing.assert_allclose(found.features, expected.features, **ROUNDING)
 
 
+@pytest.mark.parametrize("is_crossed", [True, False])
+def test_features_depend_on_the_other_cloud_and_on_positions_only_if_crossed(is_crossed: bool) -> None:
+    config = replace(CONFIG, decoder=replace(CONFIG.decoder, is_crossed=is_crossed))
+    model, a = init_model(jax.random.key(3), config), cloud(23, 8)
+    first, _ = correlate(model, a, cloud(24, 8))
+    beside_another, _ = correlate(model, a, cloud(25, 8))
+    moved, _ = correlate(model, a.replace(positions=a.positions + 7.0), cloud(24, 8))
+    for other in (beside_another, moved):
+        assert np.allclose(first.features, other.features, **ACCUMULATED) != is_crossed
+    without_others, _ = correlate(model, a.replace(mask=jnp.arange(8) < 1), cloud(24, 8))
+    assert not np.allclose(first.features[0], without_others.features[0], **ACCUMULATED)
+
+
 def test_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
     pairs = [(cloud(18, 8), cloud(19, 8)), (cloud(20, 8), cloud(21, 8))]
     overlap(model, *pairs[0])

@@ -95,7 +95,7 @@ PRESETS: dict[str, ModelConfig] = {
     "tiny": ModelConfig(
         pyramid=_pyramid((1024, 512, 256, 64, 16), (16, 16, 16, 16, 8), (0.8,)),
         encoder=EncoderConfig(stem_channels=8, expansion=2, output_channels=64, frame="local"),
-        decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2),
+        decoder=DecoderConfig(input_channels=64, model_channels=64, num_heads=2, is_crossed=False),
         preprocess=PreprocessConfig(capacity=4096),
         matching=MatchConfig(pair_ratio=2.0, consensus=ConsensusConfig()),
     ),

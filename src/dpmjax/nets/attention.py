@@ -176,17 +176,20 @@ class PairAttention(nn.Module):
 
 
 class AttentionLayer(nn.Module):
-    """Self-attention, cross-attention and a two-layer network on a pair of clouds, each added and then normalised.
+    """Attention and a two-layer network on a pair of clouds, each added to its input and then normalised.
 
-    The position embedding is added to the features before both attentions. It is therefore in the queries, keys,
-    values and in the residual path (the published networks; the paper leaves it open). Both clouds share the weights.
+    Crossed, it has self-attention and cross-attention, and the position embedding is added to the features before
+    both. It is therefore in the queries, keys, values and in the residual path (the published networks; the paper
+    leaves it open). Otherwise it has self-attention alone, of features alone. Both clouds share the weights.
 
     Attributes:
         num_heads: heads of both attentions.
+        is_crossed: see `DecoderConfig.is_crossed`.
         compute_dtype: type of the matrix products.
     """
 
     num_heads: int
+    is_crossed: bool = True
     compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
@@ -200,17 +203,19 @@ class AttentionLayer(nn.Module):
 
         Args:
             features: the stacked rows of both clouds.
-            embeddings: embeddings of the positions, row for row.
+            embeddings: embeddings of the positions, row for row; read only if the layer is crossed.
             masks: masks of both clouds.
 
         Returns:
             New features, row for row.
         """
-        num_channels = features.shape[1]
-        x = features + embeddings
-        x += PairAttention(self.num_heads, False, self.compute_dtype, name="self_attention")(x, masks)
-        x = layer_norm("self_norm")(x) + embeddings
-        x += PairAttention(self.num_heads, True, self.compute_dtype, name="cross_attention")(x, masks)
-        x = layer_norm("cross_norm")(x)
-        x += TwoLayers(num_channels, num_channels, self.compute_dtype, name="network")(x)
+        num_channels, dtype = features.shape[1], self.compute_dtype
+        x = features + embeddings if self.is_crossed else features
+        x += PairAttention(self.num_heads, False, dtype, name="self_attention")(x, masks)
+        x = layer_norm("self_norm")(x)
+        if self.is_crossed:
+            x += embeddings
+            x += PairAttention(self.num_heads, True, dtype, name="cross_attention")(x, masks)
+            x = layer_norm("cross_norm")(x)
+        x += TwoLayers(num_channels, num_channels, dtype, name="network")(x)
         return layer_norm("network_norm")(x)

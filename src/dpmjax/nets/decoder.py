@@ -5,6 +5,7 @@ DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": p
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import flax.linen as nn
@@ -27,6 +28,10 @@ class DecoderConfig:
         num_layers: number of attention layers.
         num_heads: heads of each attention; divides `model_channels`.
         shares_layers: True for the same weights in all layers, as in the paper; False for the published networks.
+        is_crossed: True as in the published networks: positions are embedded, and descriptors attend to those of both
+            clouds. With False they attend to the features of their own cloud alone, which describe the surroundings
+            already. So the other cloud and, with local frames, turns and shifts change nothing in them, and training
+            needs fewer steps.
         predicts_offsets: False leaves all offsets at 0, for the ablation of Table 2.
         compute_dtype: type of the matrix products.
     """
@@ -36,6 +41,7 @@ class DecoderConfig:
     num_layers: int = 3
     num_heads: int = 8
     shares_layers: bool = False
+    is_crossed: bool = True
     predicts_offsets: bool = True
     compute_dtype: ComputeDtype = "float32"
 
@@ -160,14 +166,15 @@ class DescriptorDecoder(nn.Module):
         channels, dtype = config.model_channels, config.compute_dtype
         self.projection = linear(channels, dtype, "projection")
         num_different = 1 if config.shares_layers else config.num_layers
-        self.layers = [AttentionLayer(config.num_heads, dtype, name=f"layer_{i}") for i in range(num_different)]
+        layer = functools.partial(AttentionLayer, config.num_heads, config.is_crossed, dtype)
+        self.layers = [layer(name=f"layer_{i}") for i in range(num_different)]
         self.similarity_head = TwoLayers(channels, channels, dtype)
         self.offset_head = OffsetHead(channels, dtype)
         self.overlap_head = OverlapHead(channels, dtype)
         self.coarse_head = TwoLayers(config.input_channels, config.input_channels, dtype)
 
     def correlate(self, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
-        """Exchanges information between two clouds by attention.
+        """Relates each descriptor to others by attention: to those of both clouds, or of its own (`is_crossed`).
 
         Args:
             a: descriptors with `input_channels` channels.
