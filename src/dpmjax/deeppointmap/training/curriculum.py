@@ -212,7 +212,7 @@ NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
 PRESETS = {
     "tiny": TrainingConfig(
         model=model_preset("tiny"),
-        curriculum=(CurriculumStage(2, 380), CurriculumStage(4, 20)),
+        curriculum=(CurriculumStage(2, 300),),
         sampling=SamplingConfig(num_scans=16),
         # Few steps need weaker augmentation, more positives, and a direct loss on the encoder.
         augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.3),
