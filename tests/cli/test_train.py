@@ -156,7 +156,7 @@ def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_gr
     assert settings.sampling.num_scans == 96
     assert sum(map(sum, stage_layouts(32, settings.sampling)[0])) == 96
     with pytest.raises(ValueError, match="num_scans: expected at least the largest group, 4, got 3"):
-        training_settings(Config(scans=3))
+        training_settings(Config(scans=3, groups=(4,)))
 
 
 def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
