@@ -202,7 +202,7 @@ def matches_figure(
     dots = ((left, a[:, :2], SOURCE), (left, b[:, :2] + shift, MUTED), (right, b[:, :2], MUTED), (right, laid, SOURCE))
     for axes, points, color in dots:
         axes.plot(*points.T, ",", color=color, alpha=0.6)
-        axes.set_aspect("equal")
+        axes.set_aspect("equal", adjustable="datalim")
         axes.set_axis_off()
     for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(is_right, bool), strict=True):
         left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
