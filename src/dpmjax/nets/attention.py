@@ -178,42 +178,40 @@ class PairAttention(nn.Module):
 class AttentionLayer(nn.Module):
     """Attention and a two-layer network on a pair of clouds, each added to its input and then normalised.
 
-    Crossed, it has self-attention and cross-attention, and the position embedding is added to the features before
-    both. It is therefore in the queries, keys, values and in the residual path (the published networks; the paper
+    With embeddings of positions it has self-attention and cross-attention, and they are added to the features before
+    both. They are therefore in the queries, keys, values and in the residual path (the published networks; the paper
     leaves it open). Otherwise it has self-attention alone, of features alone. Both clouds share the weights.
 
     Attributes:
         num_heads: heads of both attentions.
-        is_crossed: see `DecoderConfig.is_crossed`.
         compute_dtype: type of the matrix products.
     """
 
     num_heads: int
-    is_crossed: bool = True
     compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
     def __call__(
         self,
         features: Float[Array, "rows c"],
-        embeddings: Float[Array, "rows c"],
+        embeddings: Float[Array, "rows c"] | None,
         masks: tuple[Bool[Array, " m"], Bool[Array, " n"]],
     ) -> Float[Array, "rows c"]:
         """Applies the layer to both clouds.
 
         Args:
             features: the stacked rows of both clouds.
-            embeddings: embeddings of the positions, row for row; read only if the layer is crossed.
+            embeddings: embeddings of the positions, row for row; None for self-attention alone.
             masks: masks of both clouds.
 
         Returns:
             New features, row for row.
         """
         num_channels, dtype = features.shape[1], self.compute_dtype
-        x = features + embeddings if self.is_crossed else features
+        x = features if embeddings is None else features + embeddings
         x += PairAttention(self.num_heads, False, dtype, name="self_attention")(x, masks)
         x = layer_norm("self_norm")(x)
-        if self.is_crossed:
+        if embeddings is not None:
             x += embeddings
             x += PairAttention(self.num_heads, True, dtype, name="cross_attention")(x, masks)
             x = layer_norm("cross_norm")(x)

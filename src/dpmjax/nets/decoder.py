@@ -5,7 +5,6 @@ DeepPointMap section 3.2. Call a method by its name: `decoder.apply({"params": p
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 
 import flax.linen as nn
@@ -30,8 +29,8 @@ class DecoderConfig:
         shares_layers: True for the same weights in all layers, as in the paper; False for the published networks.
         is_crossed: True as in the published networks: positions are embedded, and descriptors attend to those of both
             clouds. With False they attend to the features of their own cloud alone, which describe the surroundings
-            already. So the other cloud and, with local frames, turns and shifts change nothing in them, and training
-            needs fewer steps.
+            already. The result then depends neither on the other cloud nor on positions, and training needs fewer
+            steps.
         predicts_offsets: False leaves all offsets at 0, for the ablation of Table 2.
         compute_dtype: type of the matrix products.
     """
@@ -166,8 +165,7 @@ class DescriptorDecoder(nn.Module):
         channels, dtype = config.model_channels, config.compute_dtype
         self.projection = linear(channels, dtype, "projection")
         num_different = 1 if config.shares_layers else config.num_layers
-        layer = functools.partial(AttentionLayer, config.num_heads, config.is_crossed, dtype)
-        self.layers = [layer(name=f"layer_{i}") for i in range(num_different)]
+        self.layers = [AttentionLayer(config.num_heads, dtype, name=f"layer_{i}") for i in range(num_different)]
         self.similarity_head = TwoLayers(channels, channels, dtype)
         self.offset_head = OffsetHead(channels, dtype)
         self.overlap_head = OverlapHead(channels, dtype)
@@ -185,7 +183,9 @@ class DescriptorDecoder(nn.Module):
         """
         masks = (a.mask, b.mask)
         a, b = _cleared(a), _cleared(b)
-        embeddings = embed_positions(jnp.concatenate([a.positions, b.positions]), self.config.model_channels)
+        embeddings = None
+        if self.config.is_crossed:
+            embeddings = embed_positions(jnp.concatenate([a.positions, b.positions]), self.config.model_channels)
         x = self.projection(jnp.concatenate([a.features, b.features])).astype(jnp.float32)
         for i in range(self.config.num_layers):
             x = self.layers[i % len(self.layers)](x, embeddings, masks)
