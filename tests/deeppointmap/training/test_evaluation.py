@@ -7,7 +7,7 @@ import functools
 import jax
 import numpy as np
 
-from dpmjax.deeppointmap import draw_evaluation_pairs, evaluate_registration, init_model
+from dpmjax.deeppointmap import PairKind, draw_evaluation_pairs, evaluate_registration, init_model
 from dpmjax.deeppointmap.training.step import encode_sample
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -21,3 +21,17 @@ def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
     np.testing.assert_array_equal(clouds.mask, expected.mask)
     np.testing.assert_allclose(clouds.positions, expected.positions, atol=1e-4)
     np.testing.assert_allclose(clouds.features, expected.features, **ACCUMULATED)
+
+
+def test_a_map_holds_its_first_scan_once() -> None:
+    kind = PairKind(2.0, 10.0, num_scans=4)
+    some = draw_evaluation_pairs(toy.drive(num_scans=12, step_m=3.0), 20, toy.MODEL, kinds=(kind,)).pairs[0]
+    for rows in (*some.sources, *some.targets):
+        assert np.count_nonzero(rows == rows[0]) == 1
+        assert len(set(rows.tolist())) == 4
+
+
+def test_a_scan_without_neighbours_is_repeated() -> None:
+    kind = PairKind(10.0, 14.0, num_scans=3)
+    some = draw_evaluation_pairs(toy.drive(num_scans=4, step_m=12.0), 2, toy.MODEL, kinds=(kind,)).pairs[0]
+    np.testing.assert_array_equal(some.sources, some.sources[:, :1].repeat(3, axis=1))

@@ -127,11 +127,6 @@ class Evaluation(NamedTuple):
     matches: tuple[Registration, ...]
     clouds: DescriptorCloud
 
-    @property
-    def mean_recall(self) -> float:
-        """Mean recall over the kinds."""
-        return float(np.mean([recall.recall for recall in self.recalls]))
-
 
 def draw_evaluation_pairs(
     drive: LidarSequence,
@@ -175,8 +170,10 @@ def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.G
         raise ValueError(f"drive: expected scans {kind.min_distance_m} to {kind.max_distance_m} m apart, got none")
 
     def maps(rows: Int[np.ndarray, " p"]) -> Int[np.ndarray, "p s"]:
-        near = [np.flatnonzero(distances[row] <= MAP_RADIUS_M) for row in rows]
-        others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans) for around in near]
+        is_near = (distances <= MAP_RADIUS_M) & ~np.eye(len(distances), dtype=bool)
+        # A scan without neighbours is repeated.
+        near = [np.flatnonzero(is_near[row]) if is_near[row].any() else np.array([row]) for row in rows]
+        others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans - 1) for around in near]
         return np.concatenate([rows[:, None], np.stack(others)], axis=1).astype(int)
 
     return Pairs(kind, maps(pairs[:, 0]), maps(pairs[:, 1]))
