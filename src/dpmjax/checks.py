@@ -128,7 +128,7 @@ def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
     return ScanSet(points=clean, mask=mask)
 
 
-def require_shape(name: str, array: jax.Array, shape: tuple[int, ...]) -> None:
+def require_shape(name: str, array: AnyArray, shape: tuple[int, ...]) -> None:
     """Checks a shape.
 
     Args:

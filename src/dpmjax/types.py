@@ -1,7 +1,7 @@
 """The records of the project: frozen pytrees of arrays and masks.
 
 Ragged things are capacity + mask: an array of fixed size and a boolean of the same leading shape, True for
-valid entries. Masked entries may hold any finite number and never take part in a result.
+valid entries. Masked entries may hold anything, NaN too, and never take part in a result.
 """
 
 from __future__ import annotations
@@ -142,8 +142,8 @@ class Verification(NamedTuple):
         num_slid: number of further motions along a weak axis; 0 where the walls constrain all directions.
         facing_gap: lead over the best other motion, or over 0, in elements that face the weak axis: those that meet,
             less a penalty of those that contradict. It is 0 where no axis is weak.
-        lookalike_gap: lead of `score` over the best motion to another place where the scans look alike from above;
-            infinite where no such motion was tried.
+        lookalike_gap: lead of `score` over the best motion to any other place, those where the scans look alike from
+            above among them; infinite where none of these was tried.
     """
 
     visible_share: float
@@ -166,7 +166,8 @@ class Registration:
         confidence: number in [0, 1]. With a calibrated model, `register` makes it the probability that the motion is
             right within 2 m and 5 degrees. Without calibration it is `mean_score`, which is no probability.
         mean_score: mean score of the first inliers, in [0, 1]; 0 without any.
-        rmse: root mean square error of the inliers after alignment, metres; infinite without any.
+        rmse: root mean square error of the inliers after alignment, metres; infinite with fewer than three distinct
+            pairs.
         support: consensus support of the motion: sum of 1 - error / tolerance over distinct pairs.
         num_inliers: number of pairs that determine the motion, both directions counted.
         source_indices: row of each pair in the source; first the pairs of eq. 1, then the same of eq. 2.

@@ -203,3 +203,27 @@ def test_clouds_that_share_nothing_stay_where_they_are(model, scans) -> None:
     match = dpmjax.register(model, empty, dpmjax.encode(model, scans[0]), refine=True)
     np.testing.assert_array_equal(match.T_target_source, np.eye(4))
     assert match.confidence == 0
+
+
+def test_a_batch_with_an_empty_scan_equals_single_calls(model, scans) -> None:
+    pairs = [(scans[0], scans[1]), (scans[0][:4], scans[1]), (scans[1], scans[0][:0])]
+    together = dpmjax.register_pairs(model, *zip(*pairs, strict=True))
+    for row, pair in enumerate(pairs):
+        one = dpmjax.register(model, *pair)
+        np.testing.assert_array_equal(together.T_target_source[row], one.T_target_source)
+        assert together.confidence[row] == one.confidence
+        assert together.weak_sigma_m[row] == one.weak_sigma_m
+    np.testing.assert_array_equal(np.asarray(together.confidence)[1:], 0)
+
+
+def test_a_batch_of_scans_and_of_clouds_is_refused(as_user, model, scans) -> None:
+    with pytest.raises(ValueError, match="expected scans in all pairs"):
+        dpmjax.register_pairs(model, scans, [scans[1], dpmjax.encode(model, scans[0])])
+
+
+def test_overlap_refuses_two_scales(as_user, model, scans) -> None:
+    prepared = [prepare_scan(model, scan, scale=scale) for scan, scale in zip(scans, (1.0, 2.0), strict=True)]
+    for pair in (prepared, (prepared[1], scans[0])):
+        with pytest.raises(ValueError, match="got scales 1 and 2"):
+            dpmjax.overlap(model, *pair)
+    assert 0 <= dpmjax.overlap(model, prepared[1], prepared[1]) <= 1

@@ -301,3 +301,12 @@ def test_consensus_finds_the_motion_where_scores_mislead() -> None:
     by_consensus = match_clouds(source, target, similarity, config=config)
     np.testing.assert_allclose(by_consensus.T_target_source, T, atol=0.1)
     assert np.abs(by_score.T_target_source - T).max() > 1.0
+
+
+@pytest.mark.parametrize("ratio", [0.29, 0.35, 0.58, 0.7, 1.16])
+def test_padding_changes_no_number_of_pairs(ratio: float) -> None:
+    config = MatchConfig(pair_ratio=ratio)
+    similarity = jax.random.uniform(jax.random.key(0), (60, 60))
+    plain = best_pairs(similarity[:50, :50], jnp.ones(50, bool), jnp.ones(50, bool), config=config)
+    padded = best_pairs(similarity, jnp.arange(60) < 50, jnp.arange(60) < 50, config=config)
+    assert padded.mask.sum() == plain.mask.sum()

@@ -154,7 +154,7 @@ def test_the_map_is_the_sum_of_its_levels() -> None:
     np.testing.assert_allclose(jax.jit(make_map_net(config).apply)(params, points, weights), expected, **ACCUMULATED)
 
 
-@pytest.mark.parametrize("resolutions", [(4, 12), (8, 4), (3, 6)])
+@pytest.mark.parametrize("resolutions", [(4, 12), (8, 4), (3, 6), ()])
 def test_levels_that_do_not_double_are_refused(resolutions) -> None:
     with pytest.raises(ValueError, match="resolutions"):
         OccupancyConfig(kind="grid", resolutions=resolutions)
@@ -173,3 +173,9 @@ def test_levels_that_are_off_do_not_count() -> None:
 def test_strides_belong_to_layers() -> None:
     with pytest.raises(ValueError, match="strides"):
         LocalizationNetConfig(strides=(1, 1))
+
+
+@pytest.mark.parametrize(("make", "name"), [(OccupancyConfig, "gird"), (LocalizationNetConfig, "cnv")])
+def test_an_unknown_kind_is_refused(as_user, make, name: str) -> None:
+    with pytest.raises(ValueError, match=f"kind: .*{name}"):
+        make(kind=name)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.scans.surfaces import scan_surface
-from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
+from dpmjax.scans.view_correlation import NUM_CELLS, ViewCorrelationConfig, _best_peaks, correlate_views
 from tests.scans.surface_scenes import motion, seen_from, street
 
 CONFIG = ViewCorrelationConfig()
@@ -66,3 +66,12 @@ def test_what_has_no_upright_surface_gives_no_motion() -> None:
 def test_settings_out_of_range_are_named() -> None:
     with pytest.raises(ValueError, match="num_motions"):
         ViewCorrelationConfig(num_motions=-1)
+
+
+def test_of_equal_peaks_the_first_are_kept() -> None:
+    scores = np.zeros((1, NUM_CELLS, NUM_CELLS))
+    found = _best_peaks(scores, np.zeros(1), 1.0, 2)
+    assert found[0] == (0.0, 0.0, 0.0)
+    assert found == _best_peaks(scores, np.zeros(1), 1.0, 2)
+    scores[0, 5, 7] = 1.0
+    assert _best_peaks(scores, np.zeros(1), 1.0, 1) == [(0.0, 5.0, 7.0)]

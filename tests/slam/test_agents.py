@@ -11,7 +11,8 @@ import dpmjax
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import AgentsResult, SlamConfig, SlamMethods, run_agents, take_component
+from dpmjax.slam import AgentsResult, SlamConfig, SlamMethods, run_agents, run_slam, take_component
+from dpmjax.slam.agents import join_agents
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
 CONFIG = SlamConfig()
@@ -208,3 +209,11 @@ def test_poses_are_those_of_a_moved_world() -> None:
     a, b = run(PARTS), run(PARTS, truth=moved)
     assert a.component == b.component
     assert joint_error_m(b, PARTS, (0, 1, 2), moved) < 1.0
+
+
+def test_an_agent_that_extended_a_map_is_refused(as_user) -> None:
+    methods = methods_of(TRUTH)
+    first = run_slam(methods, scans_of(PARTS[0]))
+    second = run_slam(methods, scans_of(PARTS[1]), slam_map=first.map)
+    with pytest.raises(ValueError, match="runs that began with an empty map"):
+        join_agents(methods, [first, second])

@@ -221,3 +221,8 @@ def test_a_submap_is_in_the_frame_of_its_centre(num_keyframes) -> None:
     assert len(numbers) == num_keyframes
     expected = rigid.inverse(truth[10]) @ truth[numbers]
     np.testing.assert_allclose(submap.T_submap_keyframe, expected, atol=1e-9)
+
+
+def test_of_equal_vectors_the_first_are_returned() -> None:
+    vectors = np.tile(np.float32([0.6, 0.8]), (250, 1))
+    np.testing.assert_array_equal(most_similar(vectors, vectors[0], 16)[0], np.arange(16))

@@ -8,6 +8,7 @@ import pytest
 from dpmjax.geometry import rigid
 from dpmjax.slam import SlamConfig, SlamMethods, run_slam
 from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts, thin_map
+from dpmjax.slam.loops import loops_of_map
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
@@ -41,3 +42,10 @@ def test_edges_join_what_they_joined(as_user) -> None:
     assert len(thin_map(KeyframeMap())) == 0
     with pytest.raises(ValueError, match="spacing_share: expected"):
         thin_map(MAP, spacing_share=0.0)
+
+
+def test_loops_of_a_thinned_map_are_in_the_order_of_their_sources() -> None:
+    for spacing_share in (0.2, 0.8, 1.5):
+        sources = [loop.source for loop in loops_of_map(thin_map(MAP, spacing_share=spacing_share)).loops]
+        assert len(sources) > 1
+        assert sources == sorted(sources)

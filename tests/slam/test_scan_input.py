@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
-from dpmjax.slam import in_advance
+from dpmjax.slam import TimedScan, in_advance
+from dpmjax.slam.system import corrected_points
 
 
 @pytest.mark.parametrize("num", [0, 1, 5])
@@ -31,3 +33,8 @@ def test_an_error_takes_the_place_of_its_result() -> None:
     assert next(results) == 1
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+def test_another_number_of_times_than_of_points_is_refused(as_user) -> None:
+    with pytest.raises(ValueError, match=r"scan.offsets: expected shape \(5,\), got \(4,\)"):
+        corrected_points(TimedScan(np.zeros((5, 3)), np.zeros(4)), np.eye(4))

@@ -113,7 +113,7 @@ class MatchEvidence(NamedTuple):
         of_clouds: `CLOUD_FEATURES`.
         of_scans: `SCAN_FEATURES`; None without scans.
         of_weak_scans: `WEAK_FEATURES`; None where the walls constrain all directions, and without scans.
-        lookalike_gap: lead over other places that look alike, as log odds; infinite without such places.
+        lookalike_gap: lead over other places, as log odds; infinite where none looks alike.
     """
 
     of_clouds: Float[np.ndarray, " f"]

@@ -132,7 +132,9 @@ class BestPairs(NamedTuple):
 
 
 def dual_softmax(similarity: Float[Array, "m n"], is_pair: Bool[Array, "m n"]) -> Float[Array, "m n"]:
-    """Computes the product of the softmaxes over rows and over columns (DeepPointMap section 3.2).
+    """Computes the product of the softmaxes over rows and over columns.
+
+    Published program of DeepPointMap; section 3.2 ranks by the cosine itself.
 
     Args:
         similarity: cosine of each pair of descriptors.
@@ -166,7 +168,8 @@ def best_pairs(
     """
     num_source, num_target = similarity.shape
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
-    wanted = int(config.pair_ratio * (num_source + num_target)) // 2
+    # In float32, as the number of valid pairs below: padding must not change it.
+    wanted = int(np.float32(config.pair_ratio) * np.float32(num_source + num_target)) // 2
     capacity = min(wanted, MAX_NUM_PAIRS, num_source * num_target)
     is_pair = source_mask[:, None] & target_mask[None, :]
     scores = dual_softmax(similarity, is_pair)
@@ -315,22 +318,22 @@ def merge_clouds(clouds: DescriptorCloud, T_map_cloud: Float[AnyArray, "s 4 4"])
     return merged
 
 
-def thin_merged(merged: DescriptorCloud, num_a_cloud: int) -> DescriptorCloud:
+def thin_merged(merged: DescriptorCloud, num_per_cloud: int) -> DescriptorCloud:
     """Removes descriptors of a union near those of earlier clouds, on the host; see `thinned_mask`.
 
     Args:
         merged: union from `merge_clouds`, without further surface elements.
-        num_a_cloud: number of descriptors of each cloud.
+        num_per_cloud: number of descriptors of each cloud.
 
     Returns:
         The union with a smaller mask.
     """
-    mask = thinned_mask(np.asarray(merged.positions), np.asarray(merged.mask), num_a_cloud)
+    mask = thinned_mask(np.asarray(merged.positions), np.asarray(merged.mask), num_per_cloud)
     return replace(merged, mask=jnp.asarray(mask))
 
 
 def thinned_mask(
-    positions: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_a_cloud: int
+    positions: Float[np.ndarray, "n 3"], mask: Bool[np.ndarray, " n"], num_per_cloud: int
 ) -> Bool[np.ndarray, " n"]:
     """Removes descriptors of a union near those of earlier clouds.
 
@@ -340,18 +343,18 @@ def thinned_mask(
     Args:
         positions: positions of the clouds of the union, cloud by cloud, in one frame, metres.
         mask: False for descriptors that are not there.
-        num_a_cloud: number of descriptors of each cloud.
+        num_per_cloud: number of descriptors of each cloud.
 
     Returns:
         The mask without the removed ones.
     """
     mask = np.array(mask)
-    first = positions[:num_a_cloud][mask[:num_a_cloud]]
-    if len(first) < 2 or len(positions) == num_a_cloud:
+    first = positions[:num_per_cloud][mask[:num_per_cloud]]
+    if len(first) < 2 or len(positions) == num_per_cloud:
         return mask
     spacing_m = np.median(np.asarray(cKDTree(first).query(first, 2)[0])[:, 1])
-    for start in range(num_a_cloud, len(positions), num_a_cloud):
-        rows = np.arange(start, start + num_a_cloud)[mask[start : start + num_a_cloud]]
+    for start in range(num_per_cloud, len(positions), num_per_cloud):
+        rows = np.arange(start, start + num_per_cloud)[mask[start : start + num_per_cloud]]
         if len(rows):
             mask[rows] = cKDTree(positions[:start][mask[:start]]).query(positions[rows])[0] > spacing_m
     return mask

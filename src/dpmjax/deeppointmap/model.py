@@ -112,7 +112,8 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
             descriptors in the order of farthest points have no features. None for the descriptors alone.
 
     Returns:
-        `config.num_descriptors` descriptors, and the further elements; zero where the mask is False.
+        `config.num_descriptors` descriptors, and the further elements; positions, features and normals are 0 where the
+        mask is False.
 
     Raises:
         ValueError: if the pyramid has other stages than the model, or if `num_elements` is out of range.

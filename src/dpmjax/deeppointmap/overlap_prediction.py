@@ -56,16 +56,19 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     high. A model without calibration uses the decoder's head (DeepPointMap section 3.2), which is right for published
     weights only.
 
-    Raises a `ValueError` if the points are no real numbers (n, 3), or if features have another width than the model.
+    Raises a `ValueError` if the points are no real numbers (n, 3), if features have another width than the model, or if
+    the scans have different scales.
 
     Args:
         model: encoder and decoder.
-        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
+        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud. Distances are in metres
+            times the scale of the scans.
         target: the same; the order matters a little.
 
     Returns:
         The probability; 0 where a scan is empty or a feature is not finite.
     """
+    _require_one_scale(source, target)
     clouds = [
         descriptors_of(scan if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan))
         for scan in (source, target)
@@ -76,7 +79,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 
-    Raises a `ValueError` if the lengths differ or are 0.
+    Raises a `ValueError` if the lengths differ or are 0, or if the scans of a pair have different scales.
 
     Args:
         model: encoder and decoder.
@@ -165,9 +168,19 @@ def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) ->
     return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
 
 
+def _require_one_scale(source: ScanOrCloud, target: ScanOrCloud) -> None:
+    """Refuses scans of two scales; that of a descriptor cloud is unknown, that of a raw scan is 1."""
+    scans = [scan for scan in (source, target) if not isinstance(scan, DescriptorCloud)]
+    scales = {scan.scale if isinstance(scan, PreparedScan) else 1.0 for scan in scans}
+    if len(scales) > 1:
+        raise ValueError(f"target: expected the scale of the source, got scales {min(scales):g} and {max(scales):g}")
+
+
 def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
     """Applies a function of one pair to all pairs; each scan is encoded once."""
     require_pairs(sources, targets)
+    for source, target in zip(sources, targets, strict=True):
+        _require_one_scale(source, target)
     clouds: dict[int, DescriptorCloud] = {}
     raw: dict[int, RawScan] = {}
     for scan in (*sources, *targets):

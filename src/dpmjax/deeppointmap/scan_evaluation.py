@@ -106,6 +106,8 @@ class ScanEvaluation(NamedTuple):
 def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
     """Registers a pair as `register` does with `refine=True`, and measures each stage.
 
+    Scans of fewer than 20 descriptors, which `register` does not register, are treated as all others.
+
     Args:
         model: encoder and decoder.
         pair: two scans.
@@ -166,7 +168,7 @@ def evaluate_scan_pairs(model: Model, pairs: Iterable[ScanPair]) -> ScanEvaluati
 
 def _confidence(model: Model, evidence: MatchEvidence) -> float:
     calibration = model.config.calibration
-    if calibration is None or evidence.of_scans is None:
+    if calibration is None:
         return float(evidence.of_clouds[1])
     return calibrated_probability(calibration, evidence)
 

@@ -32,6 +32,9 @@ NUM_ELEMENTS = 1024
 # Fewer descriptors fit each other by chance: any two sets of three points have a motion.
 MIN_DESCRIPTORS = 20
 
+# Agreement of two scans of which one has too few descriptors.
+NOT_COMPARED = Verification(0.0, 0.0, 0.0, 0.0)
+
 # Fields of `Registration` that are 0 for a motion that no pairs of descriptors support.
 OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
 
@@ -119,7 +122,7 @@ def register_each(
             pair_scale = _shared_scale(source, target, scale)
             hypotheses = _in_metres(in_cloud_units, pair_scale)
             if min(int(np.sum(cloud.described.mask)) for cloud in clouds) < MIN_DESCRIPTORS:
-                motion = pool.submit(_RegisteredMotion, None, np.eye(4))
+                motion = pool.submit(_unregistered, source, target)
             elif isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
                 scans = source.measured, target.measured
                 motion = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
@@ -142,8 +145,6 @@ def register_pairs(
 ) -> Registration:
     """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
 
-    Raises a `ValueError` if the lengths differ or are 0, or where `register` raises one for a pair.
-
     Args:
         model: encoder and decoder.
         sources: raw scans, prepared scans or descriptor clouds; clouds must have one capacity.
@@ -154,9 +155,16 @@ def register_pairs(
 
     Returns:
         All fields with a leading axis, in the order of the pairs.
+
+    Raises:
+        ValueError: if the lengths differ or are 0, if some pairs are scans and others have a descriptor cloud, or where
+            `register` raises one for a pair.
     """
     require_pairs(sources, targets)
-    found = register_each(model, list(zip(sources, targets, strict=True)), config=config, refine=refine, scale=scale)
+    pairs = list(zip(sources, targets, strict=True))
+    if len({any(isinstance(scan, DescriptorCloud) for scan in pair) for pair in pairs}) > 1:
+        raise ValueError("sources, targets: expected scans in all pairs, or a descriptor cloud in each, got both")
+    found = register_each(model, pairs, config=config, refine=refine, scale=scale)
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
 
 
@@ -229,6 +237,13 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
     T = np.array(hypotheses.T_target_source)
     T[:, :3, 3] /= scale
     return replace(hypotheses, T_target_source=jnp.asarray(T), rmse=hypotheses.rmse / np.float32(scale))
+
+
+def _unregistered(*scans: DescriptorCloud | PreparedScan) -> _RegisteredMotion:
+    """Returns the identity, with all fields that a registration of two scans has."""
+    if any(isinstance(scan, DescriptorCloud) for scan in scans):
+        return _RegisteredMotion(None, np.eye(4))
+    return _RegisteredMotion(None, np.eye(4), None, NOT_COMPARED, WeakDirection(np.zeros(3), np.inf))
 
 
 def _verified(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from itertools import product
@@ -13,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from dpmjax.checks import require_one_of, require_some
 
 # Xavier-uniform with the gain of ReLU, as in the published networks.
 HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
@@ -39,6 +40,7 @@ class LocalizationNetConfig:
     output_scale: float = 1.0
 
     def __post_init__(self) -> None:
+        require_one_of("kind", self.kind, ("conv", "point"))
         if self.kind == "conv" and len(self.strides) != len(self.features):
             raise ValueError(f"strides: expected one for each of {len(self.features)} layers, got {self.strides}")
 
@@ -73,7 +75,7 @@ class DilatedConvolution(nn.Module):
         )
         taps = [
             padded[tuple(slice(k * _DILATION, k * _DILATION + n, self.stride) for k, n in zip(tap, size, strict=True))]
-            for tap in itertools.product(range(3), repeat=len(size))
+            for tap in product(range(3), repeat=len(size))
         ]
         return nn.Dense(self.features, kernel_init=HE_LIKE)(jnp.concatenate(taps, axis=-1))
 
@@ -131,6 +133,8 @@ class OccupancyConfig:
     resolutions: tuple[int, ...] = (16, 32, 64, 128, 256, 512)
 
     def __post_init__(self) -> None:
+        require_one_of("kind", self.kind, ("mlp", "resmlp", "grid"))
+        require_some("resolutions", self.resolutions)
         expected = tuple(self.resolutions[0] * 2**level for level in range(len(self.resolutions)))
         if self.resolutions != expected or self.resolutions[0] % 2:
             raise ValueError(f"resolutions: expected an even number and its doubles, got {self.resolutions}")
@@ -191,9 +195,8 @@ def interpolate_grid(grid: Float[Array, "*size"], points: Float[Array, "n d"]) -
     total = jnp.zeros((points.shape[0], 2), points.dtype)
     for sides in product((0, 1), repeat=dimensions - 1):
         shares = [part[:, axis] if side else 1.0 - part[:, axis] for axis, side in enumerate(sides)]
-        total += math.prod(shares, start=jnp.ones(len(points)))[:, None] * read(
-            (corner + jnp.array([*sides, 0])) @ strides
-        )
+        share = math.prod(shares, start=jnp.ones(len(points), points.dtype))
+        total += share[:, None] * read((corner + jnp.array([*sides, 0])) @ strides)
     return total[:, 0] + part[:, -1] * (total[:, 1] - total[:, 0])
 
 

@@ -37,9 +37,9 @@ ADVICE, RESUME_ADVICE = "save it again with dpmjax.save_map", "start the run aga
 
 # Prefix of the arrays of the map in the file of a state.
 MAP = "map."
-OF_LOOPS = ("loops",)
+NOT_IN_LOOPS = ("loops",)
 # Fields that are stored separately, or computed from the map.
-OF_FRONT_END = ("local_map", "recent", "lost", "scores")
+NOT_IN_FRONT_END = ("local_map", "recent", "lost", "scores")
 
 
 def save_map(
@@ -50,9 +50,9 @@ def save_map(
     Args:
         path: must end in `.npz`; an existing file is replaced.
         slam_map: map of a run, `result.map`, with at least one keyframe.
-        precision: with "float32" the file is exact: a run that continues from it equals an unbroken one. With "int8" it
-            is smallest, for localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and
-            omits keyframes that those of other laps cover (`slam.thin_map`).
+        precision: with "float32" the loaded map equals the saved one. With "int8" the file is smallest, for
+            localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and omits keyframes
+            that those of other laps cover (`slam.thin_map`).
         spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
             0.2 for "int8" and 0 for "float32".
 
@@ -209,10 +209,9 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
     if front_end.local_map is not None:
         raise ValueError("state: expected the state after a keyframe, got scans since the last one")
     arrays = {f"{MAP}{name}": array for name, array in map_arrays(slam_map, "float32").items()}
-    arrays |= (
-        to_columns(reports, "report") | to_columns(loops.loops, "loop") | to_columns([loops], "loops", without=OF_LOOPS)
-    )
-    arrays |= to_columns(front_end.recent, "recent") | to_columns([front_end], "front_end", without=OF_FRONT_END)
+    arrays |= to_columns(reports, "report") | to_columns(loops.loops, "loop")
+    arrays |= to_columns([loops], "loops", without=NOT_IN_LOOPS)
+    arrays |= to_columns(front_end.recent, "recent") | to_columns([front_end], "front_end", without=NOT_IN_FRONT_END)
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, scores=np.array(front_end.scores), **arrays)
     return write_atomically(path, content.getvalue())
@@ -238,8 +237,8 @@ def load_state(path: str | Path) -> RunState:
     except InputError as error:
         raise InputError(path, error.found, RESUME_ADVICE) from error
     with refusing(path, "damaged: {error}", RESUME_ADVICE, (Exception,)):
-        (loops,) = from_columns(LoopState, arrays, "loops", without=OF_LOOPS)
-        (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=OF_FRONT_END)
+        (loops,) = from_columns(LoopState, arrays, "loops", without=NOT_IN_LOOPS)
+        (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=NOT_IN_FRONT_END)
         recent = tuple(from_columns(PlacedElements, arrays, "recent"))
         front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent, lost=())
         loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
@@ -298,6 +297,6 @@ def from_columns(
         found: Any = column.tolist() if column.ndim == 1 else column
         if f"{key}.lengths" in columns:
             found = np.split(column, np.cumsum(columns[f"{key}.lengths"])[:-1])
-        rest = iter(found)
-        fields.append([next(rest) if there else None for there in is_there])
+        remaining = iter(found)
+        fields.append([next(remaining) if there else None for there in is_there])
     return [record_type(*values) for values in zip(*fields, strict=True)] if num else []

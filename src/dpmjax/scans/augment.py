@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
+from dpmjax.geometry.bearing import to_ray_frame
 from dpmjax.geometry.rigid import namespace_of
 from dpmjax.scans.preprocess import farthest_first
 from dpmjax.types import AnyArray, PointCloud, Poses
@@ -69,7 +70,7 @@ class AugmentConfig:
         max_drop_ratio: largest share of points that a scan loses; the share is uniform from 0 to this.
         sparse_probability: probability that a scan is thinned further, as by a lidar of few beams.
         sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
-            scan in ten is occluded (DeepPointMap section 3.3), by either at equal odds.
+            scan in ten is occluded, by either at equal odds.
         box_probability: probability that boxes occlude a scan.
         max_yaw_rad: largest rotation about z, to either side.
         max_tilt_rad: largest rotation about x and about y, to either side.
@@ -244,13 +245,8 @@ def is_behind_box(
     Returns:
         True for hidden points.
     """
-    cos, sin = jnp.cos(heading), jnp.sin(heading)
-
-    def turn(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-        x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-        return jnp.stack([cos * x + sin * y, cos * y - sin * x, z], axis=-1)
-
-    direction, origin = turn(jnp.asarray(points)), -turn(jnp.asarray(centre))
+    along = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    direction, origin = to_ray_frame(points, along), -to_ray_frame(centre, along)
     # A beam parallel to a slab never crosses its planes; with a tiny slope, both crossings are far away.
     tiny = jnp.finfo(points.dtype).eps
     slope = jnp.where(jnp.abs(direction) < tiny, tiny, direction)

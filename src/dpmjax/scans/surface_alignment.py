@@ -111,8 +111,8 @@ class NearestPlanes(NamedTuple):
     """Samples of the source under several motions, and the planes of the target nearest to them.
 
     Attributes:
-        is_paired: (s, n) True if a point of the target is within the radius; all further fields are undefined where it
-            is False.
+        is_paired: (s, n) True if a point of the target is within the radius; where it is False, all further fields but
+            `points` are undefined.
         points: (s, n, 3) samples in the frame of the target.
         residuals: (s, n) signed distances to the planes, metres.
         normals: (s, n, 3) normals of the planes.
@@ -150,7 +150,7 @@ def align_surfaces(source: Surface, target: Surface, T_target_source: Poses, con
         config: levels and kernel.
 
     Returns:
-        The motion from each first guess, float64; the guess itself where there are too few pairs.
+        The motion from each first guess, float64; that of the step before where there are too few pairs.
     """
     T = np.array(T_target_source, np.float64)
     has_pairs = np.ones(len(T), bool)

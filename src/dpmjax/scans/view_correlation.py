@@ -180,8 +180,10 @@ def _best_peaks(
     is_near = np.hypot(shifts[:, None], shifts) <= SHIFT_SHARE * NUM_CELLS * cell_m
     flat = np.flatnonzero(is_near)
     within = scores.reshape(len(turns), -1)[:, flat]
-    best = np.argpartition(-within, min(NUM_PEAKS, within.size - 1), axis=None)[:NUM_PEAKS]
-    best = best[np.argsort(-within.ravel()[best], kind="stable")]
+    last = min(NUM_PEAKS, within.size) - 1
+    # Which of several equal values a partition keeps depends on the processor; the least of those kept does not.
+    best = np.flatnonzero(within.ravel() >= -np.partition(-within, last, axis=None)[last])
+    best = best[np.argsort(-within.ravel()[best], kind="stable")][: last + 1]
     turn, cell = np.unravel_index(best, within.shape)
     x, y = (shifts[part] for part in np.unravel_index(flat[cell], is_near.shape))
     remaining, found = np.ones(len(best), bool), list[tuple[float, float, float]]()

@@ -154,7 +154,12 @@ def join_agents(
 
     Returns:
         Trajectories, who has met whom, the joined graph, bytes sent.
+
+    Raises:
+        ValueError: if an agent extended an earlier map, or if a map was made by another matcher.
     """
+    if any(agent.reports and agent.reports[0].scan != 0 for agent in agents):
+        raise ValueError("agents: expected runs that began with an empty map, got one that extended a map")
     joined = join_maps(methods, [agent.map for agent in agents], on_keyframe=on_keyframe)
     trajectories, traffic = _trajectories(joined, agents), tuple(map(_traffic, agents))
     return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)

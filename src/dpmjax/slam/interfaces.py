@@ -1,6 +1,7 @@
 """The parts of SLAM that are arguments: a matcher, the geometry of odometry, and settings.
 
-`SurfaceGeometry` (`odometry`) aligns scans with the local map; `NetworkMatcher` (`matcher`) recognises places.
+`model_methods` has those of a trained model: `SurfaceGeometry` aligns scans with the local map, `NetworkMatcher`
+recognises places.
 """
 
 from __future__ import annotations
@@ -147,7 +148,9 @@ class Matcher(Protocol):
         """Returns a text that is equal for equal matchers."""
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
-        """Prepares a scan for any number of registrations; runs in the thread of `Geometry.thin` for each scan ahead.
+        """Prepares a scan for any number of registrations.
+
+        With the proposer "network" it runs one scan ahead, in the thread of `Geometry.thin`.
 
         Args:
             scan: the scan.

@@ -271,8 +271,7 @@ def most_similar(
     if is_allowed is not None:
         cosines = np.where(is_allowed, cosines, -np.inf)
     count = min(count, len(cosines))
-    rows = np.argpartition(-cosines, count - 1)[:count]
-    rows = rows[np.argsort(-cosines[rows], kind="stable")]
+    rows = np.argsort(-cosines, kind="stable")[:count]
     rows = rows[np.isfinite(cosines[rows])]
     return rows, cosines[rows].astype(np.float32)
 

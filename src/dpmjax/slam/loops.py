@@ -119,7 +119,8 @@ def loops_of_map(slam_map: KeyframeMap) -> LoopState:
         Loop(*edge[:2], "map", "accepted", 1.0, T_target_source=edge.T_target_source, information=edge.information)
         for edge in slam_map.edges_of("loop")
     ]
-    return LoopState(tuple(known), len(slam_map))
+    # The edges of a thinned map join other keyframes than those that measured them.
+    return LoopState(tuple(sorted(known, key=lambda loop: loop.source)), len(slam_map))
 
 
 def num_accepted(loops: Iterable[Loop]) -> int:

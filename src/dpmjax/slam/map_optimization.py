@@ -110,7 +110,7 @@ def refine_keyframes(
         read_keyframe: reads the points of a keyframe by its row, in metres, in the frame of the lidar.
         key: key of the fits.
         on_window: called after each window, for progress.
-        stop: called before each window; after the first True, all further windows keep their poses.
+        stop: called before each window; where it returns True, a window keeps its poses.
 
     Returns:
         The map with refined poses, and the number of windows that became better.

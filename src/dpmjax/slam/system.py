@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points
+from dpmjax.checks import as_host_points, require_shape
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
@@ -223,13 +223,15 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
         The points.
 
     Raises:
-        ValueError: if the shape is not (n, 3).
+        ValueError: if the shape is not (n, 3), or if there are not n times.
     """
     points = as_host_points("scan", scan.points if isinstance(scan, TimedScan) else scan)
     is_finite = np.isfinite(points).all(axis=1)
     if not isinstance(scan, TimedScan) or T_turn is None:
         return points[is_finite]
-    return deskew(points[is_finite], np.asarray(scan.offsets)[is_finite], T_turn)
+    offsets = np.asarray(scan.offsets)
+    require_shape("scan.offsets", offsets, points.shape[:1])
+    return deskew(points[is_finite], offsets[is_finite], T_turn)
 
 
 def prepare_ahead(methods: SlamMethods, scan: AnyScan) -> PreparedInput | TimedScan:

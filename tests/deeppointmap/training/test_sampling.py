@@ -126,6 +126,7 @@ def test_presets_double_the_groups(name) -> None:
         (lambda: CurriculumStage(1, 3), "max_group"),
         (lambda: SamplingConfig(max_distance_m=0.2), "max_distance_m"),
         (lambda: TrainingConfig(sampling=SamplingConfig(num_scans=16)), "num_scans"),
+        (lambda: TrainingConfig(sampling=SamplingConfig(max_side=8)), "max_side"),
         (lambda: TrainingConfig(learning_rate=0.0), "learning_rate"),
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),
     ],
@@ -133,3 +134,11 @@ def test_presets_double_the_groups(name) -> None:
 def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_layouts_of_a_stage_take_turns() -> None:
+    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(8, 9)))
+    layouts = stage_layouts(8, config.sampling)
+    assert len(layouts) > 1
+    assert [config.layout_at(step) for step in range(3, 12)] == [layouts[step % len(layouts)] for step in range(3, 12)]
+    assert config.layout_at(0) == stage_layouts(2, config.sampling)[0]

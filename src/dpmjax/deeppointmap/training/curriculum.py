@@ -66,8 +66,8 @@ class SamplingConfig:
     Attributes:
         num_scans: capacity of one sample, all groups together.
         max_distance_m: largest distance of a scan of a group from its anchor, above `MIN_DISTANCE_M`.
-        max_side: largest number of scans of one map. Half of the groups up to this size are split into one scan
-            against all others.
+        max_side: largest number of scans of one map. Half of the groups in which one scan can stand against all others
+            are split so.
     """
 
     num_scans: int = 32
@@ -124,6 +124,10 @@ class TrainingConfig:
             raise ValueError(
                 f"sampling.num_scans: expected at least the largest group, {largest}, got {self.sampling.num_scans}"
             )
+        if largest > 2 * self.sampling.max_side:
+            raise ValueError(
+                f"sampling.max_side: expected at least half the largest group, {largest}, got {self.sampling.max_side}"
+            )
 
     @property
     def num_steps(self) -> int:
@@ -144,6 +148,18 @@ class TrainingConfig:
                 return stage
             step -= stage.num_steps
         return self.curriculum[-1]
+
+    def layout_at(self, step: int) -> Layout:
+        """Finds the layout of a step; those of its stage take turns.
+
+        Args:
+            step: number of the step, from 0.
+
+        Returns:
+            The layout.
+        """
+        layouts = stage_layouts(self.stage_at(step).max_group, self.sampling)
+        return layouts[step % len(layouts)]
 
     def with_steps(self, num_steps: int) -> TrainingConfig:
         """Shortens or stretches all stages in proportion, none to less than one step.
@@ -244,7 +260,7 @@ PRESETS = {
 def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
     """Makes the layouts of a stage.
 
-    The published draw of a group: two scans with `pair_probability`, else 2 to `max_group`, each number equally likely.
+    The published draw of a group: two scans with `PAIR_PROBABILITY`, else 2 to `max_group`, each number equally likely.
     One half of the groups is split into one scan against all others; the second half is split anywhere. The losses
     are symmetric, so the smaller map of a group is always the first.
 

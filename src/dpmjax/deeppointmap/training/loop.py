@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.training.curriculum import CurriculumStage, TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
@@ -56,8 +56,8 @@ class Speed(NamedTuple):
     """Seconds of steps.
 
     Attributes:
-        run_s: seconds of all steps but the first of each stage.
-        compile_s: seconds of the first step of each stage.
+        run_s: seconds of all steps but the first of each layout.
+        compile_s: seconds of the first step of each layout, which is compiled.
         num_scans: number of scans that the steps of `run_s` processed.
     """
 
@@ -105,6 +105,7 @@ class TrainingHooks:
     evaluate: Callable[[Model], float] | None = None
     evaluate_every: int = 100
     on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
+    # int() is 0 and bool() is False: by default nothing ends training.
     stop: Callable[[], int] = int
     finish: Callable[[], bool] = bool
 
@@ -224,7 +225,7 @@ def _run_steps(
     mesh, num_local = device_mesh(), jax.local_device_count()
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
-    speed, seen, stopped_by, is_finishing = Speed(), set[CurriculumStage](), 0, False
+    speed, seen, stopped_by, is_finishing = Speed(), set[Layout](), 0, False
     first_sample = jax.process_index() * num_local
     number, end = int(progress.state.step), int(progress.state.end)
     with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
@@ -235,7 +236,7 @@ def _run_steps(
             if not is_finishing and (is_finishing := bool(largest(int(hooks.finish())))):
                 progress = place(replace(progress, state=finish(progress.state, config)), mesh)
                 end = int(progress.state.end)
-            stage = config.stage_at(number)
+            stage, layout = config.stage_at(number), config.layout_at(number)
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, is_batch=True))
             number += 1
@@ -243,11 +244,11 @@ def _run_steps(
                 batch = next(batches, None) if number < end else None
             report = jax.device_get(report)
             seconds = time.perf_counter() - begun
-            if stage in seen:
+            if layout in seen:
                 num_scans = speed.num_scans + config.sampling.num_scans * jax.device_count()
                 speed = speed._replace(run_s=speed.run_s + seconds, num_scans=num_scans)
             else:
-                seen.add(stage)
+                seen.add(layout)
                 speed = speed._replace(compile_s=speed.compile_s + seconds)
             progress = replace(progress, state=state)
             if not math.isfinite(report.loss):

@@ -57,8 +57,8 @@ class TrainingPairs:
     Attributes:
         indices: row in the second cloud; 0 where `mask` is False.
         mask: False where there are fewer.
-        offsets: offsets from the descriptor to its neighbour, metres, in the frame of the descriptor; 0 where `mask` is
-            False.
+        offsets: offsets from the descriptor to its neighbour, metres, in the frame of the cloud of the descriptor; 0
+            where `mask` is False.
     """
 
     indices: Int[AnyArray, "*b m k"]

@@ -26,7 +26,7 @@ from jaxtyping import Array, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
-from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig, stage_layouts
+from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig
 from dpmjax.deeppointmap.training.sampling import (
     PlacedScans,
     RegistrationSample,
@@ -163,7 +163,9 @@ def prepare_drive(
         bad = make(written)
         written.flush()
         del written
-        reasons.write_text(json.dumps(bad), encoding="utf-8")
+        partial = unfinished.with_suffix(f"{unfinished.suffix}.json")
+        partial.write_text(json.dumps(bad), encoding="utf-8")
+        partial.replace(reasons)
         unfinished.replace(path)
     return PreparedDrive(poses, path, json.loads(reasons.read_text(encoding="utf-8")))
 
@@ -353,8 +355,7 @@ class SampleMaker:
     def _sample(self, step: int, number: int) -> RegistrationSample:
         rng = np.random.default_rng([SAMPLE_STREAM, self._seed, step, number])
         table, sampling = self._store.table, self._config.sampling
-        layouts = stage_layouts(self._config.stage_at(step).max_group, sampling)
-        layout = layouts[step % len(layouts)]
+        layout = self._config.layout_at(step)
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
         rows = np.concatenate([group.rows for group in groups if group is not None])
         # The number of scans is always that of the layout: another number would be compiled again.
