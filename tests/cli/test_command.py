@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 
 from dpmjax.cli import program
-from dpmjax.cli.command import EXIT_BAD_INPUT
+from dpmjax.cli.command import EXIT_BAD_INPUT, STOPPING
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -174,7 +174,7 @@ def test_failure_on_the_way_exits_with_one_and_names_the_partial_results(toy, tm
 def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expected):
     code, _, errors = stop_after_first_step(toy("-o", "out", "--steps", "5000"), number)
     assert code == expected
-    assert errors == f"dpmjax: stopped by {number.name}\n"
+    assert errors == f"{STOPPING}dpmjax: stopped by {number.name}\n"
     assert (tmp_path / "out" / "metrics.json").exists()
     done = len((tmp_path / "out" / "metrics.csv").read_text().splitlines()) - 1
     code, output, _ = finish(toy("-o", "out", "--resume", "--steps", str(done + 2)))
@@ -186,7 +186,7 @@ def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expec
 
 def test_second_signal_ends_at_once(toy):
     code, _, errors = stop_after_first_step(toy("--seed", "99"), signal.SIGINT, signal.SIGINT)
-    assert (code, errors) == (130, "dpmjax: stopped by SIGINT\n")
+    assert (code, errors) == (130, f"{STOPPING}dpmjax: stopped by SIGINT\n")
 
 
 def test_resumed_run_keeps_the_options_that_are_not_given(toy):

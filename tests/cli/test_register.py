@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.program import main
 from dpmjax.cli.register import motion_text
 from dpmjax.cli.result_files import load_json
@@ -97,3 +97,16 @@ def test_columns_of_raw_files_are_judged_said_and_noted(files, tmp_path, capsys)
     assert "--columns: expected at least 3" in capsys.readouterr().err
     assert command(files, *paths, "--no-refine", "--columns", "5", "-o", tmp_path / "other") == EXIT_OK
     assert load_json(tmp_path / "other" / "metrics.json")["input_notes"] == []
+
+
+def test_scans_of_a_handful_of_points_have_no_result(files, tmp_path, capsys) -> None:
+    np.save(tmp_path / "few.npy", np.eye(3, dtype=np.float32) * 5)
+    out = tmp_path / "out"
+    assert command(files, tmp_path / "few.npy", files / "b.npy", "-o", out) == EXIT_FAILED
+    assert "no motion was found, the identity was written" in capsys.readouterr().err
+    np.testing.assert_array_equal(np.loadtxt(out / "T_target_source.txt"), np.eye(4))
+
+
+def test_a_folder_is_no_scan(files, tmp_path, capsys) -> None:
+    assert command(files, tmp_path, files / "b.npy", "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    assert "a folder; give one scan file" in capsys.readouterr().err

@@ -242,3 +242,13 @@ def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path, monkeypatch) -
     with pytest.raises(OSError, match="No space left"):
         train(tmp_path, stop_after=1)
     assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1"]
+
+
+@pytest.mark.parametrize("num_drives", [1, 2])
+def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, num_drives: int) -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_run.prepare_sources([toy.drive] * num_drives, TRAINING, tmp_path, seed=0, on_wait=stop)
+    assert not list(tmp_path.iterdir())

@@ -96,6 +96,7 @@ def with_value(index, value):
         ({"points": with_value((2,), np.nan)}, "1 of 6 scans .* scan 2"),
         ({"points": with_value((), np.nan)}, "every beam"),
         ({"points": POINTS[0]}, r"give \(n, b, 2\)"),
+        ({"points": np.concatenate([POINTS, POINTS[..., :1]], axis=2)}, "the third coordinates of the points differ"),
         ({"points": POINTS[..., :1]}, r"give \(n, b, 2\)"),
         ({"points": POINTS.astype(str)}, "points are"),
         ({"points": np.ones((5, 10, 3))}, "scans of 10 beams"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import signal
 import sys
 import threading
@@ -28,6 +29,9 @@ EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPU
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ConfigT = TypeVar("ConfigT")
+
+
+STOPPING = "\nstopping, results are kept; a second Ctrl-C ends at once\n"
 
 
 class Interrupted(KeyboardInterrupt):
@@ -67,6 +71,11 @@ class StopFlag:
         """Returns True after a signal."""
         return self.received is not None
 
+    def end_if_requested(self) -> None:
+        """Ends the block after a signal, where nothing has been made that could be written."""
+        if self.received is not None:
+            raise Interrupted(self.received)
+
     def request(self, signal_number: int) -> None:
         """Sets the flag where another process of the same run has received the signal."""
         self.received = self.received or signal_number
@@ -86,6 +95,8 @@ class StopFlag:
         if self.received is not None:
             raise Interrupted(number)
         self.received = number
+        # Written without a buffer: a handler may interrupt a print.
+        os.write(2, STOPPING.encode())
 
 
 def check_least(config: Any, **least: float) -> None:

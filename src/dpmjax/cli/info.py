@@ -54,7 +54,7 @@ def main(config: Config) -> None:
     print(f"device     {device_name()}; {found['num_cores']} cores, {found['cpu']}")
     print(f"cache      {enable_compile_cache() or 'off'} (compiled programs)")
     for name in shipped_models():
-        print(f"weights    {name}: {read_card(name)}")
+        print(f"weights    {name}: {read_card(name).removeprefix(f'{name}: ').split('. ')[0]} (docs/weights.md)")
     for extra, packages in EXTRAS.items():
         reasons = filter(None, map(why_not_importable, packages))
         print(f"extra      {extra}: {'; '.join(reasons) or 'installed'}")

@@ -20,6 +20,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deeppointmap, io, viz, weights
+from dpmjax.sequences import InputError
 
 NAME = "register"
 # Least calibrated probability of a certain motion.
@@ -81,6 +82,10 @@ def main(config: Config) -> None:
         figure = viz.registered_pairs_figure([viz.RegisteredPair(title, source, target, motions)])
         viz.save_figure(figure, folder / "registration.png")
         print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")
+        if not metrics["num_inliers"] and not metrics.get("matched_share"):
+            outcome = "no motion was found, the identity was written"
+            advice = "give scans with walls and other things at 20 places or more, 1 to 60 m from the lidar"
+            raise InputError(f"{config.source}, {config.target}", outcome, advice)
 
 
 def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
 from dpmjax.cli.result_files import write_poses, write_table
-from dpmjax.cli.slam_numbers import counted, distances_to_reference
+from dpmjax.cli.slam_numbers import count_parts, counted, distances_to_reference
 from dpmjax.sequences import LidarSequence
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
@@ -188,7 +188,9 @@ def draw_pictures(
     title = f"{sequence.name}: {counted(len(T), 'scan')}"
     figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
     viz.save_figure(figure, folder / "trajectory.png")
-    title = f"{sequence.name}: {counted(len(result.keyframes), 'keyframe')}"
+    title, num_parts = f"{sequence.name}: {counted(len(result.keyframes), 'keyframe')}", count_parts(slam_map)
+    if num_parts > 1:
+        title += f"\n{num_parts} parts that no loop joins: their relative pose is a guess"
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
 
 

@@ -155,6 +155,7 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
         "path_m": float(metrics.path_lengths(T).max(initial=0.0)),
         "reference_doubt": reference_doubt(T, sequence),
         "num_keyframes": len(result.keyframes),
+        "num_new_keyframes": sum(report.is_keyframe for report in result.reports),
         "num_parts": count_parts(result.map),
         "num_loops": loops["accepted"],
         **trajectory_errors(T, reference),
@@ -195,14 +196,16 @@ def run_status(numbers: Mapping[str, Any]) -> str:
         numbers: of the run.
 
     Returns:
-        done; uncertain: less than half of the scans were aligned in all directions; failed: none aligned; interrupted:
-        before its end.
+        done; uncertain: less than half of the scans were aligned in all directions, or no loop joins all parts of the
+        map; failed: none aligned; interrupted: before its end.
     """
     statuses = numbers["scan_statuses"]
     if numbers["is_interrupted"]:
         return "interrupted"
     if why_failed(statuses) is not None:
         return "failed"
+    if numbers["num_parts"] > 1:
+        return "uncertain"
     num_placed = sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
     num_sure = num_placed - numbers["num_unknown_along"]
     return "done" if 2 * num_sure >= sum(statuses.values()) else "uncertain"
@@ -216,9 +219,11 @@ def count_parts(slam_map: slam.KeyframeMap) -> int:
 
 def summary(numbers: Mapping[str, Any]) -> str:
     """Returns the last lines on the console."""
-    counts = (("scan", "num_scans"), ("keyframe", "num_keyframes"), ("loop closure", "num_loops"))
-    scans, *others = (counted(numbers[name], noun) for noun, name in counts)
-    lines = [", ".join([scans, f"{numbers['path_m']:.1f} m driven", *others])]
+    counts = (("scan", "num_scans"), ("keyframe", "num_new_keyframes"), ("loop closure", "num_loops"))
+    scans, keyframes, loops = (counted(numbers[name], noun) for noun, name in counts)
+    if numbers["num_keyframes"] > numbers["num_new_keyframes"]:
+        keyframes += f" ({numbers['num_keyframes']} in the map)"
+    lines = [", ".join([scans, f"{numbers['path_m']:.1f} m driven", keyframes, loops])]
     lines += [
         f"{counted(numbers['scan_statuses'][status], 'scan')} {text}"
         for status, text in UNSURE.items()

@@ -130,7 +130,10 @@ def main(config: Config) -> None:
         folder = cli.open_run_folder(config, NAME) if is_first() else None
     with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
         with together():
-            store = deeppointmap.ScanStore(prepare_sources(sources, settings, config.cache, seed=config.seed))
+            # Of several processes, none may end alone.
+            on_wait = stop.end_if_requested if config.coordinator is None else lambda: None
+            drives = prepare_sources(sources, settings, config.cache, seed=config.seed, on_wait=on_wait)
+            store = deeppointmap.ScanStore(drives)
             records = None
             if folder is not None:
                 print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")

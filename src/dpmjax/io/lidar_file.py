@@ -113,6 +113,7 @@ def read_point_times(path: str | Path) -> FloatArray | None:
 def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
     """Reads points and times of a scan of any kind, checked; see `read_lidar_file`."""
     suffix = path.suffix.lower()
+    require(not path.is_dir(), path, "a folder", "give one scan file")
     found = f"an unknown kind of scan, {suffix or 'without ending'}"
     require(suffix in SCAN_SUFFIXES, path, found, f"give one of {' '.join(SCAN_SUFFIXES)}")
     if suffix == ".bin":

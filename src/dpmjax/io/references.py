@@ -244,7 +244,8 @@ def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[
 
 def _note_of(path: Path, how: str, T: FloatArray) -> tuple[Note, ...]:
     num_without = int(np.isnan(T[:, 0, 0]).sum())
-    text = f"{path}: poses are matched by {how}; {num_without} of {len(T)} scans have no reference pose"
+    found = f"{num_without} of {len(T)} scans have no reference pose"
+    text = f"{path}: poses are matched by {how}; {found if num_without else 'all scans have a reference pose'}"
     return (Note(text, is_doubt=num_without > 0),)
 
 

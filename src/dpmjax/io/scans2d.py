@@ -34,6 +34,8 @@ _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
 # their number, their share of all beams and the number of scans with them reach the limits. The last limit is the least
 # share of scans that also have other beams.
 _SAME_RANGE, _LEAST_MAXIMA, _LEAST_SHARE, _LEAST_SCANS, _LEAST_OTHERS = 1e-5, 20, 0.005, 3, 0.5
+# Largest difference between the third coordinates of planar points.
+_LARGEST_HEIGHT = 1e-3
 _LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
@@ -221,6 +223,10 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     points = table["points"]
     is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
     require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
+    heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:]
+    is_planar = not heights.size or float(np.ptp(heights)) <= _LARGEST_HEIGHT
+    advice = "give planar scans, or 3-D scans to `dpmjax slam`"
+    require(is_planar, path, "the third coordinates of the points differ", advice)
     planar = points[..., :2].astype(np.float64)
     is_measured = (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2) & planar.any(axis=2)
     return planar, is_measured

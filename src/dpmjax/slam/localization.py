@@ -159,6 +159,8 @@ def localize_each(
     Raises:
         ValueError: see `localize`.
     """
+    if not isinstance(slam_map, KeyframeMap):
+        raise ValueError(f"slam_map: expected a map from load_map, got {type(slam_map).__name__}")
     if slam_map.origin is None:
         raise ValueError("slam_map: expected keyframes, got an empty map")
     search = _Search(methods_for(model, slam_map), slam_map, config or LocalizationConfig())

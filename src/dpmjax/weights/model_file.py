@@ -48,7 +48,7 @@ def load_model(path_or_name: str | Path) -> Model:
         return _load_safetensors(SHIPPED / (path.name + SUFFIX))
     shipped = ", ".join(shipped_models()) or "none yet"
     expected = f"expected a {SUFFIX} or .pth file, or the name of a shipped model ({shipped})"
-    raise ValueError(f"path_or_name: {expected}, got {str(path_or_name)!r}")
+    raise ValueError(f"no weights {str(path_or_name)!r}: {expected}")
 
 
 def shipped_models() -> tuple[str, ...]:

@@ -160,7 +160,11 @@ def prepare_drive(
     if not (path.is_file() and reasons.is_file()):
         unfinished = path.with_name(f".{path.name}.{os.getpid()}")
         written = np.lib.format.open_memmap(unfinished, mode="w+", dtype=dtype, shape=shape)
-        bad = make(written)
+        try:
+            bad = make(written)
+        except BaseException:
+            unfinished.unlink()
+            raise
         written.flush()
         del written
         partial = unfinished.with_suffix(f"{unfinished.suffix}.json")
@@ -280,7 +284,7 @@ def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> s
         The reason; None where there is none.
     """
     if drive.T_world_lidar is None:
-        return "no poses; a pose for each scan is needed"
+        return "no poses; a pose for each scan is needed, such as a file poses.txt beside the scans (docs/files.md)"
     positions = drive.T_world_lidar[:, :3, 3]
     tree = cKDTree(positions)
     limits = MIN_DISTANCE_M, sampling.max_distance_m
