@@ -244,6 +244,15 @@ def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path, monkeypatch) -
     assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1"]
 
 
+def broken_drive() -> None:
+    raise ValueError("no drive")
+
+
+def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
+    with pytest.raises(ValueError, match="no drive"):
+        train_run.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
+
+
 @pytest.mark.parametrize("num_drives", [1, 2])
 def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, num_drives: int) -> None:
     def stop() -> None:

@@ -98,6 +98,8 @@ def prepare_sources(
                 remaining = set(begun)
                 while remaining:
                     done, remaining = wait(remaining, timeout=1.0, return_when=FIRST_COMPLETED)
+                    for one in done:
+                        one.result()  # an error ends the preparation of all drives
                     bar.update(len(done))
                     on_wait()
             except BaseException:
