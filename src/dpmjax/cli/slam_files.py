@@ -190,7 +190,7 @@ def draw_pictures(
     viz.save_figure(figure, folder / "trajectory.png")
     title, num_parts = f"{sequence.name}: {counted(len(result.keyframes), 'keyframe')}", count_parts(slam_map)
     if num_parts > 1:
-        title += f"\n{num_parts} parts that no loop joins: their relative pose is a guess"
+        title += f", {num_parts} parts at guessed relative poses"
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
 
 
