@@ -223,7 +223,7 @@ def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
     points = table["points"]
     is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
     require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
-    heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:]
+    heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:].astype(np.float64)
     is_planar = not heights.size or float(np.ptp(heights)) <= _LARGEST_HEIGHT
     advice = "give planar scans, or 3-D scans to `dpmjax slam`"
     require(is_planar, path, "the third coordinates of the points differ", advice)
