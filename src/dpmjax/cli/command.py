@@ -28,10 +28,8 @@ from dpmjax.sequences import InputError
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-ConfigT = TypeVar("ConfigT")
-
-
 STOPPING = "\nstopping, results are kept; a second Ctrl-C ends at once\n"
+ConfigT = TypeVar("ConfigT")
 
 
 class Interrupted(KeyboardInterrupt):
