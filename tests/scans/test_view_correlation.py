@@ -33,6 +33,17 @@ def test_one_of_the_best_motions_is_true_whatever_turn_shift_and_tilt(yaw: float
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.parametrize("yaw", range(0, 360, 45))
+def test_two_parallel_walls_are_found_under_each_turn(yaw: float) -> None:
+    along, height = np.meshgrid(np.arange(-15, 15, 0.3), np.arange(-1, 2, 0.3))
+    walls = [np.stack([along, np.full_like(along, y), height], -1).reshape(-1, 3) for y in (-2.0, 3.0)]
+    T = motion(yaw, (0, 0, 0))
+    surfaces = [scan_surface(np.concatenate(walls) @ R.T) for R in (np.eye(3), T[:3, :3])]
+    found = correlate_views(*surfaces, CONFIG)
+    assert len(found) == CONFIG.num_motions
+    assert min(errors(some, T)[1] for some in found[:2]) < 4
+
+
 def test_beside_a_motion_each_quarter_turn_has_an_equal_share() -> None:
     surfaces = [scan_surface(seen_from(street(seed), np.eye(4))) for seed in (0, 1)]
     found = correlate_views(*surfaces, ViewCorrelationConfig(8), beside=motion(33, (4, 0, 0)))
