@@ -32,6 +32,9 @@ def test_matches_join_the_clouds_and_wrong_ones_stand_out():
     assert right_match.get_linestyle() != wrong_match.get_linestyle()
     for match, start in ((right_match, [0.0, 0.0]), (wrong_match, [0.5, 0.5])):
         np.testing.assert_allclose(match.get_segments()[0][0], start)
+    many = viz.matches_figure(pair, np.zeros((400, 3)), np.zeros((400, 3)), np.ones(400)).axes[0].collections[0]
+    assert len(many.get_segments()) == 30
+    assert many.get_label() == "400 right matches, 30 drawn"
     titles = left.get_title(loc="left"), right.get_title(loc="left")
     assert titles == ("pair", "laid onto the target")
     source_at = next(line for line in right.lines if line.get_label() == "lidar of source")

@@ -21,6 +21,8 @@ SOURCE, TARGET = "#2e6f9e", "#e0902a"
 SHOWN_SHARE = 0.99
 GAP_IN, ABOVE_IN, BELOW_IN = 0.2, 0.65, 0.55
 _APART_M, _LOW_IN = 5.0, 4.2
+# Most lines of matches of one kind; hundreds would hide the scans.
+_MAX_LINES = 30
 
 
 class RegisteredPair(NamedTuple):
@@ -74,7 +76,7 @@ def matches_figure(
 ) -> Figure:
     """Draws two scans side by side from above with lines between matches, and one on the other by the estimated motion.
 
-    Lines of right matches are black, those of wrong ones red and dashed.
+    Lines of right matches are black, those of wrong ones red and dashed; at most 30 of each kind are drawn.
 
     Args:
         pair: both scans and the estimated motion.
@@ -111,7 +113,10 @@ def matches_figure(
 
 def _draw_matches(axes: Axes, lines: NDArray[np.float64], kind: str, color: str, style: str) -> None:
     label = f"{len(lines)} {kind} match" + "es" * (len(lines) != 1)
-    axes.add_collection(LineCollection(list(lines), colors=color, linestyles=style, linewidths=0.9, label=label))
+    if len(lines) > _MAX_LINES:
+        label += f", {_MAX_LINES} drawn"
+    drawn = np.random.default_rng(0).permutation(lines)[:_MAX_LINES]
+    axes.add_collection(LineCollection(list(drawn), colors=color, linestyles=style, linewidths=0.9, label=label))
 
 
 def _draw_overlap(
