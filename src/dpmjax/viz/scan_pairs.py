@@ -16,7 +16,7 @@ from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, Limits
 
 # The colours differ in lightness too, so that they differ in grey.
-SOURCE, TARGET = "#2e6f9e", "#e0902a"
+SOURCE, TARGET = "#2e6f9e", "#d98c3f"
 # Points farther out than this share of them are outside of the picture.
 SHOWN_SHARE = 0.99
 GAP_IN, ABOVE_IN, BELOW_IN = 0.2, 0.65, 0.55
