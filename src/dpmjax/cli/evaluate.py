@@ -206,8 +206,7 @@ def worst_failures(drives: Sequence[LidarSequence], rows: Sequence[cli.Row], see
         a, b = drawn[number]
         title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
         motions = {"estimated motion": np.reshape(row["motions"][number], (4, 4)), "true motion": pair.T_target_source}
-        names = f"scan {a}", f"scan {b}"
-        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions, names))
+        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions, (f"scan {a}", f"scan {b}")))
     return shown
 
 

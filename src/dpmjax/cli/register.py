@@ -78,8 +78,8 @@ def main(config: Config) -> None:
         metrics["wall_s"] = time.perf_counter() - started
         cli.write_metrics(folder, metrics)
         motions = {"before registration": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
-        names = names_of(config.source, config.target)
-        pair = viz.RegisteredPair(f"{names[0]} in the frame of {names[1]}", source, target, motions, names)
+        files = names_of(config.source, config.target)
+        pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
         figure = viz.registered_pairs_figure([pair])
         viz.save_figure(figure, folder / "registration.png")
         print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")

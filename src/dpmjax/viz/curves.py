@@ -176,7 +176,7 @@ def reliability_figure(
     """
     confidence, right = np.asarray(confidence, float), np.asarray(is_right, bool)
     bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
-    figure = figures.new_figure(4.8, 4.9, layout="tight")
+    figure = figures.new_figure(4.6, 5.0, layout="tight")
     axes = figure.subplots()
     figures.style_axes(axes, *labels)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--", label="calibrated: share equals confidence")
@@ -188,5 +188,5 @@ def reliability_figure(
         axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
     brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
     figures.set_title(axes, f"{title}\n{len(right)} pairs, Brier score {brier:.3f} (0: perfect)")
-    figures.add_legend(axes, columns=2, loc="upper center", bbox_to_anchor=(0.5, -0.13))
+    figures.add_legend(axes, columns=1, loc="upper center", bbox_to_anchor=(0.5, -0.13))
     return figure

@@ -143,8 +143,9 @@ def _draw_overlap(
 def _limits_of(pair: RegisteredPair) -> Limits:
     """Returns limits that show both lidars and nearly all points under every motion."""
     moved = [pair.source @ T[:3, :3].T + T[:3, 3] for T in pair.motions.values()]
+    corners = [_corners(points) for points in (pair.target, *moved)]
     lidars = [np.zeros(2), *(T[:2, 3] for T in pair.motions.values())]
-    return figures.plane_limits(np.concatenate([lidars, *map(_corners, (pair.target, *moved))]), 0.03)
+    return figures.plane_limits(np.concatenate([lidars, *corners]), 0.03)
 
 
 def _corners(points: NDArray[np.floating]) -> NDArray[np.float64]:

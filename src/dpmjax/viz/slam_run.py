@@ -57,7 +57,7 @@ def trajectory_figure(
 
     Args:
         title: title of the picture.
-        tracks: the last one is the result; those before are drawn thinner.
+        tracks: at most three; the last one is the result, drawn on those before.
         reference: positions in the same frame; None where there is none.
         loops: positions of both ends of each accepted loop.
 
@@ -75,7 +75,7 @@ def trajectory_figure(
     figure = figures.new_figure(width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
     axes = figures.add_axes(figure, (0.15, 0.65, width_in, height_in))
     if reference is not None:
-        axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
+        axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=5.5, solid_capstyle="round", label="reference", zorder=2)
     for track in tracks:
         axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
     if len(loops):
@@ -220,7 +220,7 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
     for track in tracks:
         if track.errors_m is not None:
             way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(track.positions, axis=0), axis=1))])
-            axes.plot(way, track.errors_m, **_style(track, tracks))
+            axes.plot(way, track.errors_m, **{**_style(track, tracks), "lw": 1.2})
     figures.style_axes(axes, "distance driven, m")
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
@@ -228,10 +228,10 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
 
 
 def _style(track: Track, tracks: Sequence[Track]) -> dict[str, Any]:
-    """Returns the line style of a track; the last track is the result."""
-    others = [{"color": ODOMETRY, "lw": 1.3, "ls": (0, (4, 2))}, {"color": INK, "lw": 1.3, "ls": (0, (1, 1.5))}]
+    """Returns the line style of a track; the last one, the result, is thin, so that it does not hide the others."""
+    others = [{"color": ODOMETRY, "lw": 2.4, "ls": (0, (3, 1.5))}, {"color": INK, "lw": 3.6, "ls": (0, (0.5, 1))}]
     number = next(number for number, other in enumerate(reversed(tracks)) if other is track)
-    return others[(number - 1) % len(others)] if number else {"color": OURS, "lw": 1.5}
+    return others[(number - 1) % len(others)] if number else {"color": OURS, "lw": 1.3}
 
 
 class LiveViewer:
