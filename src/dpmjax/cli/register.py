@@ -25,7 +25,7 @@ from dpmjax.sequences import InputError
 NAME = "register"
 # Least calibrated probability of a certain motion.
 SURE = 0.9
-SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
+SOURCE_COLOR, TARGET_COLOR = (58, 134, 192), (240, 168, 64)
 
 
 @dataclass(frozen=True, kw_only=True)

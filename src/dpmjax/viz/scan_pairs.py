@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, Limits
 
-# The colours differ in lightness too, so that they differ in grey.
-SOURCE, TARGET = "#2e6f9e", "#d98c3f"
+# These colours and black differ in lightness too, so that they differ in grey.
+SOURCE, TARGET = "#3a86c0", "#f0a840"
 # Points farther out than this share of them are outside of the picture.
 SHOWN_SHARE = 0.99
 GAP_IN, ABOVE_IN, BELOW_IN = 0.2, 0.65, 0.55
@@ -44,7 +44,7 @@ class RegisteredPair(NamedTuple):
 
 
 def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
-    """Draws pairs of scans from above, the source under each of the motions; neither scan hides the other.
+    """Draws pairs of scans from above, the source under each of the motions; cells with points of both scans are black.
 
     Args:
         pairs: one row each; at least one.

@@ -18,7 +18,7 @@ from dpmjax.viz import figures
 from dpmjax.viz.figures import INK, MUTED, Limits
 
 # Colours of the agents, in turn; the first two differ in lightness too, so that they differ in grey.
-COLORS = ("#1f4e8c", "#e08a1e", "#2a9d5c", "#d1495b", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
+COLORS = ("#2f6fb5", "#e08a1e", "#2a9d5c", "#d1495b", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
 GAP_IN, TITLE_IN, BELOW_IN = 0.2, 0.6, 0.8
 # Points of the widest and the narrowest path; a narrower path lies on a wider one, so that none hides another.
 _WIDEST, _NARROWEST = 6.0, 1.6
