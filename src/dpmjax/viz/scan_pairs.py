@@ -143,7 +143,7 @@ def _draw_overlap(
 def _limits_of(pair: RegisteredPair) -> Limits:
     """Returns limits that show both lidars and nearly all points under every motion."""
     moved = [pair.source @ T[:3, :3].T + T[:3, 3] for T in pair.motions.values()]
-    corners = [_corners(points) for points in (pair.target, *moved)]
+    corners = [_corners(pair.target), *(_corners(points) for points in moved)]
     lidars = [np.zeros(2), *(T[:2, 3] for T in pair.motions.values())]
     return figures.plane_limits(np.concatenate([lidars, *corners]), 0.03)
 
