@@ -15,6 +15,18 @@ def test_found_scans_are_drawn_where_they_are() -> None:
     np.testing.assert_array_equal(path.get_xdata(), [0, 5, 10])
     np.testing.assert_array_equal(right.get_ydata(), [2])
     np.testing.assert_array_equal(wrong.get_ydata(), [3])
+    # Shape tells right and wrong apart where the colour cannot be seen; a ring does not hide the scan under it.
+    assert right.get_marker() != wrong.get_marker()
+    assert path.get_markerfacecolor() == "none"
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert labels == ["3 keyframes", "1 found (arrow: forward)", "1 found elsewhere than the reference"]
+
+
+def test_the_legend_lies_below_the_map() -> None:
+    figure = viz.localization_figure(np.ones((9, 3)), np.eye(4)[None], np.eye(4)[None], title="t")
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    assert axes.get_legend().get_window_extent().y1 <= axes.get_window_extent().y0
 
 
 def test_a_map_without_found_scans_is_drawn() -> None:

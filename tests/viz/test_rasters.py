@@ -125,7 +125,7 @@ def test_images_from_above_lie_where_their_poses_say_and_the_ceiling_is_left_out
     # The whole first panel is moved: it is laid onto the reference by its first pose.
     moved = np.eye(4)
     moved[:3, 3] = [7.0, 0.0, -3.0]
-    panels = from_above_figure([("found", moved @ T), ("reference", T)], points, mask).axes
+    *panels, _ = from_above_figure([("found", moved @ T), ("reference", T)], points, mask).axes
     assert [axes.get_title(loc="left") for axes in panels] == ["found", "reference"]
     for axes in panels:
         first, second, path = axes.lines[:3]
@@ -135,3 +135,13 @@ def test_images_from_above_lie_where_their_poses_say_and_the_ceiling_is_left_out
         np.testing.assert_allclose(path.get_xydata(), [[0.0, 0.0], [2.0, 1.0]])
     with pytest.raises(ValueError, match="panels"):
         from_above_figure([], points, mask)
+
+
+def test_images_from_above_fill_the_panel_and_have_a_bar_of_their_numbers():
+    points = np.random.default_rng(0).uniform([-0.3, -0.5, 0.2], [0.3, 0.5, 0.8], (3, 4, 5, 3))
+    figure = from_above_figure([("found", np.tile(np.eye(4), (3, 1, 1)))], points, np.ones(points.shape[:3], bool))
+    panel, bar = figure.axes
+    assert np.ptp(panel.get_xlim()) < 1.5 * np.ptp(points[..., 0])
+    assert [text.get_text() for text in bar.texts] == ["image 1", "image 3"]
+    assert panel.get_aspect() == 1.0
+    assert any(text.get_text().endswith(" m") for text in panel.texts)

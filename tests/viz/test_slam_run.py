@@ -29,6 +29,19 @@ def test_a_trajectory_is_drawn_with_what_is_known() -> None:
     assert len(figure.axes) == 1
 
 
+def test_a_height_map_names_the_path_of_the_lidar() -> None:
+    figure = viz.height_map_figure("a", np.zeros((0, 3)), np.zeros(0), circle())
+    assert labels(figure) == ["path of the lidar", "start"]
+
+
+def test_tracks_differ_in_line_style() -> None:
+    tracks = [viz.Track(name, circle()) for name in ("the map before", "odometry alone", "SLAM")]
+    (axes,) = viz.trajectory_figure("town", tracks, None, circle()[None, :2]).axes
+    drawn = {line.get_label(): line for line in axes.lines}
+    assert len({(drawn[track.label].get_color(), drawn[track.label].is_dashed()) for track in tracks}) == 3
+    assert "1 loop" in [text.get_text() for text in axes.get_legend().get_texts()]
+
+
 @pytest.mark.parametrize("positions", [np.zeros((1, 3)), circle()[:2], np.column_stack([np.arange(9.0)] * 3)])
 def test_short_and_straight_drives_are_drawn(positions, tmp_path) -> None:
     figure = viz.trajectory_figure("a", [viz.Track("SLAM", positions)], None, np.zeros((0, 2, 3)))

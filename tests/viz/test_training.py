@@ -26,7 +26,17 @@ def test_matches_join_the_clouds_and_wrong_ones_stand_out():
     pair = viz.RegisteredPair("pair", source, target, {"laid onto the target": T})
     figure = viz.matches_figure(pair, matched, matched, [True, False])
     left, right = figure.axes
-    right_match, wrong_match = left.lines[2:4]
-    assert right_match.get_color() != wrong_match.get_color()
-    assert (left.get_title(), right.get_title()) == ("pair", "laid onto the target")
-    np.testing.assert_allclose(right.lines[1].get_xydata(), np.tile([2.0, 3.0], (3, 1)))
+    right_match, wrong_match = left.collections
+    assert (right_match.get_label(), wrong_match.get_label()) == ("1 right match", "1 wrong match")
+    # Style tells them apart where the colour cannot be seen.
+    assert right_match.get_linestyle() != wrong_match.get_linestyle()
+    for match, start in ((right_match, [0.0, 0.0]), (wrong_match, [0.5, 0.5])):
+        np.testing.assert_allclose(match.get_segments()[0][0], start)
+    many = viz.matches_figure(pair, np.zeros((400, 3)), np.zeros((400, 3)), np.ones(400)).axes[0].collections[0]
+    assert len(many.get_segments()) == 30
+    assert many.get_label() == "400 right matches, 30 drawn"
+    titles = left.get_title(loc="left"), right.get_title(loc="left")
+    assert titles == ("pair", "laid onto the target")
+    source_at = next(line for line in right.lines if line.get_label() == "lidar of source")
+    np.testing.assert_allclose(source_at.get_xydata(), [[2.0, 3.0]])
+    assert all(any(text.get_text().endswith(" m") for text in axes.texts) for axes in (left, right))

@@ -27,6 +27,8 @@ from dpmjax.sequences import DepthSequence, FloatArray
 
 NAME = "depth"
 _NUM_SIMULATED = 8
+# Names of the sets of poses, in the order of the picture.
+METHODS = {"start": "search of first poses", "fit": "DeepMapping"}
 # Typical ranges that a radian equals in the alignment of poses, for positions on a line.
 _LEVER = 0.1
 
@@ -88,10 +90,9 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> dic
     assert found.start is not None
     assert found.start_misfit is not None
     before, after = (depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
-    kept = {"fit": "DeepMapping", "start": "search of first poses"}[found.kept]
     return {
         "num_images": len(sequence),
-        "kept": kept,
+        "kept": METHODS[found.kept],
         "consistency": 1 - (found.misfit if found.kept == "fit" else found.start_misfit),
         "consistency_initial": 1 - found.start_misfit,
         **after,
@@ -141,7 +142,12 @@ def write_depth_results(folder: cli.RunFolder, sequence: DepthSequence, T_world_
 def draw(folder: cli.RunFolder, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
     assert found.start is not None
-    panels = [("search of first poses", found.start), ("DeepMapping", found.fitted.T_world_scan)]
+    poses = {"start": found.start, "fit": found.fitted.T_world_scan}
+    panels = []
+    for name, T_world_camera in poses.items():
+        errors = depth_errors(sequence, T_world_camera)
+        ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
+        panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))
     if sequence.T_world_camera is not None:
         panels.append(("reference", sequence.T_world_camera))
     viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), folder / "map.png", dpi=110)

@@ -205,8 +205,8 @@ def worst_failures(drives: Sequence[LidarSequence], rows: Sequence[cli.Row], see
         *_, pair = deeppointmap.read_scan_pairs(drive, drawn[: number + 1], seed=seed)
         a, b = drawn[number]
         title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
-        motions = {"found": np.reshape(row["motions"][number], (4, 4)), "true": pair.T_target_source}
-        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions))
+        motions = {"estimated motion": np.reshape(row["motions"][number], (4, 4)), "true motion": pair.T_target_source}
+        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions, (f"scan {a}", f"scan {b}")))
     return shown
 
 

@@ -63,7 +63,7 @@ def main(config: Config) -> None:
         cli.write_metrics(folder, metrics)
         title = f"{config.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
         tracks = [
-            viz.Track(f"start, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
+            viz.Track(f"before, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
             viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
         ]
         viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), folder / "trajectory.png")

@@ -25,7 +25,7 @@ from dpmjax.sequences import InputError
 NAME = "register"
 # Least calibrated probability of a certain motion.
 SURE = 0.9
-SOURCE_COLOR, TARGET_COLOR = (46, 111, 158), (217, 140, 63)
+SOURCE_COLOR, TARGET_COLOR = (58, 134, 192), (240, 168, 64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,15 +77,22 @@ def main(config: Config) -> None:
         write_motion(folder, T, source, target)
         metrics["wall_s"] = time.perf_counter() - started
         cli.write_metrics(folder, metrics)
-        title = f"{config.source.name} (blue), {config.target.name} (orange)"
-        motions = {"as measured": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
-        figure = viz.registered_pairs_figure([viz.RegisteredPair(title, source, target, motions)])
+        motions = {"before registration": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
+        files = names_of(config.source, config.target)
+        pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
+        figure = viz.registered_pairs_figure([pair])
         viz.save_figure(figure, folder / "registration.png")
         print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")
         if not metrics["num_inliers"] and not metrics.get("matched_share"):
             outcome = "no motion was found, the identity was written"
             advice = "give scans with walls and other things at 20 places or more, 1 to 60 m from the lidar"
             raise InputError(f"{config.source}, {config.target}", outcome, advice)
+
+
+def names_of(source: Path, target: Path) -> tuple[str, str]:
+    """Returns the names of both files, with their folders where the files have the same name."""
+    num_parts = 1 if source.name != target.name else 2
+    return str(Path(*source.parts[-num_parts:])), str(Path(*target.parts[-num_parts:]))
 
 
 def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:

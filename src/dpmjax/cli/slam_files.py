@@ -196,7 +196,7 @@ def draw_pictures(
 
 def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> viz.Track:
     errors = distances_to_reference(T_world_scan, reference)
-    label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.2f} m"
+    label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.3f} m"
     return viz.Track(label, T_world_scan[:, :3, 3], errors)
 
 

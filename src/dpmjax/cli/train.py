@@ -245,7 +245,7 @@ def draw_curves(folder: cli.RunFolder) -> None:
 def draw_matches(
     folder: cli.RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs
 ) -> None:
-    """Draws matches.png: the held-out pair of scans of median error."""
+    """Draws matches.png: of the pairs left out of the training, the one of the median error."""
     errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
     number = int(np.argsort(errors)[len(errors) // 2])
     a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
@@ -254,8 +254,9 @@ def draw_matches(
     p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
     q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
     distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
-    title = f"held-out pair of median error, {errors[number]:.2f} m; green: matches less than 3 m apart"
-    motions = {"source laid onto target": np.asarray(matches.T_target_source[number], np.float64)}
+    title = f"Pair of scans left out of the training, the one of the median error ({errors[number]:.2f} m)\n"
+    title += "right matches are less than 3 m apart under the true motion"
+    motions = {"source moved by the estimated motion": np.asarray(matches.T_target_source[number], np.float64)}
     pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
     viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), folder / "matches.png")
 

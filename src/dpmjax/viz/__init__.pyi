@@ -1,10 +1,7 @@
 from .comparison import ErrorMap as ErrorMap
-from .comparison import RegisteredPair as RegisteredPair
 from .comparison import endings_figure as endings_figure
 from .comparison import error_boxes_figure as error_boxes_figure
 from .comparison import error_maps_figure as error_maps_figure
-from .comparison import matches_figure as matches_figure
-from .comparison import registered_pairs_figure as registered_pairs_figure
 from .comparison import success_grids_figure as success_grids_figure
 from .comparison import toy_figure as toy_figure
 from .curves import curves_figure as curves_figure
@@ -16,6 +13,9 @@ from .registered_scans import Panel as Panel
 from .registered_scans import from_above_figure as from_above_figure
 from .registered_scans import occupancy_figure as occupancy_figure
 from .registered_scans import registered_scans_figure as registered_scans_figure
+from .scan_pairs import RegisteredPair as RegisteredPair
+from .scan_pairs import matches_figure as matches_figure
+from .scan_pairs import registered_pairs_figure as registered_pairs_figure
 from .slam_comparison import COLORS as COLORS
 from .slam_comparison import AgentPanel as AgentPanel
 from .slam_comparison import AgentTrack as AgentTrack

@@ -1,4 +1,4 @@
-"""Comparisons: errors of methods (DeepMapping figures 6 and 7), forms of the toy (figure 14), pairs of scans."""
+"""Comparisons: errors of methods (DeepMapping figures 6 and 7), forms of the toy (figure 14)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
 SOURCE, GREEN, DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
-TARGET, OBSTACLE, TRAJECTORY = "#d98c3f", "#e4e6e9", "#16c7d9"
+OBSTACLE, TRAJECTORY = "#e4e6e9", "#16c7d9"
 GRIDS_IN_A_LINE, LETTERS_IN_A_LINE = 5, 24
-# Points farther out than this share of them are outside of the picture of a pair.
-SHOWN_SHARE = 0.99
 
 
 def error_boxes_figure(
@@ -160,78 +158,6 @@ def endings_figure(
         axes.set_yscale("symlog", linthresh=1.0)
         figures.annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
         figures.style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "")
-    return figure
-
-
-class RegisteredPair(NamedTuple):
-    """Two scans and the motions between them.
-
-    Attributes:
-        title: title of the row.
-        source: (n, 3) points, metres.
-        target: (m, 3) points, metres.
-        motions: (4, 4) `T_target_source` by the title of its panel, from left to right.
-    """
-
-    title: str
-    source: NDArray[np.float32]
-    target: NDArray[np.float32]
-    motions: Mapping[str, NDArray[np.float64]]
-
-
-def matches_figure(
-    pair: RegisteredPair, source_matched: ArrayLike, target_matched: ArrayLike, is_right: ArrayLike
-) -> Figure:
-    """Draws two scans side by side from above with lines between matches, and overlaid by the estimated motion.
-
-    Args:
-        pair: both scans and the estimated motion.
-        source_matched: (k, 3) matched points of the source.
-        target_matched: (k, 3) matched points of the target, row for row.
-        is_right: (k,) True where the true motion maps the two points of a match onto each other.
-
-    Returns:
-        The figure.
-    """
-    a, b, pa, pb = (np.asarray(x, np.float64) for x in (pair.source, pair.target, source_matched, target_matched))
-    ((label, T),) = pair.motions.items()
-    figure = figures.new_figure(12.0, 4.6, layout="tight")
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    shift = np.array([a[:, 0].max(initial=0) - b[:, 0].min(initial=0) + 5.0, 0.0])
-    laid = (a @ T[:3, :3].T + T[:3, 3])[:, :2]
-    dots = ((left, a[:, :2], SOURCE), (left, b[:, :2] + shift, MUTED), (right, b[:, :2], MUTED), (right, laid, SOURCE))
-    for axes, points, color in dots:
-        axes.plot(*points.T, ",", color=color, alpha=0.6)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_axis_off()
-    for start, end, fits in zip(pa[:, :2], pb[:, :2] + shift, np.asarray(is_right, bool), strict=True):
-        left.plot(*zip(start, end, strict=True), color=GREEN if fits else ACCENT, lw=0.6, alpha=0.7)
-    figures.set_title(left, pair.title)
-    figures.set_title(right, label)
-    return figure
-
-
-def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
-    """Draws pairs of scans from above, the source under each of the motions.
-
-    Args:
-        pairs: one row each; at least one, each with the same number of motions.
-
-    Returns:
-        The figure.
-    """
-    figure = figures.new_figure(9.0, 4.2 * len(pairs), layout="tight")
-    grid = figure.subplots(len(pairs), len(pairs[0].motions), squeeze=False)
-    for row, pair in zip(grid, pairs, strict=True):
-        for axes, (label, T) in zip(row, pair.motions.items(), strict=True):
-            moved = pair.source @ T[:3, :3].T + T[:3, 3]
-            for points, color in ((pair.target, TARGET), (moved, SOURCE)):
-                axes.plot(points[:, 0], points[:, 1], ".", color=color, ms=1.2, alpha=0.5, mew=0)
-            axes.plot([0, T[0, 3]], [0, T[1, 3]], "o-", color=ACCENT, ms=4, lw=1)
-            both = np.concatenate([pair.target, moved])[:, :2]
-            corners = np.quantile(both, (0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2), axis=0)
-            figures.frame_map(axes, figures.plane_limits(corners, 0.05))
-            figures.set_title(axes, f"{pair.title}\n{label}", 9)
     return figure
 
 

@@ -176,16 +176,17 @@ def reliability_figure(
     """
     confidence, right = np.asarray(confidence, float), np.asarray(is_right, bool)
     bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
-    figure = figures.new_figure(4.6, 4.6, layout="tight")
+    figure = figures.new_figure(4.6, 5.0, layout="tight")
     axes = figure.subplots()
     figures.style_axes(axes, *labels)
-    axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--")
+    axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--", label="calibrated: share equals confidence")
     counts = np.bincount(bins, minlength=NUM_BINS)
     used = counts > 0
     x, y = (np.bincount(bins, values, NUM_BINS)[used] / counts[used] for values in (confidence, right))
-    axes.plot(x, y, "o-", color=ACCENT, lw=1.4, ms=4)
+    axes.plot(x, y, "o-", color=ACCENT, lw=1.4, ms=4, label="measured, with the number of pairs")
     for count, left, up in zip(counts[used], x, y, strict=True):
         axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
     brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
-    figures.set_title(axes, f"{title}\n{len(right)} pairs, Brier score {brier:.3f}")
+    figures.set_title(axes, f"{title}\n{len(right)} pairs, Brier score {brier:.3f} (0: perfect)")
+    figures.add_legend(axes, columns=1, loc="upper center", bbox_to_anchor=(0.5, -0.13))
     return figure

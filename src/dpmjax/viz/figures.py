@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -10,14 +11,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
 
 INK = "#1b1f24"
 MUTED = "#6a737d"
 FRAME = "#d6dadf"
 ACCENT = "#d1495b"
 _LONGER_SIDE_IN, _SHORTER_SIDE_IN = 6.4, 2.6
+# A cell of a cloud is about two pixels wide, so that its colour can be seen.
+_CELLS_PER_IN = 75
 
 
 class Limits(NamedTuple):
@@ -139,18 +144,19 @@ def add_axes(figure: Figure, place_in: tuple[float, float, float, float]) -> Axe
     return figure.add_axes((left / whole, bottom / high, width / whole, height / high))
 
 
-def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float) -> Limits:
+def plane_limits(positions: Float[np.ndarray, "n 2"], margin_share: float, *, least_margin: float = 1.0) -> Limits:
     """Returns a rectangle round positions; that of a straight road has a useful height too.
 
     Args:
         positions: positions, at least one.
         margin_share: margin as a share of the longer side, added on all sides.
+        least_margin: least margin, in the unit of the positions.
 
     Returns:
         The limits.
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
-    margin = max(margin_share * float((high - low).max()), 1.0)
+    margin = max(margin_share * float((high - low).max()), least_margin)
     narrow = np.maximum((high - low).max() * 0.35 - (high - low), 0) / 2
     (x_min, y_min), (x_max, y_max) = low - narrow - margin, high + narrow + margin
     return Limits(float(x_min), float(x_max), float(y_min), float(y_max))
@@ -184,3 +190,34 @@ def pixels_of(
     column, row = np.floor(place).astype(np.int64).T
     is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     return row[is_inside] * columns + column[is_inside], is_inside
+
+
+def show_clouds(axes: Axes, clouds: Sequence[Float[np.ndarray, "_ d"]], colors: Sequence[str], limits: Limits) -> float:
+    """Draws clouds from above in square cells; no cloud hides another.
+
+    A cell with points of one cloud has the colour of this cloud, a cell with points of two or more clouds is black.
+
+    Args:
+        axes: axes of the map, of their final size.
+        clouds: at least one; x and y are drawn.
+        colors: color of each cloud.
+        limits: limits of the map.
+
+    Returns:
+        The side of a cell in the unit of the map.
+    """
+    side = float(limits.width) / (_CELLS_PER_IN * axes.get_window_extent().width / axes.figure.dpi)
+    shape = max(round(limits.height / side), 1), max(round(limits.width / side), 1)
+    picture, num_clouds = np.ones((shape[0] * shape[1], 3)), np.zeros(shape[0] * shape[1], int)
+    for cloud, color in zip(clouds, colors, strict=True):
+        cells = np.unique(pixels_of(cloud, limits, shape)[0])
+        picture[cells] = to_rgb(color)
+        num_clouds[cells] += 1
+    picture[num_clouds > 1] = to_rgb(INK)
+    show_raster(axes, picture.reshape(*shape, 3), limits)
+    return side
+
+
+def cell_entry(color: str, label: str) -> Line2D:
+    """Returns an entry of a legend: a square of this colour, as points of a cloud have it."""
+    return Line2D([], [], color=color, marker="s", ms=5, ls="none", label=label)

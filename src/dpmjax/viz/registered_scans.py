@@ -8,9 +8,12 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike, NDArray
 
@@ -22,13 +25,13 @@ from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
 PANEL_WIDTH_IN = 4.2
 HEADER_IN = 0.62
-FOOTER_IN = 0.55
+FOOTER_IN = 0.75
 GAP_IN = 0.14
 MAX_POINTS_PER_PANEL = 120_000
 OUTER_QUANTILE = 0.002
 MARGIN = 0.04
 UNEXPLORED_GREY = 0.74
-OCCUPANCY_SIDE_IN, OCCUPANCY_GAP_IN = 6.4, 0.12
+OCCUPANCY_SIDE_IN, OCCUPANCY_GAP_IN, LEGEND_IN = 6.4, 0.12, 0.3
 # Points with a smaller y than this, in the frame of the first camera, are the ceiling.
 CEILING_M = -0.9
 
@@ -115,7 +118,7 @@ def registered_scans_figure(panels: Sequence[Panel], unit: str) -> Figure:
         left_in = GAP_IN + column * (PANEL_WIDTH_IN + GAP_IN)
         _draw_panel(figures.add_axes(figure, (left_in, FOOTER_IN, PANEL_WIDTH_IN, height_in)), panel, unit, colormap)
         figures.frame_map(figure.axes[-1], limits, None if column else unit)
-    _add_time_bar(figure, len(anchor.poses), colormap)
+    _add_time_bar(figure, len(anchor.poses), "scan", "path of the sensor, its start a dot")
     return figure
 
 
@@ -178,16 +181,18 @@ def _draw_panel(axes: Axes, panel: Panel, unit: str, colormap: Colormap) -> None
     figures.annotate_corner(axes, "   ".join(numbers), (1, 7), fontsize=9.5)
 
 
-def _add_time_bar(figure: Figure, num_scans: int, colormap: Colormap) -> None:
-    """Adds a thin colour bar of the scans under the panels."""
+def _add_time_bar(figure: Figure, num: int, noun: str, path_label: str) -> None:
+    """Adds a thin colour bar of the scans or images under the panels, and names the path."""
     width_in = figure.get_figwidth()
     length_in = min(3.0, 0.5 * width_in)
-    axes = figures.add_axes(figure, (0.5 * (width_in - length_in), 0.24, length_in, 0.09))
-    axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=colormap)
+    axes = figures.add_axes(figure, (0.5 * (width_in - length_in), 0.44, length_in, 0.09))
+    axes.imshow(np.linspace(0.0, 1.0, 256)[None, :], aspect="auto", cmap=time_colormap())
     axes.set_axis_off()
     style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center", "fontsize": 8.5}
-    axes.annotate("first scan", (0, 0.5), xytext=(-6, 0), ha="right", color=MUTED, **style)
-    axes.annotate(f"scan {num_scans}", (1, 0.5), xytext=(6, 0), ha="left", color=MUTED, **style)
+    axes.annotate(f"{noun} 1", (0, 0.5), xytext=(-6, 0), ha="right", color=MUTED, **style)
+    axes.annotate(f"{noun} {num}", (1, 0.5), xytext=(6, 0), ha="left", color=MUTED, **style)
+    path = Line2D([], [], color=INK, marker="o", ms=4, lw=1.2, label=path_label)
+    figures.add_legend(figure, handles=[path], columns=1, loc="lower center", bbox_to_anchor=(0.5, 0.0))
 
 
 def occupancy_figure(
@@ -222,14 +227,18 @@ def occupancy_figure(
         raise ValueError(f"expected an extent (x_min, x_max, y_min, y_max) with min < max; got {tuple(extent)}")
     scale_in = OCCUPANCY_SIDE_IN / max(limits.width, limits.height)
     width_in, height_in = limits.width * scale_in, limits.height * scale_in
-    figure = figures.new_figure(width_in + 2.0 * OCCUPANCY_GAP_IN, height_in + 2.0 * OCCUPANCY_GAP_IN)
-    axes = figures.add_axes(figure, (OCCUPANCY_GAP_IN, OCCUPANCY_GAP_IN, width_in, height_in))
+    figure = figures.new_figure(width_in + 2.0 * OCCUPANCY_GAP_IN, height_in + 2.0 * OCCUPANCY_GAP_IN + LEGEND_IN)
+    axes = figures.add_axes(figure, (OCCUPANCY_GAP_IN, OCCUPANCY_GAP_IN + LEGEND_IN, width_in, height_in))
     brightness = np.where(explored, 1.0 - np.clip(probability, 0.0, 1.0), UNEXPLORED_GREY)
     axes.set_facecolor(str(UNEXPLORED_GREY))
     image = figures.show_raster(axes, brightness, extent, cmap="gray", vmin=0.0, vmax=1.0)
     image.set_transform(Affine2D(T_view_world) + axes.transData)
     figures.draw_trajectory(axes, trajectory_world @ T_view_world[:2, :2].T + T_view_world[:2, 2], ACCENT)
     figures.frame_map(axes, limits, unit)
+    greys = {"occupied": "0.0", "free": "1.0", "not seen": str(UNEXPLORED_GREY)}
+    entries: list[Artist] = [Patch(fc=grey, ec=MUTED, lw=0.5, label=name) for name, grey in greys.items()]
+    entries.append(Line2D([], [], color=ACCENT, marker="o", ms=4, lw=1.2, label="path, its start a dot"))
+    figures.add_legend(axes, handles=entries, columns=4)
     return figure
 
 
@@ -256,17 +265,22 @@ def from_above_figure(panels: Sequence[tuple[str, NDArray[np.float64]]], points:
     clouds = [np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3] for T in aligned]
     sensors = [T[:, :3, 3] for T in aligned]
     low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)
-    limits = figures.plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.12)
-    figure = figures.new_figure(4.4 * len(panels), 4.4 * limits.height / limits.width + 0.5, layout="tight")
+    # A room is small: a margin of metres would be most of the picture.
+    limits = figures.plane_limits(np.vstack([sensors[-1][:, [0, 2]], [low, high]]), 0.06, least_margin=0.05)
+    height_in = PANEL_WIDTH_IN * limits.height / limits.width
+    width_in = len(panels) * (PANEL_WIDTH_IN + GAP_IN) + GAP_IN
+    figure = figures.new_figure(width_in, height_in + HEADER_IN + FOOTER_IN)
     colors = time_colormap()(np.linspace(0.0, 1.0, len(cloud)))
-    axes_row = figure.subplots(1, len(panels), squeeze=False)[0]
     # Few points would hardly be seen.
     size = float(np.clip(200 / np.sqrt(max(valid.sum(), 1)), 1.2, 4))
-    for axes, (title, _), world, centres in zip(axes_row, panels, clouds, sensors, strict=True):
+    for column, ((title, _), world, centres) in enumerate(zip(panels, clouds, sensors, strict=True)):
+        left_in = GAP_IN + column * (PANEL_WIDTH_IN + GAP_IN)
+        axes = figures.add_axes(figure, (left_in, FOOTER_IN, PANEL_WIDTH_IN, height_in))
         for image, color in enumerate(colors):
             shown = world[image][valid[image] & (world[image][..., 1] > CEILING_M)]
             axes.plot(shown[:, 0], shown[:, 2], ".", ms=size, mew=0, color=color)
         axes.plot(centres[:, 0], centres[:, 2], "-o", color=INK, ms=3, lw=1)
-        figures.frame_map(axes, limits, "m" if axes is axes_row[0] else None)
+        figures.frame_map(axes, limits, None if column else "m")
         figures.set_title(axes, title, loc="left")
+    _add_time_bar(figure, len(cloud), "image", "camera at each image")
     return figure

@@ -7,19 +7,21 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from dpmjax.viz import figures
 from dpmjax.viz.figures import INK, MUTED, Limits
 
-# Colours of the agents, in turn.
-COLORS = ("#1f4e8c", "#d1495b", "#2a9d5c", "#e08a1e", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
-GAP_IN, TITLE_IN, BELOW_IN, DOTS_PER_IN = 0.2, 0.6, 0.8, 100
+# Colours of the agents, in turn; the first two differ in lightness too, so that they differ in grey.
+COLORS = ("#2f6fb5", "#e08a1e", "#2a9d5c", "#d1495b", "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
+GAP_IN, TITLE_IN, BELOW_IN = 0.2, 0.6, 0.8
+# Points of the widest and the narrowest path; a narrower path lies on a wider one, so that none hides another.
+_WIDEST, _NARROWEST = 6.0, 1.6
 # Least height of drawn points of agents relative to the lidar, which excludes the ground.
 MIN_HEIGHT_M = -1.0
 _COLUMNS = 4
@@ -199,21 +201,28 @@ def agents_figure(title: str, panels: Sequence[AgentPanel]) -> Figure:
 
 
 def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float, float]) -> None:
-    figures.show_raster(axes, _raster(panel, limits, (int(DOTS_PER_IN * size[1]), int(DOTS_PER_IN * size[0]))), limits)
+    clouds = [agent.points[agent.heights_m > MIN_HEIGHT_M] for agent in panel.agents]
+    figures.show_clouds(axes, clouds, [agent.color for agent in panel.agents], limits)
     references = [agent.reference for agent in panel.agents if agent.reference is not None]
     for number, reference in enumerate(references):
         label = None if number else "reference"
         axes.plot(*reference[:, :2].T, color=INK, lw=0.6, ls=(0, (5, 3)), label=label, zorder=6)
-    for agent in panel.agents:
-        axes.plot(*agent.positions[:, :2].T, color="white", lw=4.4, zorder=3, solid_capstyle="round")
-        axes.plot(*agent.positions[:, :2].T, color=agent.color, lw=2.6, label=agent.label, zorder=4)
-        axes.plot(*agent.positions[:1, :2].T, "o", ms=5.5, color=agent.color, mec="white", zorder=8)
+    widths = np.linspace(_WIDEST, _NARROWEST, len(panel.agents)) if len(panel.agents) > 1 else [_NARROWEST]
+    for agent, width in zip(panel.agents, widths, strict=True):
+        path = agent.positions[:, :2].T
+        axes.plot(*path, color="white", lw=width + 1.6, zorder=4, solid_capstyle="round")
+        axes.plot(*path, color=agent.color, lw=width, label=agent.label, zorder=4, solid_capstyle="round")
+        axes.plot(*path[:, :1], "o", ms=width + 4, color=agent.color, mec="white", zorder=8)
     if len(panel.loops):
         label = f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them"
         figures.draw_loops(axes, panel.loops, label, INK)
     figures.frame_map(axes, limits, "m")
     axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")
-    figures.add_legend(axes, columns=max(int(size[0] / 1.6), 1), bbox_to_anchor=(-0.02, -0.01))
+    entries = axes.get_legend_handles_labels()[0]
+    if len(panel.agents) > 1:
+        entries.append(figures.cell_entry(INK, "points of two or more"))
+    entries.append(Line2D([], [], color=MUTED, marker="o", mec="white", ls="none", label="start"))
+    figures.add_legend(axes, handles=entries, columns=max(int(size[0] / 1.6), 1), bbox_to_anchor=(-0.02, -0.01))
 
 
 def _limits_of(panel: AgentPanel) -> Limits:
@@ -223,19 +232,3 @@ def _limits_of(panel: AgentPanel) -> Limits:
     if len(points):
         shown.append(np.quantile(points, [0.01, 0.99], axis=0))
     return figures.plane_limits(np.concatenate(shown), 0.03)
-
-
-def _raster(panel: AgentPanel, limits: Limits, shape: tuple[int, int]) -> UInt8[np.ndarray, "r c 3"]:
-    """Makes the picture: each pixel has the colour of the agents with points there, stronger for more points."""
-    size = shape[0] * shape[1]
-    color, total = np.zeros((size, 3)), np.zeros(size)
-    for agent in panel.agents:
-        points = agent.points[agent.heights_m > MIN_HEIGHT_M, :2]
-        count = np.bincount(figures.pixels_of(points, limits, shape)[0], minlength=size)
-        color += count[:, None] * np.array(to_rgb(agent.color))
-        total += count
-    is_seen = total > 0
-    strong = np.quantile(total[is_seen], 0.9) if is_seen.any() else 1.0
-    alpha = np.where(is_seen, 0.35 + 0.6 * np.clip(total / max(strong, 1.0), 0, 1), 0.0)[:, None]
-    mixed = alpha * color / np.maximum(total, 1)[:, None] + 1 - alpha
-    return np.asarray(np.round(255 * mixed), np.uint8).reshape(*shape, 3)

@@ -22,7 +22,8 @@ from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
 OURS, ODOMETRY, LOOP = "#1f4e8c", "#e08a1e", "#2a9d5c"
-RIGHT, HEAD_SHARE = "#2a9d5c", 0.02
+# Length of an arrow as a share of the longer side; grey of points, darker than that of words.
+HEAD_SHARE, POINTS = 0.04, "#9aa3ad"
 # Heights above the lidar that the colours of maps span.
 HEIGHTS_M = (-2.5, 5.5)
 
@@ -56,7 +57,7 @@ def trajectory_figure(
 
     Args:
         title: title of the picture.
-        tracks: the last one is the result; those before are drawn thinner.
+        tracks: at most three; the last one is the result, drawn on those before.
         reference: positions in the same frame; None where there is none.
         loops: positions of both ends of each accepted loop.
 
@@ -74,11 +75,11 @@ def trajectory_figure(
     figure = figures.new_figure(width_in + (4.1 if has_errors else 0.3), height_in + 1.05)
     axes = figures.add_axes(figure, (0.15, 0.65, width_in, height_in))
     if reference is not None:
-        axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=4.2, solid_capstyle="round", label="reference", zorder=2)
+        axes.plot(*reference[:, :2].T, color="#b9c0c8", lw=5.5, solid_capstyle="round", label="reference", zorder=2)
     for track in tracks:
         axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
     if len(loops):
-        figures.draw_loops(axes, loops, f"{len(loops)} loops", LOOP)
+        figures.draw_loops(axes, loops, f"{len(loops)} loop" + "s" * (len(loops) != 1), LOOP)
     axes.plot(*tracks[-1].positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
     figures.frame_map(axes, limits, "m")
     figures.set_title(axes, title, 11, loc="left", fontweight="bold")
@@ -111,14 +112,17 @@ def height_map_figure(
     low, high = np.quantile(points[:, :2], [0.005, 0.995], axis=0) if len(points) else (np.zeros(2), np.ones(2))
     limits = figures.plane_limits(np.vstack([path[:, :2], [low, high]]), 0.03)
     width_in, height_in = figures.size_in(limits)
-    figure = figures.new_figure(width_in + 1.05, height_in + 0.5)
-    axes = figures.add_axes(figure, (0.12, 0.12, width_in, height_in))
+    figure = figures.new_figure(width_in + 1.05, height_in + 0.75)
+    axes = figures.add_axes(figure, (0.12, 0.37, width_in, height_in))
     figures.show_raster(axes, _raster(points, heights_m, limits, (int(160 * height_in), int(160 * width_in))), limits)
-    axes.plot(*path[:, :2].T, color=ACCENT, lw=1.0, zorder=4)
+    axes.plot(*path[:, :2].T, color="white", lw=2.6, zorder=4)
+    axes.plot(*path[:, :2].T, color=ACCENT, lw=1.3, zorder=5, label="path of the lidar")
+    axes.plot(*path[:1, :2].T, "o", ms=5, color=ACCENT, mec="white", zorder=7, label="start")
     figures.frame_map(axes, limits, "m")
     figures.set_title(axes, title, 11, loc="left", fontweight="bold")
+    figures.add_legend(axes, columns=2)
     bar_in = min(height_in, 3.0)
-    bar = figures.add_axes(figure, (width_in + 0.27, 0.12 + (height_in - bar_in) / 2, 0.13, bar_in))
+    bar = figures.add_axes(figure, (width_in + 0.27, 0.37 + (height_in - bar_in) / 2, 0.13, bar_in))
     shown = figure.colorbar(ScalarMappable(Normalize(*HEIGHTS_M), _height_colormap()), cax=bar, extend="both")
     shown.set_label("height above the lidar, m", fontsize=8, color=MUTED)
     bar.tick_params(labelsize=7, colors=MUTED)
@@ -152,19 +156,22 @@ def localization_figure(
     shown = np.concatenate([points[:, :2], path[:, :2], T[:, :2, 3]])
     limits = figures.plane_limits(np.percentile(shown, [0.5, 99.5], axis=0), 0.06)
     width_in, height_in = figures.size_in(limits)
-    figure = figures.new_figure(width_in + 0.3, height_in + 0.8, layout="tight")
-    axes = figure.subplots()
-    axes.scatter(points[:, 0], points[:, 1], s=0.4, color=MUTED, alpha=0.35, linewidths=0, rasterized=True)
-    axes.plot(path[:, 0], path[:, 1], ".", color=INK, ms=3, label=f"{len(path)} keyframes", zorder=4)
-    head = HEAD_SHARE * max(limits.width, limits.height)
-    for mask, color, label in ((~wrong, RIGHT, "found"), (wrong, ACCENT, "found elsewhere than the reference")):
+    figure = figures.new_figure(width_in + 0.3, height_in + 0.75)
+    axes = figures.add_axes(figure, (0.15, 0.37, width_in, height_in))
+    figures.show_clouds(axes, [points], [POINTS], limits)
+    # The rings lie on the arrows: a keyframe under a scan is visible, and so is the scan.
+    keyframes = f"{len(path)} keyframe" + "s" * (len(path) != 1)
+    axes.plot(*path[:, :2].T, "o", mfc="none", mec=INK, mew=0.8, ms=6, label=keyframes, zorder=7)
+    length = HEAD_SHARE * max(limits.width, limits.height)
+    right = (~wrong, OURS, "o", 4, "found (arrow: forward)")
+    for mask, color, marker, size, label in (right, (wrong, ACCENT, "X", 7, "found elsewhere than the reference")):
         if mask.any():
             (x, y), (dx, dy) = T[mask, :2, 3].T, T[mask, :2, 0].T
-            axes.quiver(x, y, dx, dy, color=color, scale=1 / head, scale_units="xy", width=0.004, zorder=6)
-            axes.plot(x, y, "o", color=color, ms=3.5, label=f"{mask.sum()} {label}", zorder=5)
+            axes.quiver(x, y, dx, dy, color=color, scale=1 / length, scale_units="xy", width=0.0025, zorder=6)
+            axes.plot(x, y, marker, color=color, ms=size, ls="none", label=f"{mask.sum()} {label}", zorder=6)
     figures.frame_map(axes, limits, "m")
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
-    figures.set_title(axes, title)
+    figures.add_legend(axes, columns=3)
+    figures.set_title(axes, title, 11, loc="left", fontweight="bold")
     return figure
 
 
@@ -213,7 +220,7 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
     for track in tracks:
         if track.errors_m is not None:
             way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(track.positions, axis=0), axis=1))])
-            axes.plot(way, track.errors_m, **_style(track, tracks))
+            axes.plot(way, track.errors_m, **{**_style(track, tracks), "lw": 1.2})
     figures.style_axes(axes, "distance driven, m")
     axes.set_ylim(bottom=0)
     axes.set_xlim(left=0)
@@ -221,8 +228,10 @@ def _draw_errors(axes: Axes, tracks: Sequence[Track]) -> None:
 
 
 def _style(track: Track, tracks: Sequence[Track]) -> dict[str, Any]:
-    """Returns the line style of a track; the last track is the result."""
-    return {"color": OURS, "lw": 1.5} if track is tracks[-1] else {"color": ODOMETRY, "lw": 1.1, "ls": (0, (4, 2))}
+    """Returns the line style of a track; the last one, the result, is thin, so that it does not hide the others."""
+    others = [{"color": ODOMETRY, "lw": 2.4, "ls": (0, (3, 1.5))}, {"color": INK, "lw": 3.6, "ls": (0, (0.5, 1))}]
+    number = next(number for number, other in enumerate(reversed(tracks)) if other is track)
+    return others[(number - 1) % len(others)] if number else {"color": OURS, "lw": 1.3}
 
 
 class LiveViewer:
