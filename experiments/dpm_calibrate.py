@@ -142,22 +142,34 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, HeldOu
     models, held_out = {}, {}
     for kind, names in zip(KINDS, (dpm.CLOUD_FEATURES, dpm.SCAN_FEATURES, dpm.WEAK_FEATURES), strict=True):
         pairs = [
-            (place, row[kind][number], row["is_right_of_clouds" if kind == "of_clouds" else "is_right"][number])
+            (
+                place,
+                row[kind][number],
+                row["is_right_of_clouds" if kind == "of_clouds" else "is_right"][number],
+                lookalike_gap(row, number) if kind == "of_scans" else np.inf,
+            )
             for place, row in enumerate(rows)
             for number, weak in enumerate(row["of_weak_scans"])
             if row[kind][number] is not None and (kind != "of_scans" or weak is None)
         ]
-        if kind == "of_weak_scans" and len({is_right for _, _, is_right in pairs}) < 2:
+        if kind == "of_weak_scans" and len({is_right for _, _, is_right, _ in pairs}) < 2:
             continue
-        place, features, is_right = (np.array(column) for column in zip(*pairs, strict=True))
-        models[kind], held_out[kind] = fit_held_out(names, features, is_right, place)
+        place, features, is_right, gaps = (np.array(column) for column in zip(*pairs, strict=True))
+        models[kind], held_out[kind] = fit_held_out(names, features, is_right, place, dpm.lookalike_share(gaps))
         numbers |= {
             f"num_pairs_{kind}": len(pairs),
             f"share_right_{kind}": float(is_right.mean()),
             f"brier_{kind}": metrics.brier_score(*held_out[kind]),
             f"brier_of_a_constant_{kind}": float(is_right.var()),
+            f"calibration_error_{kind}": metrics.expected_calibration_error(*held_out[kind]),
         }
     return dpm.Calibration(**models), numbers, held_out
+
+
+def lookalike_gap(row: cli.Row, number: int) -> float:
+    """Returns the lead of a pair over the best other place that looks alike; files hold None for infinity."""
+    gap = row["lookalike_gap"][number]
+    return np.inf if gap is None else float(gap)
 
 
 def ambiguous_case(number: int, first_seed: int) -> cli.Row:
@@ -275,7 +287,7 @@ def fit_overlap(rows: Sequence[cli.Row]) -> tuple[dpm.LogisticModel, cli.Row, He
     towns = np.concatenate([np.full(len(row["is_overlap"]), row["overlap_town"]) for row in rows])
     features = np.concatenate([np.asarray(row["evidence"], float) for row in rows])
     is_overlap = np.concatenate([np.asarray(row["is_overlap"], bool) for row in rows])
-    fitted, found = fit_held_out(dpm.OVERLAP_FEATURES, features, is_overlap, towns)
+    fitted, found = fit_held_out(dpm.OVERLAP_FEATURES, features, is_overlap, towns, np.ones(len(towns)))
     numbers = {
         "num_overlap_pairs": len(towns),
         "auc_overlap": metrics.area_under_curve(*found),
@@ -286,14 +298,19 @@ def fit_overlap(rows: Sequence[cli.Row]) -> tuple[dpm.LogisticModel, cli.Row, He
 
 
 def fit_held_out(
-    names: tuple[str, ...], features: np.ndarray, labels: np.ndarray, places: np.ndarray
+    names: tuple[str, ...],
+    features: np.ndarray,
+    labels: np.ndarray,
+    places: np.ndarray,
+    shares: np.ndarray,
 ) -> tuple[dpm.LogisticModel, HeldOut]:
     """Returns the regression on all places, and the probability of each example by a fit on all places but its own."""
     found = np.empty(len(places))
     for place in np.unique(places):
         part = places == place
-        found[part] = dpm.logistic_probability(dpm.fit_logistic(names, features[~part], labels[~part]), features[part])
-    return dpm.fit_logistic(names, features, labels), (found, labels)
+        fitted = dpm.fit_logistic(names, features[~part], labels[~part], shares[~part])
+        found[part] = shares[part] * dpm.logistic_probability(fitted, features[part])
+    return dpm.fit_logistic(names, features, labels, shares), (found, labels)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, load_model, metrics
 from dpmjax import deeppointmap as dpm
-from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, draw_pairs, measure_pairs
+from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, draw_pairs, lookalike_gap, measure_pairs
 
 EXPERIMENT = "dpm_confidence"
 # Apart from the seeds of the calibration.
@@ -94,8 +94,7 @@ def rate(rows: list[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.R
             if rated == "scans":
                 arrays = {name: row[name][number] for name in ("of_scans", "of_weak_scans")}
                 evidence = evidence._replace(**{name: np.asarray(some) for name, some in arrays.items() if some})
-                gap = row["lookalike_gap"][number]
-                evidence = evidence._replace(lookalike_gap=np.inf if gap is None else gap)
+                evidence = evidence._replace(lookalike_gap=lookalike_gap(row, number))
             confidence.append(dpm.calibrated_probability(calibration, evidence))
         is_right += row[RATED[rated]]
         distance_m += row["distance_m"]

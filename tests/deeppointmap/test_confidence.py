@@ -55,6 +55,17 @@ def test_examples_of_one_kind_are_refused() -> None:
         fit_logistic(CLOUD_FEATURES, np.ones((3, 4)), np.ones(3, bool))
 
 
+def test_shares_of_the_probability_belong_to_the_fit() -> None:
+    rng = np.random.default_rng(0)
+    features, shares = rng.normal(size=(20_000, 4)), rng.uniform(0.5, 1.0, 20_000)
+    weights, bias = np.array([2.0, 0.0, -1.0, 0.5]), 1.0
+    is_right = rng.uniform(size=len(shares)) < shares / (1 + np.exp(-(features @ weights + bias)))
+    model = fit_logistic(CLOUD_FEATURES, features, is_right, shares)
+    np.testing.assert_allclose((*model.weights, model.bias), (*weights, bias), atol=0.12)
+    probability = shares * logistic_probability(model, features)
+    assert probability.mean() == pytest.approx(is_right.mean(), abs=0.005)
+
+
 def test_features_of_another_version_are_refused() -> None:
     with pytest.raises(ValueError, match="features"):
         LogisticModel(("speed",), (1.0,), 0.0)

@@ -9,6 +9,7 @@ from .confidence import calibrated_probability as calibrated_probability
 from .confidence import fit_logistic as fit_logistic
 from .confidence import fit_weights as fit_weights
 from .confidence import logistic_probability as logistic_probability
+from .confidence import lookalike_share as lookalike_share
 from .encoding import encode as encode
 from .encoding import encode_scans as encode_scans
 from .encoding import pyramid_of_cloud as pyramid_of_cloud

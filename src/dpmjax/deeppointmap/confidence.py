@@ -172,10 +172,23 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
     if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
         return float(logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans))
     if evidence.of_scans is not None:
-        # Of two places under which the scans agree, one is right: the odds are those of their scores.
-        is_right_of_both = expit(evidence.lookalike_gap)
-        return float(is_right_of_both * logistic_probability(calibration.of_scans, evidence.of_scans))
+        share = lookalike_share(evidence.lookalike_gap)
+        return float(share * logistic_probability(calibration.of_scans, evidence.of_scans))
     return float(logistic_probability(calibration.of_clouds, evidence.of_clouds))
+
+
+def lookalike_share(lookalike_gap: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    """Computes the share of the probability that a place keeps beside the best other one that looks alike.
+
+    Of two places under which the scans agree, one is right: the odds are those of their scores.
+
+    Args:
+        lookalike_gap: lead of its score over that of the other place, as log odds.
+
+    Returns:
+        In [0, 1]; 1 for an infinite lead.
+    """
+    return np.asarray(expit(lookalike_gap))
 
 
 def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
@@ -192,7 +205,10 @@ def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f
 
 
 def fit_logistic(
-    names: tuple[str, ...], features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
+    names: tuple[str, ...],
+    features: Float[np.ndarray, "n f"],
+    is_right: Bool[np.ndarray, " n"],
+    shares: Float[np.ndarray, " n"] | float = 1.0,
 ) -> LogisticModel:
     """Fits a logistic model by maximum likelihood, with a small ridge on standardised weights.
 
@@ -200,25 +216,29 @@ def fit_logistic(
         names: names of the features.
         features: features of held-out registrations.
         is_right: True for right registrations.
+        shares: factors of the probability, in (0, 1], as of places that look alike in `calibrated_probability`.
 
     Returns:
-        The model.
+        The model; its probability times the share is the fitted probability.
 
     Raises:
         ValueError: if all are right, or none.
     """
-    weights, bias = fit_weights(features, is_right)
+    weights, bias = fit_weights(features, is_right, shares)
     return LogisticModel(names, tuple(map(float, weights)), bias)
 
 
 def fit_weights(
-    features: Float[np.ndarray, "n f"], is_right: Bool[np.ndarray, " n"]
+    features: Float[np.ndarray, "n f"],
+    is_right: Bool[np.ndarray, " n"],
+    shares: Float[np.ndarray, " n"] | float = 1.0,
 ) -> tuple[Float[np.ndarray, " f"], float]:
     """Fits the weights and the constant of a logistic model; see `fit_logistic`.
 
     Args:
         features: features of examples.
         is_right: True for right examples.
+        shares: factors of the probability.
 
     Returns:
         Weights and constant.
@@ -230,13 +250,17 @@ def fit_weights(
         raise ValueError(f"is_right: expected right and wrong registrations, got {is_right.sum()} of {len(is_right)}")
     mean, scale = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
     standard = np.column_stack([(features - mean) / scale, np.ones(len(features))])
-    sign = np.where(is_right, 1.0, -1.0)
+    with np.errstate(divide="ignore"):
+        log_rest = np.log1p(-np.broadcast_to(shares, len(features)))  # -inf for a share of 1
 
     def loss(weights: Float[np.ndarray, " w"]) -> tuple[float, Float[np.ndarray, " w"]]:
-        margins = sign * (standard @ weights)
-        slope = -sign * expit(-margins) / len(sign)
+        margins = standard @ weights
+        # -log(p) of a right example and -log(1 - share p) of a wrong one; the share of a right one is a constant.
+        of_wrong = np.logaddexp(0, margins) - np.logaddexp(0, margins + log_rest)
+        losses = np.where(is_right, np.logaddexp(0, -margins), of_wrong)
+        slopes = np.where(is_right, -expit(-margins), expit(margins) - expit(margins + log_rest))
         ridge = RIDGE * np.append(weights[:-1], 0.0)
-        return float(np.logaddexp(0, -margins).mean() + ridge @ weights / 2), standard.T @ slope + ridge
+        return float(losses.mean() + ridge @ weights / 2), standard.T @ slopes / len(slopes) + ridge
 
     found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
