@@ -49,7 +49,8 @@ class Config(cli.DriveOptions):
     preset: Literal["default", "paper"] = "default"
     """Settings of SLAM: the default ones, or the thresholds of the paper."""
     odometry: Literal["prediction", "network"] | None = None
-    """Source of the first guess of a pose: the motion of before, or the network for every scan. None: of the preset."""
+    """Source of the first guess of a pose: the motion of before, or the network for every scan; without it, the preset
+    decides."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
     refine: FlagCreatePairsOff[bool] = False
