@@ -102,7 +102,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
     assert broken.returncode == 130, broken.stderr
     stopped = metrics_of(tmp_path / "broken")
-    assert stopped["is_interrupted"]
+    assert stopped["status"] == "interrupted"
     assert 0 < stopped["steps"] < 60
     assert list(stopped["candidates"]) == ["zero poses", "DeepMapping"]
     resumed = run("--resume", "-o", tmp_path / "broken")
@@ -127,7 +127,7 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
     with pytest.raises(Interrupted):
         main(Config(data=scans_npz, init="zero", output=tmp_path / "out"))
     found = metrics_of(tmp_path / "out")
-    assert found["is_interrupted"]
+    assert found["status"] == "interrupted"
     assert (found["steps"], found["kept"]) == (0, "zero poses")
     assert list(found["candidates"]) == ["zero poses"]
     assert (tmp_path / "out" / "map.png").exists()

@@ -130,6 +130,7 @@ def test_metrics_are_valid_json_with_seed_and_versions():
     )
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["ate_px"] == 0.5
+    assert metrics["status"] == "done"
     assert metrics["steps"] == 3
     assert metrics["loss"] is None
     assert metrics["seed"] == 7

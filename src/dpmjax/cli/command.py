@@ -69,6 +69,11 @@ class StopFlag:
         """Returns True after a signal."""
         return self.received is not None
 
+    @property
+    def status(self) -> str:
+        """Returns the status of the run for `metrics.json`."""
+        return "done" if self.received is None else "interrupted"
+
     def end_if_requested(self) -> None:
         """Ends the block after a signal, where nothing has been made that could be written."""
         if self.received is not None:

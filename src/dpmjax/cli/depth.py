@@ -62,7 +62,7 @@ def main(config: Config) -> None:
         numbers = {
             **depth_numbers(sequence, found),
             **recorder.numbers,
-            "is_interrupted": stop.is_requested,
+            "status": stop.status,
         }
         write_depth_results(folder, sequence, found.T_world_scan)
         draw(folder, sequence, found)

@@ -100,7 +100,7 @@ def main(config: Config) -> dict[str, Any]:
             **map_numbers(sequence, result, config, measure),
             **notes,
             **recorder.numbers,
-            "is_interrupted": stop.is_requested,
+            "status": "uncertain" if stop.status == "done" and not result.assessment.is_trusted else stop.status,
         }
         # Numbers first, so that they are written even if a picture fails.
         cli.write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)

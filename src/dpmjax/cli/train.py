@@ -152,7 +152,7 @@ def main(config: Config) -> None:
             "num_scans": len(store.table),
             "bad_scans": bad,
             "wall_s": time.perf_counter() - started,
-            "is_interrupted": stop.is_requested,
+            "status": stop.status,
             "seed": config.seed,
         }
         # Numbers first, so that they are written even if a picture fails.
