@@ -96,6 +96,8 @@ def test_resume_takes_the_latest_run_and_refuses_other_options():
     assert open_run(seed=1, resume=True).path.resolve() == first.path.resolve()
     with pytest.raises(ValueError, match=r"--seed was 1 in .* and is 2 now"):
         open_run(seed=2, resume=True)
+    with pytest.raises(ValueError, match=r"--data was not given in .* and is a now"):
+        open_run(seed=1, data=Path("a"), resume=True)
     assert open_run(seed=1, seconds=60.0, resume=True).is_resumed
 
 

@@ -36,8 +36,7 @@ class Config(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of NAME.depth.png, one *intrinsics*.txt, and a NAME.pose.txt for each image or for none. Without it: a
-    simulated apartment."""
+    """Folder of NAME.depth.png with an intrinsics file, and poses or none. Without it: a simulated apartment."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
 

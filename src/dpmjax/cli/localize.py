@@ -6,8 +6,8 @@
 
 The map is a file of `dpmjax.save_map`, such as map.npz of `dpmjax slam`. Each scan is looked for by itself. Results go
 to results/localize/<time>/: localizations.csv (a row for each scan: status, pose, probability, reason),
-trajectory_tum.txt (the scans that were found), map.png, metrics.json. Where the scans have reference poses, and
---map-poses gives those of the drive that made the map in the same world, the errors are measured too.
+trajectory_tum.txt (the scans that were found), map.png, metrics.json. Errors are measured where the scans have
+reference poses and --map-poses gives those of the drive that made the map, in the same world.
 """
 
 from __future__ import annotations

@@ -287,9 +287,14 @@ def _check_same_options(config: Any, path: Path) -> None:
     for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - getattr(config, "may_change", frozenset())):
         if stored[name] != now[name]:
             raise ValueError(
-                f"--{name.replace('_', '-')} was {stored[name]} in {path} and is {now[name]} now: "
+                f"--{name.replace('_', '-')} was {_said(stored[name])} in {path} and is {_said(now[name])} now: "
                 "a resumed run keeps its options; start a new run for others"
             )
+
+
+def _said(value: Any) -> Any:
+    """Returns the value of an option for a message."""
+    return "not given" if value is None else value
 
 
 def _make_timestamped(parent: Path) -> Path:
