@@ -41,7 +41,8 @@ def test_a_drive_of_fewer_scans_than_wanted_is_noted(room) -> None:
         drive = open_drive(room[0], DriveOptions(**options))
         return [note.text for note in drive.notes if "fewer" in note.text]
 
-    assert notes(n_scans=50, jump=3) == ["drive: 7 scans after --jump, fewer than --n-scans 50"]
+    assert notes(n_scans=50, jump=3) == ["drive: 7 scans at --jump 3, fewer than --n-scans 50"]
+    assert notes(n_scans=50) == ["drive: 20 scans, fewer than --n-scans 50"]
     assert not notes(n_scans=7, jump=3)
     assert not notes()
 

@@ -78,7 +78,8 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
     io.require_whole_files(part, bin_columns=options.columns)
     notes = [io.unit_note(part.read_points(0), part.sources[0])]
     if options.n_scans is not None and len(part) < options.n_scans:
-        notes.append(Note(f"{part.name}: {len(part)} scans after --jump, fewer than --n-scans {options.n_scans}"))
+        at_jump = f" at --jump {options.jump}" if options.jump > 1 else ""
+        notes.append(Note(f"{part.name}: {len(part)} scans{at_jump}, fewer than --n-scans {options.n_scans}"))
     return replace(part, notes=(*part.notes, *(note for note in notes if note is not None)))
 
 
