@@ -75,6 +75,7 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
     metrics = metrics_of(tmp_path / "out")
     assert not [name for name in METRICS if metrics.get(name) is None]
     assert (metrics["num_scans"], metrics["steps"], metrics["success"]) == (NUM_SCANS, 20, True)
+    assert metrics["status"] == ("done" if metrics["assessment"]["is_trusted"] else "uncertain")
     # From a good start it never gets worse.
     assert metrics["ate_initial_px"] < 1e-3
     assert metrics["ate_px"] < 0.1

@@ -58,6 +58,7 @@ def test_options_that_are_not_given_are_those_of_the_default():
         ("a --world 9", "--world: expected one of 0, 1, grove, got '9'"),
         ("a --groups 8 x", "--groups: expected a whole number, got 'x'"),
         ("a --hours", "--hours: expected a value"),
+        ("--nope", "missing arguments; --help describes them"),
         ("a --hour 3", "unknown options or too many arguments: --hour, 3; did you mean --hours?"),
         ("a b", "unknown options or too many arguments: b; --help lists the options"),
         ("", "missing: PATH; --help describes the options"),

@@ -58,7 +58,10 @@ def _message_in(box: str) -> str:
         names = (row.split()[0] for row in others if re.match(r" {4}\S", row))
         return f"missing: {', '.join(names)}; --help describes the options"
     message = " ".join(row.strip() for row in (first, *others)).removeprefix("Error parsing ")
-    message = re.sub(r"Missing value for argument '(.*)'\. Expected.*", r"\1: expected a value", message)
+    if valueless := re.match(r"Missing value for argument '(.*)'\. Expected", message):
+        # A positional argument has the name of its field here, which the help does not show.
+        is_option = valueless[1].startswith("-")
+        return f"{valueless[1]}: expected a value" if is_option else "missing arguments; --help describes them"
     if message.startswith("Unrecognized"):
         known = re.search(r"Perhaps you meant:\W*?(-[\w/-]+)", text)
         message = message.replace("Unrecognized options", "unknown options or too many arguments")
