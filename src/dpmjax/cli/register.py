@@ -14,14 +14,16 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deeppointmap, io, viz, weights
 from dpmjax.sequences import InputError
-from dpmjax.types import Registration
+
+if TYPE_CHECKING:
+    from dpmjax.types import Registration
 
 NAME = "register"
 # Least calibrated probability of a certain motion.
