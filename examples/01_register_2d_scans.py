@@ -1,4 +1,7 @@
-"""Planar scans without poses become one map: the whole pipeline first, then DeepMapping's networks alone."""
+"""Planar scans without poses become one map: the whole pipeline first, then DeepMapping's networks alone.
+
+Each takes about a minute and prints nothing meanwhile.
+"""
 
 import jax
 

@@ -3,7 +3,7 @@
 import dpmjax
 from dpmjax import io, simulation
 
-# Round a block of a simulated suburb, 215 m, and on over streets that it has seen.
+# Once round a block of a simulated suburb, and on over known streets.
 town = simulation.TownConfig("suburb", "loop", route_length_m=200.0, block_m=50.0)
 driving = simulation.DriveConfig(rate_hz=3.0, length_m=240.0, max_turn_deg_s=30.0)
 drive = simulation.simulate_scene(simulation.Scene(0, town, driving, simulation.HDL64E.with_azimuths(900)))

@@ -20,10 +20,10 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from dpmjax import DescriptorCloud, cli, encode, load_model, metrics, register, save_model, simulation, slam, viz
 from dpmjax import deeppointmap as dpm
@@ -63,7 +63,7 @@ NUM_PAIRS, NUM_OVERLAP_PAIRS = 30, 96
 class Config(cli.RunOptions):
     """Options of the run."""
 
-    model: Positional[str]
+    model: Annotated[Positional[str], arg(metavar="NAME|FILE")]
     """The model: a .safetensors file, or the name of a shipped one."""
 
     def __post_init__(self) -> None:

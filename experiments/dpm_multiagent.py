@@ -56,7 +56,7 @@ def main(config: Config) -> Any:
         folder = cli.open_run_folder(config, EXPERIMENT)
         with cli.recording(folder), cli.StopFlag() as stop:
             numbers = map_agents(cli.TableRun(folder, lambda: stop.is_requested), config, methods, runs[0])
-            numbers |= {"is_interrupted": stop.is_requested, "wall_s": time.perf_counter() - started}
+            numbers |= {"status": stop.status, "wall_s": time.perf_counter() - started}
             cli.write_metrics(folder, numbers, seed=config.seed)
             drives = ", ".join(dict.fromkeys(agent["sequence"] for agent in numbers["agents"]))
             print(table([{"sequence": drives, **numbers}]), f"results in {folder.path}", sep="\n")
@@ -85,7 +85,9 @@ def map_agents(run: cli.TableRun, config: Config, methods: slam.SlamMethods, seq
         result = slam.join_agents(methods, agents, on_keyframe=on_keyframe)
     sizes = write_agents(folder, result, mapped)
     numbers = {"weights": config.weights, "overlap": OVERLAP, **agents_numbers(result, mapped, sizes)}
-    cli.write_metrics(folder, numbers, seed=config.seed)  # numbers first: a picture that fails must not cost them
+    status = "interrupted" if run.is_stopped() else "done"
+    # Numbers first: a picture that fails must not cost them.
+    cli.write_metrics(folder, {"status": status, **numbers}, seed=config.seed)
     viz.save_figure(viz.agents_figure(f"{len(mapped)} agents", agent_panels(result, mapped)), folder / "agents.png")
     return numbers
 

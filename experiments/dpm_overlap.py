@@ -47,7 +47,7 @@ NUM_DRAWN = 64
 class Config(cli.RunOptions):
     """Options of the run."""
 
-    model: Positional[str]
+    model: Annotated[Positional[str], arg(metavar="NAME|FILE")]
     """The model: a .safetensors file, or the name of a shipped one."""
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")] = ()
     """Folders of scans with poses."""

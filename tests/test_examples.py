@@ -1,9 +1,11 @@
-"""Examples run, and the pages show their code: README and quick start as printed, guides as quoted."""
+"""Examples run, and the pages show their code: README and quick start as printed, guides as quoted and as a whole."""
 
 from __future__ import annotations
 
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,11 +35,12 @@ def test_example_runs(path, tmp_path, monkeypatch, capsys) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", ["README.md", "docs/quickstart.md"])
+@pytest.mark.parametrize("name", ["README.md", "docs/quickstart.md", *(f"docs/guides/{each.name}" for each in GUIDES)])
 def test_code_of_a_page_runs_as_printed(name, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile("\n".join(_blocks(ROOT / name)), name, "exec"), {})
-    assert capsys.readouterr().out
+    code = "\n".join(_blocks(ROOT / name))
+    exec(compile(code, name, "exec"), {})
+    assert ("print(" in code) == bool(capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
@@ -48,6 +51,16 @@ def test_code_of_a_guide_is_that_of_an_example_that_it_names(guide) -> None:
     assert blocks
     for block in blocks:
         assert any(block in source for source in sources), block
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
+def test_code_of_a_guide_defines_all_its_names(guide, tmp_path) -> None:
+    """Its blocks run one after the other, so no name may come from the example alone."""
+    code = tmp_path / "guide.py"
+    code.write_text("\n".join(_blocks(guide)))
+    ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "concise"]
+    done = subprocess.run([*ruff, str(code)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_examples_are_numbered_and_short() -> None:

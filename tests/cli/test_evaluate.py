@@ -70,12 +70,12 @@ def test_ctrl_c_within_a_band_keeps_the_rows_before_it(weights, tmp_path, monkey
     monkeypatch.setattr(scan_evaluation, "register_in_stages", interrupting)
     assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == 130
     stopped = load_json(out / "metrics.json")
-    assert stopped["is_interrupted"] is True
+    assert stopped["status"] == "interrupted"
     assert [row["band"] for row in stopped["rows"]] == ["near"][: num_registered // 4]
     assert next(count) <= num_registered + 3
     assert run(["--resume", "-o", str(out)]) == EXIT_OK
     whole = load_json(out / "metrics.json")
-    assert whole["is_interrupted"] is False
+    assert whole["status"] == "done"
     assert [row["band"] for row in whole["rows"]] == ["near", "middle", "far", "overlap"]
     assert whole["rows"][: len(stopped["rows"])] == stopped["rows"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -86,7 +87,9 @@ def test_every_subcommand_ends_well_on_simulated_input(installed, tmp_path) -> N
         done = start(installed, tmp_path, name, *arguments)
         assert done.returncode == EXIT_OK, f"{name}: {done.stderr[-2000:]}"
         if "-o" in arguments:
-            assert (tmp_path / arguments[-1] / "metrics.json").is_file(), name
+            metrics = json.loads((tmp_path / arguments[-1] / "metrics.json").read_text())
+            assert metrics["status"] in ("done", "uncertain"), name
+            assert "is_interrupted" not in metrics, name
 
 
 @pytest.mark.slow

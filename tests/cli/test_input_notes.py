@@ -74,9 +74,9 @@ def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found:
     ],
 )
 def test_run_status_a_run(statuses: dict[str, int], num_unknown_along: int, is_interrupted: bool, status: str) -> None:
-    numbers = {"scan_statuses": statuses, "num_unknown_along": num_unknown_along, "is_interrupted": is_interrupted}
-    assert run_status({**numbers, "num_parts": 1}) == status
-    assert run_status({**numbers, "num_parts": 2}) == ("uncertain" if status == "done" else status)
+    numbers = {"scan_statuses": statuses, "num_unknown_along": num_unknown_along}
+    assert run_status({**numbers, "num_parts": 1}, is_interrupted) == status
+    assert run_status({**numbers, "num_parts": 2}, is_interrupted) == ("uncertain" if status == "done" else status)
 
 
 def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(

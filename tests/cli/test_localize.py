@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import jax
 import numpy as np
 import pytest
@@ -148,6 +151,19 @@ def test_errors_are_those_of_the_keyframes_frames(case) -> None:
         list(map(localize.as_localization, rows)), slam_map, reference, drive.T_world_lidar[[1, 1, 1, 1]]
     )
     np.testing.assert_allclose(again.translation_m, errors.translation_m, atol=1e-6)
+
+
+def test_a_stopped_run_is_interrupted(case, tmp_path, monkeypatch) -> None:
+    def stopped(*arguments):
+        for result in localize_each(*arguments):
+            os.kill(os.getpid(), signal.SIGINT)
+            yield result
+
+    localize_each = localize.slam.localize_each
+    monkeypatch.setattr("dpmjax.slam.localize_each", stopped)
+    arguments = (case / "map.npz", scans_of(case), "--weights", case / "model.safetensors", "-o", tmp_path / "out")
+    assert run(*arguments) == 130
+    assert load_json(tmp_path / "out" / "metrics.json")["status"] == "interrupted"
 
 
 def test_scans_without_points_are_a_failure(case, tmp_path, capsys) -> None:

@@ -75,6 +75,7 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
     metrics = metrics_of(tmp_path / "out")
     assert not [name for name in METRICS if metrics.get(name) is None]
     assert (metrics["num_scans"], metrics["steps"], metrics["success"]) == (NUM_SCANS, 20, True)
+    assert metrics["status"] == ("done" if metrics["assessment"]["is_trusted"] else "uncertain")
     # From a good start it never gets worse.
     assert metrics["ate_initial_px"] < 1e-3
     assert metrics["ate_px"] < 0.1
@@ -102,7 +103,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
     assert broken.returncode == 130, broken.stderr
     stopped = metrics_of(tmp_path / "broken")
-    assert stopped["is_interrupted"]
+    assert stopped["status"] == "interrupted"
     assert 0 < stopped["steps"] < 60
     assert list(stopped["candidates"]) == ["zero poses", "DeepMapping"]
     resumed = run("--resume", "-o", tmp_path / "broken")
@@ -127,7 +128,7 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
     with pytest.raises(Interrupted):
         main(Config(data=scans_npz, init="zero", output=tmp_path / "out"))
     found = metrics_of(tmp_path / "out")
-    assert found["is_interrupted"]
+    assert found["status"] == "interrupted"
     assert (found["steps"], found["kept"]) == (0, "zero poses")
     assert list(found["candidates"]) == ["zero poses"]
     assert (tmp_path / "out" / "map.png").exists()

@@ -48,6 +48,9 @@ def test_the_last_lines_name_the_uncertain_scans_and_the_fault() -> None:
     assessment |= {"uncertain_scans": [3, 4, 5, 9], "fault": "the scans are mirrored"}
     text = report("m", {"candidates": {"odometry": numbers}, "kept": "odometry", "assessment": assessment})
     assert "DO NOT TRUST" in text
+    # Without a reference there is no error to show.
+    assert "ATE" not in text
+    assert "no reference was given" in text
     assert "uncertain where 4 scans are" in text
     assert text.endswith("3-5, 9")
     assert "the scans are mirrored\n" in text

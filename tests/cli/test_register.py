@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import jax
 import numpy as np
 import pytest
@@ -9,9 +11,10 @@ import pytest
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.program import main
-from dpmjax.cli.register import motion_text
+from dpmjax.cli.register import confidence_numbers, motion_text
 from dpmjax.cli.result_files import load_json
 from dpmjax.io import read_lidar_file
+from dpmjax.types import Registration
 from tests.data_sets import read_ply, write_pcd
 from tests.deeppointmap import toy
 
@@ -104,9 +107,19 @@ def test_scans_of_a_handful_of_points_have_no_result(files, tmp_path, capsys) ->
     out = tmp_path / "out"
     assert command(files, tmp_path / "few.npy", files / "b.npy", "-o", out) == EXIT_FAILED
     assert "no motion was found, the identity was written" in capsys.readouterr().err
+    assert load_json(out / "metrics.json")["status"] == "failed"
     np.testing.assert_array_equal(np.loadtxt(out / "T_target_source.txt"), np.eye(4))
 
 
 def test_a_folder_is_no_scan(files, tmp_path, capsys) -> None:
     assert command(files, tmp_path, files / "b.npy", "-o", tmp_path / "out") == EXIT_BAD_INPUT
     assert "a folder; give one scan file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("num_inliers", "confidence", "is_calibrated", "status"),
+    [(9, 0.95, True, "done"), (9, 0.5, True, "uncertain"), (9, 0.5, False, "done"), (0, 0.95, True, "failed")],
+)
+def test_the_status_follows_from_the_confidence(num_inliers, confidence, is_calibrated, status) -> None:
+    found = Mock(spec=Registration, verification=None, num_inliers=num_inliers, confidence=confidence)
+    assert confidence_numbers(found, is_calibrated)["status"] == status

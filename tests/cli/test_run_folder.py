@@ -96,6 +96,8 @@ def test_resume_takes_the_latest_run_and_refuses_other_options():
     assert open_run(seed=1, resume=True).path.resolve() == first.path.resolve()
     with pytest.raises(ValueError, match=r"--seed was 1 in .* and is 2 now"):
         open_run(seed=2, resume=True)
+    with pytest.raises(ValueError, match=r"--data was not given in .* and is a now"):
+        open_run(seed=1, data=Path("a"), resume=True)
     assert open_run(seed=1, seconds=60.0, resume=True).is_resumed
 
 
@@ -130,6 +132,7 @@ def test_metrics_are_valid_json_with_seed_and_versions():
     )
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["ate_px"] == 0.5
+    assert metrics["status"] == "done"
     assert metrics["steps"] == 3
     assert metrics["loss"] is None
     assert metrics["seed"] == 7

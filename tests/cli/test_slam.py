@@ -148,7 +148,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert metrics["ate_m"] < 0.5 * metrics["ate_odometry_m"]
     assert metrics["t_rel_percent"] < 1.0
     assert metrics["seed"] == 0
-    assert metrics["is_interrupted"] is False
+    assert metrics["status"] == "done"
     assert {"thinning ahead", "odometry", "encoder", "decoder", "loops", "waiting", "write"} <= set(metrics["stages_s"])
     scans, loops = table(whole / "scans.csv"), table(whole / "loops.csv")
     assert [int(row["scan"]) for row in scans] == list(range(len(TRUTH)))
@@ -204,7 +204,7 @@ def test_a_bad_scan_on_the_way_keeps_what_was_found(whole, drive, with_truth, tm
     assert "060.npy" in last
     assert str(out) in last
     assert len(np.load(out / "trajectory.npy")) == 60
-    assert load_json(out / "metrics.json")["is_interrupted"] is True
+    assert load_json(out / "metrics.json")["status"] == "interrupted"
     path.write_bytes(good)
     assert run("--resume", "-o", out) == EXIT_OK
     assert_same_results(out, whole)

@@ -36,6 +36,17 @@ def room(tmp_path_factory) -> tuple[Path, Path]:
     return folder / "drive", folder / "toy.safetensors"
 
 
+def test_a_drive_of_fewer_scans_than_wanted_is_noted(room) -> None:
+    def notes(**options):
+        drive = open_drive(room[0], DriveOptions(**options))
+        return [note.text for note in drive.notes if "fewer" in note.text]
+
+    assert notes(n_scans=50, jump=3) == ["drive: 7 scans at --jump 3, fewer than --n-scans 50"]
+    assert notes(n_scans=50) == ["drive: 20 scans, fewer than --n-scans 50"]
+    assert not notes(n_scans=7, jump=3)
+    assert not notes()
+
+
 def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
     drive, weights = room
     first, second = tmp_path / "first", tmp_path / "second"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, open_lidar_sequence, read_lidar_file, require_whole_files
+from dpmjax.io import InputError, open_lidar_sequence, read_lidar_file, require_whole_files, scan_notes
 from dpmjax.io.lidar_file import find_columns
 
 NUM = 1200
@@ -76,6 +76,20 @@ def test_values_that_do_not_tell_are_said(tmp_path: Path, caplog: pytest.LogCapt
     caplog.clear()
     assert len(read_lidar_file(tmp_path / "0.bin", bin_columns=3)) == NUM // 3 * 4
     assert not caplog.records
+
+
+@pytest.mark.parametrize("given", [3, 7])
+def test_given_columns_that_the_values_contradict_are_a_doubt(tmp_path: Path, table: np.ndarray, given: int) -> None:
+    table[: 7 * (NUM // 7), :4].tofile(tmp_path / "0.bin")
+    doubt = f"0.bin: --columns {given}, but the values look like 4 columns a point"
+    (note,) = open_lidar_sequence(tmp_path, bin_columns=given).notes
+    assert note.is_doubt
+    assert note.text.endswith(doubt)
+    points = read_lidar_file(tmp_path / "0.bin", bin_columns=given)
+    (note,) = scan_notes(tmp_path / "0.bin", points, bin_columns=given)
+    assert note.is_doubt
+    assert note.text.endswith(doubt)
+    assert not open_lidar_sequence(tmp_path, bin_columns=4).notes
 
 
 def test_the_ending_of_nuscenes_tells_where_values_do_not(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from dpmjax.io import InputError, ScanSequence, read_sequence
+from dpmjax.io import InputError, ScanSequence, read_planar_poses, read_sequence
+from dpmjax.io.files import load_arrays
 from dpmjax.sequences import has_angular_order
 from tests.data_sets import write_deepmapping_folder
 
@@ -101,8 +102,8 @@ def with_value(index, value):
         ({"points": POINTS.astype(str)}, "points are"),
         ({"points": np.ones((5, 10, 3))}, "scans of 10 beams"),
         ({"points": np.ones((5, 40, 2))}, "one and the same"),
-        ({"points": POINTS[:1]}, "two scans"),
-        ({"points": POINTS[:0]}, "two scans"),
+        ({"points": POINTS[:1]}, "1 scan; give two or more"),
+        ({"points": POINTS[:0]}, "0 scans; give two or more"),
         ({"points": POINTS * 1000}, "millimetres"),
         ({"points": POINTS / 1000}, "median range"),
         ({"points": POINTS, "poses": POSES[:4]}, "poses are"),
@@ -133,6 +134,27 @@ def test_missing_empty_and_foreign_files_are_refused(tmp_path, name, content):
         read_sequence(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "found"), [(b"", "an empty file of 0 bytes; copy it again"), (b"1 2 3\n", "it has no header of NumPy")]
+)
+def test_an_empty_file_and_a_text_are_named(tmp_path, content, found):
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(InputError, match=found):
+        load_arrays(tmp_path / "a.npy")
+    with pytest.raises(InputError, match="a folder; give one file"):
+        load_arrays(tmp_path)
+
+
+def test_a_single_scan_is_named(tmp_path):
+    with pytest.raises(InputError, match="1 scan; give two or more"):
+        read_sequence(save(tmp_path, points=POINTS[:1]))
+    with pytest.raises(InputError, match="1 of 6 scans chosen; give two or more"):
+        read_sequence(save(tmp_path, points=POINTS), selection=slice(1))
+    np.savetxt(tmp_path / "one.txt", np.zeros((1, 3)))
+    with pytest.raises(InputError, match="1 pose for 6 scans"):
+        read_planar_poses(tmp_path / "one.txt", 6, "m")
 
 
 def test_damaged_npz_is_refused(tmp_path):

@@ -113,7 +113,7 @@ def test_homogeneous_planar_matrices_are_read(tmp_path):
     ("text", "found"),
     [
         ("", "no row"),
-        ("1 2 3\n", "1 poses for 2 scans"),
+        ("1 2 3\n", "1 pose for 2 scans"),
         ("1 2 3\n1 2 nan\n", "NaN"),
         ("1 2 3\n1 2\n", "columns"),
         ("1 2\n1 2\n", "columns"),

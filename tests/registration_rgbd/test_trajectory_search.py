@@ -127,7 +127,9 @@ def test_of_alike_trajectories_the_best_goes_on(walk, scans, monkeypatch) -> Non
 @pytest.mark.slow
 def test_images_are_registered_without_a_first_guess(walk, scans) -> None:
     config = DepthSearchConfig(num_candidates=512)
-    T = initialize_depth(scans, config, key=KEY)
+    placed = []
+    T = initialize_depth(scans, config, key=KEY, on_image=lambda *numbers: placed.append(numbers))
+    assert placed == [(number, len(T)) for number in range(1, len(T) + 1)]
     relative = np.linalg.inv(walk.T_world_camera[0]) @ walk.T_world_camera
     assert absolute_trajectory_error(T[:, :3, 3], relative[:, :3, 3]) < 0.02
     assert np.abs(T[:, 0, 2] - relative[:, 0, 2]).max() < 0.02

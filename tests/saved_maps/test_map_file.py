@@ -229,10 +229,14 @@ def test_foreign_and_broken_files_are_refused(as_user, tmp_path, found) -> None:
 def test_files_that_are_none_are_refused(as_user, tmp_path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_map(tmp_path / "none.npz")
-    for name, content in (("empty.npz", b""), ("text.npz", b"a map\n"), ("folder.npz", None)):
+    for name, content, found in (
+        ("empty.npz", b"", "an empty file of 0 bytes"),
+        ("text.npz", b"a map\n", "not a readable NumPy file"),
+        ("folder.npz", None, "a folder"),
+    ):
         path = tmp_path / name
         path.mkdir() if content is None else path.write_bytes(content)
-        with pytest.raises(InputError, match="not a readable NumPy file"):
+        with pytest.raises(InputError, match=f"{found}.*; give a file of dpmjax.save_map"):
             load_map(path)
 
 

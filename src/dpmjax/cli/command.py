@@ -16,11 +16,11 @@ from functools import partial
 from types import FrameType
 from typing import Any, TypeVar
 
-import tyro
 from tqdm import tqdm
 
 from dpmjax.cli import program
 from dpmjax.cli.info import select_device
+from dpmjax.cli.options import parse_options
 from dpmjax.cli.run_folder import OutputOptions, RunFailedError, check_run_folder, find_run, load_config
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError
@@ -68,6 +68,11 @@ class StopFlag:
     def is_requested(self) -> bool:
         """Returns True after a signal."""
         return self.received is not None
+
+    @property
+    def status(self) -> str:
+        """Returns the status of the run for `metrics.json`."""
+        return "done" if self.received is None else "interrupted"
 
     def end_if_requested(self) -> None:
         """Ends the block after a signal, where nothing has been made that could be written."""
@@ -161,7 +166,7 @@ def run_command(
             check_run_folder(config, name)
             select_device(config.device)
         main(config)
-    except SystemExit as done:  # tyro, after --help or wrong usage
+    except SystemExit as done:  # after --help
         return EXIT_OK if done.code is None else int(done.code)
     except Interrupted as stop:
         return _say(f"stopped by {stop}", stop.exit_code)
@@ -183,15 +188,15 @@ def run_command(
 
 def _parse(config_type: type[ConfigT], name: str, description: str | None, arguments: list[str]) -> ConfigT:
     prog = f"dpmjax {name}" if name in program.COMMANDS else f"python -m experiments.{name}"
-    parse = partial(tyro.cli, config_type, prog=prog, description=description)
-    config = parse(args=arguments)
+    parse = partial(parse_options, config_type, prog=prog, description=description)
+    config = parse(arguments)
     if not getattr(config, "resume", False):
         return config
     earlier = load_config(find_run(name, getattr(config, "output", None)), config_type)
     # Of a flag that is on, tyro takes --no-FLAG alone; who repeats the command says --FLAG again.
     names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
     on = {f"--{name}".replace("_", "-") for name in names if getattr(earlier, name) is True}
-    return parse(args=[argument for argument in arguments if argument.replace("_", "-") not in on], default=earlier)
+    return parse([argument for argument in arguments if argument.replace("_", "-") not in on], default=earlier)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

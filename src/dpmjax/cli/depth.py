@@ -38,8 +38,7 @@ class Config(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of NAME.depth.png, one *intrinsics*.txt, and a NAME.pose.txt for each image or for none. Without it: a
-    simulated apartment."""
+    """Folder of NAME.depth.png with an intrinsics file, and poses or none. Without it: a simulated apartment."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
 
@@ -57,14 +56,17 @@ def main(config: Config) -> None:
     images = registration_rgbd.as_depth_scans(sequence.points, sequence.mask)
     folder = cli.open_run_folder(config, NAME)
     with cli.recording(folder), cli.StopFlag() as stop:
-        print(f"{sequence.name}: {len(sequence)} images", "search of first poses ...", sep="\n", flush=True)
+        print(f"{sequence.name}: {len(sequence)} images", flush=True)
         recorder = cli.FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
         settings = deepmapping.preset(config.preset, "depth", motion="planar" if sequence.is_planar else "full")
-        found = deepmapping.register_depth(images, settings, key=jax.random.key(config.seed), engine=recorder)
+        key, search = jax.random.key(config.seed), registration_rgbd.depth_search(settings.motion)
+        with cli.progress_bar("search of first poses", " images") as on_image:
+            start = registration_rgbd.initialize_depth(images, search, key=key, on_image=on_image)
+        found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
         numbers = {
             **depth_numbers(sequence, found),
             **recorder.numbers,
-            "is_interrupted": stop.is_requested,
+            "status": stop.status,
         }
         write_depth_results(folder, sequence, found.T_world_scan)
         draw(folder, sequence, found)

@@ -76,8 +76,11 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
         drive = with_raised_beams(drive)
     part = drive.take(options.selection)
     io.require_whole_files(part, bin_columns=options.columns)
-    note = io.unit_note(part.read_points(0), part.sources[0])
-    return part if note is None else replace(part, notes=(*part.notes, note))
+    notes = [io.unit_note(part.read_points(0), part.sources[0])]
+    if options.n_scans is not None and len(part) < options.n_scans:
+        at_jump = f" at --jump {options.jump}" if options.jump > 1 else ""
+        notes.append(Note(f"{part.name}: {len(part)} scans{at_jump}, fewer than --n-scans {options.n_scans}"))
+    return replace(part, notes=(*part.notes, *(note for note in notes if note is not None)))
 
 
 def open_path(path: Path, seed: int, **options: Any) -> LidarSequence:

@@ -104,6 +104,7 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> 
     Raises:
         ValueError: a path cannot be read, or a drive has no poses or no pairs, or two drives have the same name.
     """
+    print("opening the drives ...", flush=True)
     drives = [source() for source in cli.find_sources(data, towns)]
     for drive in drives:
         if not len(deeppointmap.draw_scan_pairs(drive, "near", 1)):

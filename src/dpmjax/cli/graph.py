@@ -42,7 +42,9 @@ class Config(cli.OutputOptions):
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        cli.check_least(self, iterations=1, outlier_chi2=1e-9)
+        cli.check_least(self, iterations=1)
+        if self.outlier_chi2 is not None and not self.outlier_chi2 > 0.0:
+            raise ValueError(f"--outlier-chi2: expected more than 0, got {self.outlier_chi2}")
         if self.graph == Path():
             raise ValueError("give a pose graph, a file of g2o or TORO")
 

@@ -6,8 +6,8 @@
 
 The map is a file of `dpmjax.save_map`, such as map.npz of `dpmjax slam`. Each scan is looked for by itself. Results go
 to results/localize/<time>/: localizations.csv (a row for each scan: status, pose, probability, reason),
-trajectory_tum.txt (the scans that were found), map.png, metrics.json. Where the scans have reference poses, and
---map-poses gives those of the drive that made the map in the same world, the errors are measured too.
+trajectory_tum.txt (the scans that were found), map.png, metrics.json. Errors are measured where the scans have
+reference poses and --map-poses gives those of the drive that made the map, in the same world.
 """
 
 from __future__ import annotations
@@ -93,6 +93,7 @@ def main(config: Config) -> None:
             rows.append(row)
             bar.update(1)
             bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
+        bar.close()  # so that the result stands below it
         print(write_found(folder, config, case, rows, notes))
         if _are_all_empty(rows) and not stop.is_requested:
             found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
@@ -151,7 +152,7 @@ def write_found(
         "is_calibrated": case.is_calibrated,
         "map_bytes": config.map.stat().st_size,
         **notes,
-        "status": "failed" if _are_all_empty(rows) else "done",
+        "status": _status(case, rows),
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
         **errors,
     }
@@ -191,6 +192,13 @@ def map_points(slam_map: slam.KeyframeMap) -> np.ndarray:
     poses = enumerate(slam_map.T_world_keyframe)
     points = np.concatenate([slam.keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3] for row, T in poses])
     return points[np.random.default_rng(0).permutation(len(points))[:NUM_MAP_POINTS]]
+
+
+def _status(case: Case, rows: list[dict[str, str]]) -> str:
+    """Returns the status of the run, whose rows are those of all scans unless it was stopped."""
+    if len(rows) < len(case.drive):
+        return "interrupted"
+    return "failed" if _are_all_empty(rows) else "done"
 
 
 def _are_all_empty(rows: list[dict[str, str]]) -> bool:

@@ -55,7 +55,8 @@ class Config(cli.ScanOptions, cli.RunOptions):
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
     """Where the poses start; auto: odometry if there is any, else icp-plane; if the map from odometry cannot be
-    trusted, icp-plane is tried, too; global: exhaustive search of scan pairs, needs no guess; FILE is a trajectory."""
+    trusted, icp-plane is tried, too; global: exhaustive search of scan pairs, needs no guess; FILE: poses (TUM, KITTI,
+    or x y theta)."""
     ordered: bool = True
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
@@ -100,7 +101,7 @@ def main(config: Config) -> dict[str, Any]:
             **map_numbers(sequence, result, config, measure),
             **notes,
             **recorder.numbers,
-            "is_interrupted": stop.is_requested,
+            "status": "uncertain" if stop.status == "done" and not result.assessment.is_trusted else stop.status,
         }
         # Numbers first, so that they are written even if a picture fails.
         cli.write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)

@@ -119,7 +119,9 @@ def _trust_lines(assessment: Mapping[str, Any]) -> list[str]:
     """Returns the lines on trust: the assessment, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
-    lines = [f"{trust}: weakest connection {weakest:.2f}, {contradiction:.1%} of the beams contradict beyond the usual"]
+    # Near zero the difference of two shares has either sign.
+    more = f"{max(contradiction, 0.0):.1%} more beams than between the best pairs"
+    lines = [f"{trust}: the weakest connection scores {weakest:.2f} of 1; {more} end in the free space of another scan"]
     if assessment["fault"] is not None:
         lines.append(assessment["fault"])
     if count := len(assessment["uncertain_scans"]):
@@ -139,11 +141,17 @@ def report(unit: str, numbers: Mapping[str, Any]) -> str:
     """Returns the last lines on the console: errors and scores of each candidate, assessment of the kept one."""
     candidates, assessment = numbers["candidates"], numbers["assessment"]
     width = max(map(len, candidates))
-    lines = [f"  {'candidate':{width}}  {'ATE, ' + unit:>10}  nats a beam  beams off a surface"]
+    has_ate = all(f"ate_{unit}" in found for found in candidates.values())
+    head = f"  {'ATE, ' + unit:>10}" if has_ate else ""
+    lines = [f"  {'candidate':{width}}{head}  nats a beam  beams off a surface"]
     for name, found in candidates.items():
-        mark, ate = "*" if name == numbers["kept"] else " ", found.get(f"ate_{unit}", math.nan)
-        lines.append(f"{mark} {name:{width}}  {ate:10.3g}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
-    lines += [f"kept: {numbers['kept']} (chosen without the reference)", *_trust_lines(assessment)]
+        mark, ate = "*" if name == numbers["kept"] else " ", f"  {found[f'ate_{unit}']:10.3g}" if has_ate else ""
+        lines.append(f"{mark} {name:{width}}{ate}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
+    why = "chosen without the reference" if has_ate else "no reference was given"
+    lines += [
+        f"kept: {numbers['kept']} ({why}; docs/guides/scans_2d.md explains both scores)",
+        *_trust_lines(assessment),
+    ]
     if "num_relations" in numbers:
         kinds = (f"{numbers[f'relations_initial_{kind}']:.3g} -> {numbers[f'relations_{kind}']:.3g}" for kind in UNITS)
         lines.append(f"mean error of {numbers['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")

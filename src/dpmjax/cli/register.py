@@ -14,13 +14,16 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deeppointmap, io, viz, weights
 from dpmjax.sequences import InputError
+
+if TYPE_CHECKING:
+    from dpmjax.types import Registration
 
 NAME = "register"
 # Least calibrated probability of a certain motion.
@@ -57,21 +60,17 @@ def main(config: Config) -> None:
     folder = cli.open_run_folder(config, NAME)
     with cli.recording(folder):
         noted = cli.report_notes(notes)
+        print("registration ...", flush=True)
         clock = time.perf_counter()
         found = deeppointmap.register(model, source, target, refine=config.refine)
         T = np.asarray(found.T_target_source, np.float64)
-        names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
-        shares = {name: float(getattr(found.verification, name)) for name in names}
         metrics = {
             "source": config.source.name,
             "target": config.target.name,
             "weights": config.weights,
             **noted,
             **motion_numbers(T),
-            "confidence": float(found.confidence),
-            "num_inliers": int(found.num_inliers),
-            **shares,
-            "is_calibrated": model.config.calibration is not None,
+            **confidence_numbers(found, model.config.calibration is not None),
             "register_s": time.perf_counter() - clock,
         }
         write_motion(folder, T, source, target)
@@ -83,7 +82,7 @@ def main(config: Config) -> None:
         figure = viz.registered_pairs_figure([pair])
         viz.save_figure(figure, folder / "registration.png")
         print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")
-        if not metrics["num_inliers"] and not metrics.get("matched_share"):
+        if metrics["status"] == "failed":
             outcome = "no motion was found, the identity was written"
             advice = "give scans with walls and other things at 20 places or more, 1 to 60 m from the lidar"
             raise InputError(f"{config.source}, {config.target}", outcome, advice)
@@ -93,6 +92,22 @@ def names_of(source: Path, target: Path) -> tuple[str, str]:
     """Returns the names of both files, with their folders where the files have the same name."""
     num_parts = 1 if source.name != target.name else 2
     return str(Path(*source.parts[-num_parts:])), str(Path(*target.parts[-num_parts:]))
+
+
+def confidence_numbers(found: Registration, is_calibrated: bool) -> dict[str, Any]:
+    """Returns the status of a registration, its confidence, and the evidence for it."""
+    names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
+    shares = {name: float(getattr(found.verification, name)) for name in names}
+    confidence, num_inliers = float(found.confidence), int(found.num_inliers)
+    has_motion = num_inliers > 0 or bool(shares.get("matched_share"))
+    status = "uncertain" if is_calibrated and confidence < SURE else "done"
+    return {
+        "status": status if has_motion else "failed",
+        "confidence": confidence,
+        "num_inliers": num_inliers,
+        **shares,
+        "is_calibrated": is_calibrated,
+    }
 
 
 def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def run_table(
                 rows.append(do_row(folder.path, case, partial(work, table, **case), seed=config.seed))
         summary = report(rows) if rows else Summary({}, "no row is finished")
         # Numbers come before pictures, so that they are written even if a picture fails.
-        metrics = {**summary.numbers, "is_interrupted": stop.is_requested}
+        metrics = {**summary.numbers, "status": stop.status}
         note = write_metrics(folder, metrics, seed=config.seed, rows=rows, table=summary.rows)
         write_atomically(folder / "table.md", summary.text + (f"\n\n{note}.\n" if note else "\n"))
         print(summary.text)

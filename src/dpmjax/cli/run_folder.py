@@ -219,11 +219,11 @@ def write_metrics(
     rows: Sequence[Mapping[str, Any]] | None = None,
     table: Sequence[Mapping[str, Any]] | None = None,
 ) -> str | None:
-    """Writes `metrics.json`: plain names with units, then the seed, the versions, the device and the machine.
+    """Writes `metrics.json`: status, plain names with units, then the seed, the versions, the device and the machine.
 
     Args:
         folder: folder of the run.
-        metrics: numbers by name.
+        metrics: numbers by name; without a `status` among them, it is "done".
         seed: seed of the run; None where nothing is random.
         rows: rows made by `do_row`; the file names those of another commit than its own.
         table: rows of the file; None: those of `do_row`.
@@ -235,7 +235,7 @@ def write_metrics(
     note = commits_note(rows or (), made_by["git_hash"])
     noted_rows = {} if rows is None else {"note": note, "rows": rows if table is None else table}
     seeds = {} if seed is None else {"seed": seed}
-    write_json(folder / METRICS, {**metrics, **seeds, **made_by, **noted_rows})
+    write_json(folder / METRICS, {"status": "done", **metrics, **seeds, **made_by, **noted_rows})
     return note
 
 
@@ -287,9 +287,14 @@ def _check_same_options(config: Any, path: Path) -> None:
     for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - getattr(config, "may_change", frozenset())):
         if stored[name] != now[name]:
             raise ValueError(
-                f"--{name.replace('_', '-')} was {stored[name]} in {path} and is {now[name]} now: "
+                f"--{name.replace('_', '-')} was {_said(stored[name])} in {path} and is {_said(now[name])} now: "
                 "a resumed run keeps its options; start a new run for others"
             )
+
+
+def _said(value: Any) -> Any:
+    """Returns the value of an option for a message."""
+    return "not given" if value is None else value
 
 
 def _make_timestamped(parent: Path) -> Path:

@@ -49,7 +49,8 @@ class Config(cli.DriveOptions):
     preset: Literal["default", "paper"] = "default"
     """Settings of SLAM: the default ones, or the thresholds of the paper."""
     odometry: Literal["prediction", "network"] | None = None
-    """Source of the first guess of a pose: the motion of before, or the network for every scan. None: of the preset."""
+    """Source of the first guess of a pose: the motion of before, or the network for every scan; without it, the preset
+    decides."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
     refine: FlagCreatePairsOff[bool] = False
@@ -94,8 +95,12 @@ def main(config: Config) -> None:
         metrics = write_results(folder, config, drive, run)
         if config.refine and run.failure is None and not stop.is_requested:
             metrics |= refine_trajectory(folder, config, drive, lambda: stop.is_requested)
-        metrics["is_interrupted"] = stop.is_requested or run.failure is not None
-        metrics |= {**notes, "status": numbers.run_status(metrics), "wall_s": time.perf_counter() - started}
+        is_interrupted = stop.is_requested or run.failure is not None
+        metrics |= {
+            **notes,
+            "status": numbers.run_status(metrics, is_interrupted),
+            "wall_s": time.perf_counter() - started,
+        }
         cli.write_metrics(folder, metrics, seed=config.seed)
         cli.tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
         if run.failure is not None:
@@ -148,7 +153,8 @@ def write_results(folder: cli.RunFolder, config: Config, drive: MappedDrive, run
     files.write_scans(folder / "scans.csv", result.reports, result.keyframes, sequence.sources)
     if len(slam_map):
         metrics |= files.write_map_file(folder / "map.npz", slam_map)
-    cli.write_metrics(folder, metrics, seed=config.seed)  # numbers first, even if a picture fails
+    # Numbers first, so that they are written even if a picture fails.
+    cli.write_metrics(folder, metrics | {"status": "interrupted"}, seed=config.seed)
     cloud = files.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
     io.write_ply(folder / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
     files.draw_pictures(folder.path, sequence, result, cloud, len(drive.start.slam_map))

@@ -189,18 +189,19 @@ def why_failed(statuses: Mapping[str, int]) -> str | None:
     return None
 
 
-def run_status(numbers: Mapping[str, Any]) -> str:
+def run_status(numbers: Mapping[str, Any], is_interrupted: bool) -> str:
     """Returns the status of a finished run.
 
     Args:
         numbers: of the run.
+        is_interrupted: True for a run that stopped before its end.
 
     Returns:
         done; uncertain: less than half of the scans were aligned in all directions, or no loop joins all parts of the
         map; failed: none aligned; interrupted: before its end.
     """
     statuses = numbers["scan_statuses"]
-    if numbers["is_interrupted"]:
+    if is_interrupted:
         return "interrupted"
     if why_failed(statuses) is not None:
         return "failed"

@@ -203,7 +203,7 @@ def write_interim(
 
 def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) -> str:
     num_loops = len(cli.accepted_ends(state.loops.loops))
-    parts = [f"kf {len(state.slam_map)}", f"loops {num_loops}", f"score {report.score:.2f}"]
+    parts = [cli.counted(len(state.slam_map), "keyframe"), cli.counted(num_loops, "loop"), f"score {report.score:.2f}"]
     if report.status not in ("first", "tracked"):
         parts.append(report.status)
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])

@@ -77,8 +77,7 @@ class Config(ProcessOptions):
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
     groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
-    """Largest group of scans of each stage of the curriculum, stages of equal length, such as 8 16 8 16 for weights
-    that register pairs already; without it, the preset decides."""
+    """Largest group of scans of each stage of the curriculum, such as 8 16 8 16; without it, the preset decides."""
     scans: Annotated[int | None, arg(metavar="N")] = None
     """How many scans a step takes; more keep a GPU busy, which computes all of them at once. Without it, the preset
     decides."""
@@ -152,7 +151,7 @@ def main(config: Config) -> None:
             "num_scans": len(store.table),
             "bad_scans": bad,
             "wall_s": time.perf_counter() - started,
-            "is_interrupted": stop.is_requested,
+            "status": stop.status,
             "seed": config.seed,
         }
         # Numbers first, so that they are written even if a picture fails.

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -258,16 +258,27 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
         InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
     """
     require(Path(path).exists(), path, "no such file", "check the path")
+    require(not Path(path).is_dir(), path, "a folder", "give one file")
+    require(Path(path).stat().st_size > 0, path, "an empty file of 0 bytes", "copy it again")
     found, advice = "not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
     # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
     with refusing(path, found, advice, (Exception,)), Path(path).open("rb") as file:
         if file.read(6) == npy_format.MAGIC_PREFIX:
             file.seek(0)
             return {"points": _parse_npy(file.read())}
-        with zipfile.ZipFile(file) as archive:
+        file.seek(0)
+        with _open_archive(file) as archive:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             chosen = [key for key in (members if keys is None else keys) if key in members]
             return {key: _parse_npy(archive.read(members[key])) for key in chosen}
+
+
+def _open_archive(file: BinaryIO) -> zipfile.ZipFile:
+    """Opens an `.npz`; raises a ValueError for a file of another kind."""
+    start = file.read(2)
+    if start != b"PK":
+        raise ValueError("it has no header of NumPy")
+    return zipfile.ZipFile(file)
 
 
 def _parse_npy(content: bytes) -> NDArray[np.generic]:

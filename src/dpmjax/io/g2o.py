@@ -67,7 +67,7 @@ _READ = "give VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2,
 # Advice for other tags, by parts of their names.
 _OTHER_TAGS = {
     ("SWITCH", "MAXMIX", "DCS"): (
-        "switchable and mixture edges are not read: give plain edges, a robust kernel lets wrong ones go"
+        "switchable and mixture edges are not read: give plain edges; --outlier-chi2 10 rejects wrong ones"
     ),
     ("PRIOR",): "priors of single poses are not read: leave them out, and fix nodes with FIX",
     ("XY", "LANDMARK", "POINT", "LINE", "PLANE", "BEARING", "CAM"): (
@@ -223,7 +223,7 @@ def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: b
         if is_finite[place]:
             least = float(np.linalg.eigvalsh(matrices[place])[0])
             why = f"not positive semidefinite, its least eigenvalue is {least:.4g}"
-            advice = "mend it, or take the nearest such matrix (nearest_psd=True, --nearest-psd)"
+            advice = "mend it, or take the nearest such matrix (--nearest-psd)"
         found = f"the information of edge {lines[place].nodes[0]} {lines[place].nodes[1]} is {why}"
         raise InputError(f"{path}: line {lines[place].number}", found, advice)
     return matrices

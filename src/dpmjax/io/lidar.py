@@ -86,10 +86,8 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     drive = _read(path, poses)
     files = drive.files
     require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    notes: list[Note | None] = [folder_note(files[0].parent), *drive.notes]
-    if bin_columns is None:
-        bin_columns, note = columns_of_drive(files)
-        notes.append(note)
+    bin_columns, note = columns_of_drive(files, bin_columns)
+    notes = (folder_note(files[0].parent), *drive.notes, note)
 
     def read_scan(index: int) -> NDArray[np.float32]:
         return read_timed_cloud(files[index], bin_columns).points

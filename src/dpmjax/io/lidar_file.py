@@ -87,8 +87,8 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
         InputError: the file cannot be read any more.
     """
     path = Path(path)
-    is_inferred = bin_columns is None and path.suffix.lower() == ".bin"
-    columns = find_columns(path, read_bytes(path)).note if is_inferred else None
+    is_raw = path.suffix.lower() == ".bin"
+    columns = find_columns(path, read_bytes(path), bin_columns).note if is_raw else None
     return [note for note in (columns, unit_note(points, path)) if note is not None]
 
 
@@ -274,8 +274,8 @@ class Columns(NamedTuple):
     note: Note | None = None
 
 
-def find_columns(path: Path, content: bytes) -> Columns:
-    """Infers the columns of a raw file.
+def find_columns(path: Path, content: bytes, given: int | None = None) -> Columns:
+    """Infers the columns of a raw file, or compares given ones with the values.
 
     The correct layout has values of one kind in each column, and a wrong one mixes them. So the layout with the largest
     mutual information of column and value is taken. `.pcd.bin` files, as those of nuScenes, have five columns unless
@@ -284,19 +284,24 @@ def find_columns(path: Path, content: bytes) -> Columns:
     Args:
         path: the file.
         content: its bytes.
+        given: number of columns; None infers it.
 
     Returns:
-        The layout, with a note where it is not KITTI's, or where the values fit another as well.
+        The layout, with a note where it is not KITTI's, where the values fit another as well, or where they contradict
+        the given one.
 
     Raises:
-        Float64Error: the file holds float64.
+        Float64Error: the file holds float64, and no layout is given.
         InputError: the file has no whole number of points of the layout, or of any.
     """
     fitting = [n for n in _COLUMN_COUNTS if len(content) % (4 * n) == 0]
     values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")
+    inferred = _columns_by_values(values)
+    if given is not None:
+        text = f"{path}: --columns {given}, but the values look like {inferred} columns a point"
+        return Columns(given, None if inferred in (None, given) else Note(text, is_doubt=True))
     if _are_doubles(values):
         raise Float64Error(path, "the values are float64", "save them as float32, or the points as .npy")
-    inferred = _columns_by_values(values)
     is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
     if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
         return Columns(_NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides"))
@@ -326,20 +331,20 @@ def _read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
     return np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3]
 
 
-def columns_of_drive(files: Iterable[Path]) -> Columns:
-    """Infers the columns of the raw files of a drive by the first one that can be read; KITTI's where none can."""
+def columns_of_drive(files: Iterable[Path], given: int | None = None) -> Columns:
+    """Infers or compares the columns of raw files by the first one that can be read; KITTI's where none can."""
     for file in files:
         if file.suffix.lower() != ".bin":
             break
         try:
             content = read_bytes(file)
             if content:
-                return find_columns(file, content)
+                return find_columns(file, content, given)
         except Float64Error:
             raise
         except InputError:  # named where it is read
             continue
-    return Columns(_USUAL_COLUMNS)
+    return Columns(given or _USUAL_COLUMNS)
 
 
 def _are_doubles(values: NDArray[np.float32]) -> bool:

@@ -91,7 +91,7 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         if named and named.group(1) != unit:
             raise InputError(path, f"poses in {named.group(1)}, the scans are in {unit}", f"give poses in {unit}")
     poses, _ = _read(path)
-    found = f"{len(poses)} poses for {num_scans} scans"
+    found = f"{len(poses)} pose{'s' * (len(poses) != 1)} for {num_scans} scans"
     require(len(poses) == num_scans, path, found, "give one pose a scan, in the scans' order")
     if poses.ndim == 2:
         return poses

@@ -56,7 +56,11 @@ def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatAr
     """
     matched = match_rows(poses, files)
     if matched is None:
-        raise InputError(path, f"{len(poses)} poses for {len(files)} scans", "give one pose a scan, in their order")
+        raise InputError(
+            path,
+            f"{len(poses)} pose{'s' * (len(poses) != 1)} for {len(files)} scans",
+            "give one pose a scan, in their order",
+        )
     return matched
 
 
@@ -165,7 +169,7 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
             return Reference(T, _note_of(path, f"time, tolerance {tolerance_s:.3g} s", T))
         reason, is_doubt = "no scan has the time of a pose", True
     advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
-    require(count == num_scans, path, f"{count} poses for {num_scans} scans, and {reason}", advice)
+    require(count == num_scans, path, f"{count} pose{'s' * (count != 1)} for {num_scans} scans, and {reason}", advice)
     note = Note(f"{path}: {reason}; poses are matched by their order", is_doubt=True)
     return Reference(found.poses, (note,) if is_doubt else ())
 

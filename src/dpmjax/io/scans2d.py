@@ -69,8 +69,11 @@ def read_sequence(
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
     whole = _without_maxima(_read(path, unit, topic), path)
     sequence = _without_constant_odometry(whole, path).take(slice(start, stop, stride))
-    found = f"{len(sequence)} of {len(whole)} scans chosen ({chosen})"
-    require(len(sequence) >= 2, path, found, "a registration needs two scans at least")
+    is_part = len(sequence) < len(whole)
+    found = (
+        f"{len(sequence)} of {len(whole)} scans chosen" if is_part else f"{len(whole)} scan{'s' * (len(whole) != 1)}"
+    )
+    require(len(sequence) >= 2, path, found, "give two or more")
     _check_beams(sequence, path, start, stride)
     sequence = replace(sequence, notes=(*sequence.notes, *_check_unit(sequence, path)))
     if whole.odometry_poses is None and whole.unit == "m":

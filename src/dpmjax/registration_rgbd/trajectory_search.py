@@ -7,6 +7,8 @@ of each trajectory are adjusted. At the end they are adjusted at a finer toleran
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +51,11 @@ _NUM_LAST, _NUM_TOLERANCES = 4, 3
 
 
 def initialize_depth(
-    scans: DepthScans, config: DepthSearchConfig | None = None, *, key: jax.Array
+    scans: DepthScans,
+    config: DepthSearchConfig | None = None,
+    *,
+    key: jax.Array,
+    on_image: Callable[[int, int], None] = lambda num_placed, num_all: None,
 ) -> NDArray[np.float64]:
     """Searches initial poses of all images, the first at the origin.
 
@@ -57,6 +63,7 @@ def initialize_depth(
         scans: images in order of time, metres; neighbours overlap.
         config: settings of the search; None: `depth_search("planar")`.
         key: key of the search.
+        on_image: called with the number of images that have poses and of all images, before the search of each.
 
     Returns:
         (n, 4, 4) T_world_camera, metres.
@@ -72,7 +79,9 @@ def initialize_depth(
         for k in range(config.num_trajectories + _NUM_TRIES)
     ]
     T = np.eye(4)[None, None]
-    for scan in range(1, scans.mask.shape[0]):
+    num_images = scans.mask.shape[0]
+    for scan in range(1, num_images):
+        on_image(scan, num_images)
         # One search for each trajectory, and more for the best ones, each with other points.
         num_searches = _NUM_TRIES if len(T) < _NUM_TRIES else len(T) + _NUM_TRIES
         continued = []
@@ -83,10 +92,17 @@ def initialize_depth(
             continued.append(np.concatenate([poses, (before[-1] @ T_last_next)[:, None]], axis=1))
         T = _best_that_differ(np.stack(continued), images, config)
         T = _adjusted(T, images, config.scales.tolerance[1], config.motion)
-    T, images = T[:_NUM_LAST], SampledImages(scans, scans.pixels, unit)
+    on_image(num_images, num_images)
+    return _best_at_finer_tolerance(T[:_NUM_LAST], SampledImages(scans, scans.pixels, unit), config)
+
+
+def _best_at_finer_tolerance(
+    T: NDArray[np.float64], images: SampledImages, config: DepthSearchConfig
+) -> NDArray[np.float64]:
+    """Adjusts all poses of trajectories at falling tolerances, and selects the best trajectory."""
     final = config.scales.final_tolerance
     for tolerance in np.geomspace(config.scales.tolerance[1], final, _NUM_TOLERANCES):
-        T = _adjusted(T, images, float(tolerance), config.motion, num_window=scans.mask.shape[0])
+        T = _adjusted(T, images, float(tolerance), config.motion, num_window=T.shape[1])
     scores = _explained(jnp.asarray(T, jnp.float32), images, jnp.asarray(final))
     return T[np.argmax(np.asarray(scores) - _mean_cost(T, config))]
 
