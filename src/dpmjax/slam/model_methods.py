@@ -28,7 +28,7 @@ from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces, nearest_planes
+from dpmjax.scans.surface_alignment import NearestPlanes, align_surfaces, nearest_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
 from dpmjax.scans.weak_directions import (
     plane_information,
@@ -189,8 +189,7 @@ class SurfaceGeometry:
         return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
 
     def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
-        level = AlignmentLevel(self.config.plane_radius_m, num_samples, 1)
-        return nearest_planes(surface, local_map.surface, T_map_scan[None], level)
+        return nearest_planes(surface, local_map.surface, T_map_scan[None], self.config.plane_radius_m, num_samples)
 
 
 def _turned(turn_deg: float) -> Float[np.ndarray, "3 3"]:
@@ -317,8 +316,8 @@ class NetworkMatcher:
         config = self._model.config.verification
         scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
         T = align_surfaces(scan, union, np.asarray(found.T_target_source)[None], REFINEMENT)
-        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        information = plane_information(nearest_planes(scan, union, T, level).pairs, T[0])
+        pairs = nearest_planes(scan, union, T, config.plane_radius_m, config.num_samples).pairs
+        information = plane_information(pairs, T[0])
         return Match(T[0], float(found.confidence), float(found.rmse), found.verification, information)
 
 
