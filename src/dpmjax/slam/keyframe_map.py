@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from dpmjax.checks import require_positive
 from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
-from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.slam.config import SlamConfig
 from dpmjax.types import Information, Pose, Poses
 
@@ -219,45 +219,27 @@ def connected_parts(num_nodes: int, edges: Iterable[Sequence[Any]]) -> Int[np.nd
     Returns:
         The number of the part of each node.
     """
-    return np.asarray(sp.csgraph.connected_components(_joined(num_nodes, edges), directed=False)[1], np.int64)
+    return label_parts(num_nodes, *_ends(edges))
 
 
-def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Int[np.ndarray, " n"]:
-    """Finds the nearest keyframes among those that measured edges join to a keyframe.
-
-    Args:
-        slam_map: the map.
-        row: row of the keyframe.
-        num_keyframes: largest number of keyframes, and of edges between them and the first.
-        radius_m: keyframes farther away are left out.
-
-    Returns:
-        Rows, the keyframe itself first, then nearest first.
-    """
-    joined = _joined(len(slam_map), slam_map.edges_of("odometry", "loop"))
-    steps = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=num_keyframes)[0]
-    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
-    rows = np.flatnonzero(np.isfinite(steps) & (apart_m <= radius_m))
-    return rows[np.lexsort((apart_m[rows], rows != row))][:num_keyframes]
-
-
-def _joined(num_nodes: int, edges: Iterable[Sequence[Any]]) -> sp.csr_array:
-    ends = _ends(edges)
-    return sp.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (num_nodes, num_nodes)).tocsr()
-
-
-def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap:
-    """Gathers a keyframe and its neighbours in the graph, nearest first.
+def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, *, radius_m: float = SUBMAP_RADIUS_M) -> Submap:
+    """Gathers a keyframe and the nearest of those that measured edges join to it.
 
     Args:
         slam_map: the map.
         row: row of the central keyframe.
-        num_keyframes: largest number of keyframes, the central one among them.
+        num_keyframes: largest number of keyframes, the central one among them, and of edges between them and it.
+        radius_m: keyframes farther away are left out.
 
     Returns:
-        The submap, in the frame of the central keyframe.
+        The submap, in the frame of the central keyframe; the others follow it, nearest first.
     """
-    rows = nearest_in_graph(slam_map, row, num_keyframes, SUBMAP_RADIUS_M)
+    source, target = _ends(slam_map.edges_of("odometry", "loop"))
+    joined = sp.coo_array((np.ones(len(source)), (source, target)), (len(slam_map), len(slam_map))).tocsr()
+    steps = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=num_keyframes)[0]
+    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
+    rows = np.flatnonzero(np.isfinite(steps) & (apart_m <= radius_m))
+    rows = rows[np.lexsort((apart_m[rows], rows != row))][:num_keyframes]
     T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
     return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
 

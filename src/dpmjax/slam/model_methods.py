@@ -39,7 +39,7 @@ from dpmjax.scans.weak_directions import (
 from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap
-from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframe
+from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframes
 from dpmjax.types import DescriptorCloud, Pose, Poses, Registration
 
 # Turns about the x and y axes among the further starts.
@@ -314,16 +314,11 @@ class NetworkMatcher:
 
     def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
-        scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
+        scan, union = joined_surface(placed_keyframes(source)[:1]), joined_surface(placed_keyframes(target))
         T = align_surfaces(scan, union, np.asarray(found.T_target_source)[None], REFINEMENT)
         pairs = nearest_planes(scan, union, T, config.plane_radius_m, config.num_samples).pairs
         information = plane_information(pairs, T[0])
         return Match(T[0], float(found.confidence), float(found.rmse), found.verification, information)
-
-
-def _surface(submap: Submap) -> Surface:
-    placed = zip(submap.scans, submap.T_submap_keyframe, strict=False)
-    return joined_surface([placed_keyframe(scan, T) for scan, T in placed])
 
 
 def _merged(submap: Submap) -> PreparedScan:
