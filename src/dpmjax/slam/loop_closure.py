@@ -164,14 +164,12 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
     config, loops = methods.config.loops, list(candidates)
     for start in range(0, len(candidates), config.num_asked):
         some = candidates[start : start + config.num_asked]
-        overlaps = [1.0] * len(some)
-        if config.min_overlap > 0:
-            scans = [slam_map.keyframes[loop.target].compact for loop in some]
-            overlaps = methods.matcher.overlaps(slam_map.keyframes[some[0].source].compact, scans).tolist()
+        scans = [slam_map.keyframes[loop.target].compact for loop in some]
+        overlaps = methods.matcher.overlaps(slam_map.keyframes[some[0].source].compact, scans).tolist()
         for number, overlap in enumerate(overlaps, start):
             status: LoopStatus = "no overlap" if overlap < config.min_overlap else "not registered"
             loops[number] = loops[number]._replace(status=status, overlap=overlap)
-        if config.min_overlap > 0 and max(overlaps) >= SURE_OVERLAP:
+        if max(overlaps) >= SURE_OVERLAP:
             break
     return loops
 

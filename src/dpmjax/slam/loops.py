@@ -68,7 +68,8 @@ class Loop(NamedTuple):
         target: row of an older one.
         found_by: search that found it; "map" is a loop of the map that was extended.
         status: outcome.
-        overlap: probability of overlap; 1 where no network predicts it, None where another candidate surely overlaps.
+        overlap: probability of overlap; 1 for a loop of the map that was extended, None where another candidate surely
+            overlaps.
         probability: P(correct) of the registration; None without one.
         rmse: root mean square error of the registration, metres; None without one.
         T_target_source: motion of the registration; None without one.
