@@ -36,6 +36,7 @@ from dpmjax.scans.weak_directions import (
     with_least_covariance,
     without_noise_along,
 )
+from dpmjax.sequences import homogeneous
 from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap
@@ -160,7 +161,8 @@ class SurfaceGeometry:
             The motions.
         """
         R, step = T_last_scan[:3, :3], T_last_scan[:3, 3]
-        turns, spins = ([R @ _turned(turn_deg) for turn_deg in several] for several in (TURNS_DEG, SPINS_DEG))
+        turns = [R @ Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in TURNS_DEG]
+        spins = [R @ Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in SPINS_DEG]
         tilts = [Rotation.from_euler(*tilt, degrees=True).as_matrix() for tilt in itertools.product("xy", TILTS_DEG)]
         motions = [(R, factor * step) for factor in STEP_FACTORS]
         motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
@@ -169,9 +171,8 @@ class SurfaceGeometry:
         # A rocking vehicle tilts back, so its last rotation does not continue.
         motions.append((np.eye(3), step))
         motions += [(rotation, step) for tilt in tilts for rotation in (R @ tilt, tilt)]
-        found = np.tile(np.eye(4), (len(motions), 1, 1))
-        found[:, :3, :3], found[:, :3, 3] = (np.array(parts) for parts in zip(*motions, strict=True))
-        return found
+        rotations, translations = (np.array(parts) for parts in zip(*motions, strict=True))
+        return homogeneous(rotations, translations)
 
     def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Poses) -> list[Alignment]:
         found = align_surfaces(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
@@ -190,11 +191,6 @@ class SurfaceGeometry:
 
     def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
         return nearest_planes(surface, local_map.surface, T_map_scan[None], self.config.plane_radius_m, num_samples)
-
-
-def _turned(turn_deg: float) -> Float[np.ndarray, "3 3"]:
-    """Returns a rotation about the vertical."""
-    return np.asarray(Rotation.from_euler("z", turn_deg, degrees=True).as_matrix())
 
 
 def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
