@@ -14,13 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.deeppointmap.verification import (
-    MeasuredScan,
-    VerificationConfig,
-    compare_scans,
-    verify_motions,
-)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
 from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import are_near
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
 from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
@@ -220,6 +216,4 @@ def refine_motion(
 
 def _is_apart(T: Poses, T_other: Pose) -> Bool[np.ndarray, " s"]:
     """Returns True for motions to another place than that of `T_other`; only these compete with it."""
-    difference = rigid.inverse(T_other) @ T
-    cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    return (np.linalg.norm(difference[:, :3, 3], axis=1) > DISTINCT_M) | (cosine < np.cos(DISTINCT_RAD))
+    return np.array([not are_near(T_other, one, DISTINCT_M, DISTINCT_RAD) for one in T])
