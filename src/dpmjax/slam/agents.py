@@ -242,13 +242,7 @@ def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
         The map of the keyframes and edges of that component, with rows of its own.
     """
     is_taken = np.array(joined.component_of_map)[joined.map_of_keyframe] == component
-    new_row = np.cumsum(is_taken) - 1
-    edges = [
-        edge._replace(source=int(new_row[edge.source]), target=int(new_row[edge.target]))
-        for edge in joined.slam_map.edges
-        if is_taken[edge.source]
-    ]
-    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist(), edges)
+    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist())
 
 
 def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:

@@ -172,21 +172,23 @@ def joined_maps(slam_map: KeyframeMap, other: KeyframeMap) -> KeyframeMap:
     )
 
 
-def take_keyframes(slam_map: KeyframeMap, rows: Sequence[int], edges: Iterable[MapEdge]) -> KeyframeMap:
-    """Selects keyframes of a map.
+def take_keyframes(slam_map: KeyframeMap, rows: Sequence[int]) -> KeyframeMap:
+    """Selects keyframes of a map, and the edges between them.
 
     Args:
         slam_map: the map.
         rows: rows of the selected keyframes.
-        edges: edges of the result, with rows of the result.
 
     Returns:
         The smaller map.
     """
-    keyframes = tuple(slam_map.keyframes[row] for row in rows)
-    return KeyframeMap(
-        keyframes, slam_map.T_world_keyframe[rows], slam_map.vectors[rows], tuple(edges), slam_map.origin
+    keyframes, new_row = tuple(slam_map.keyframes[row] for row in rows), {row: new for new, row in enumerate(rows)}
+    edges = tuple(
+        edge._replace(source=new_row[edge.source], target=new_row[edge.target])
+        for edge in slam_map.edges
+        if edge.source in new_row and edge.target in new_row
     )
+    return KeyframeMap(keyframes, slam_map.T_world_keyframe[rows], slam_map.vectors[rows], edges, slam_map.origin)
 
 
 def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
@@ -301,15 +303,14 @@ def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMa
     if len(slam_map) == 0:
         return slam_map
     kept, cover = _covering(slam_map, spacing_share)
-    row_of = {row: number for number, row in enumerate(kept)}
     edges: dict[tuple[int, int, str], MapEdge] = {}
     for edge in slam_map.edges:
-        found = _contracted(slam_map, edge, cover, row_of)
+        found = _contracted(slam_map, edge, cover)
         key = (found.source, found.target, found.kind)
         is_better = key not in edges or np.trace(found.information) > np.trace(edges[key].information)
         if found.source != found.target and is_better:
             edges[key] = found
-    return take_keyframes(slam_map, kept, edges.values())
+    return take_keyframes(replace(slam_map, edges=tuple(edges.values())), kept)
 
 
 def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
@@ -329,7 +330,7 @@ def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], I
     return kept, np.array([kept[int(np.argmin(apart_m(row)))] for row in range(len(slam_map))], np.int64)
 
 
-def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"], row_of: dict[int, int]) -> MapEdge:
+def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"]) -> MapEdge:
     """Moves both ends of an edge to the keyframes that cover them."""
     source, target = int(cover[edge.source]), int(cover[edge.target])
     T_world = slam_map.T_world_keyframe
@@ -338,7 +339,7 @@ def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k
     T = T_target_end @ edge.T_target_source @ T_start_source
     num_steps = 1 + (source != edge.source) + (target != edge.target)
     information = _moved_information(edge.information, T_start_source) / num_steps
-    return MapEdge(row_of[source], row_of[target], T, information, edge.kind)
+    return MapEdge(source, target, T, information, edge.kind)
 
 
 def _moved_information(information: Information, T_old_new: Pose) -> np.ndarray:
