@@ -7,6 +7,7 @@ surface elements that face the axis decide.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -58,7 +59,7 @@ FACING_VISIBLE = 0.2
 HYPOTHESES_AT_ONCE = 4
 
 # Motions that differ by less end in the same place.
-DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
+DISTINCT_M, DISTINCT_RAD = 2.0, math.radians(5.0)
 
 # Fields of `Verification` that rest on all motions that were tried.
 OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap", "lookalike_gap")
