@@ -251,5 +251,4 @@ def map_path(folder: Path, precision: Precision) -> Path:
 
 def first_keyframes(slam_map: KeyframeMap, num: int) -> KeyframeMap:
     """Returns the map as it was: the first keyframes, and the edges between them."""
-    edges = [edge for edge in slam_map.edges if max(edge.source, edge.target) < num]
-    return take_keyframes(slam_map, range(min(num, len(slam_map))), edges)
+    return take_keyframes(slam_map, range(min(num, len(slam_map))))

@@ -27,7 +27,7 @@ from dpmjax.slam.keyframe_map import (
     with_origin,
 )
 from dpmjax.types import DescriptorCloud
-from tests.deeppointmap.test_compact import room
+from tests.scans.test_compact_surfaces import room
 from tests.slam.truth import noise
 
 RNG = np.random.default_rng(3)
@@ -136,15 +136,13 @@ def test_int8_leaves_out_keyframes_that_others_cover(tmp_path) -> None:
     path = tmp_path / "map.npz"
     scans = [keyframe.scan for keyframe in load_map(save_map(path, joined, "int8")).keyframes]
     assert scans == [keyframe.scan for keyframe in MAP.keyframes[:3]]
-    assert len(load_map(save_map(path, joined, "int8", spacing_share=0.0))) == 4
     assert len(load_map(save_map(path, joined))) == 4
-    assert len(load_map(save_map(path, joined, spacing_share=0.8))) == 2
     # What is counted is what is written.
     assert len(map_bytes(joined, "int8")) == save_map(path, joined, "int8").stat().st_size
 
 
 def test_fewer_bytes_at_lower_precision() -> None:
-    sizes = [len(map_bytes(MAP, precision, spacing_share=0.0)) for precision in ("float32", "int8")]
+    sizes = [len(map_bytes(MAP, precision)) for precision in ("float32", "int8")]
     assert sizes[0] > sizes[1]
 
 

@@ -151,7 +151,7 @@ def test_points_of_no_surface_are_the_last_samples_and_are_paired_with_any_plane
     assert sorted(some.samples) == list(range(len(some.points)))
     assert (some.flatness[some.samples[:num_flat]] > MIN_FLATNESS).all()
     assert not some.normals[some.samples[num_flat:]].any()
-    planes = nearest_planes(some, whole, np.eye(4)[None], AlignmentLevel(3.0, len(some.points), 1))
+    planes = nearest_planes(some, whole, np.eye(4)[None], 3.0, len(some.points))
     assert (planes.cosines[0, num_flat:] == 1).all()
 
 

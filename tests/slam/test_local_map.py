@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.prepared_scans import compact_elements
 from dpmjax.geometry import rigid
+from dpmjax.scans.compact_surfaces import compact_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
-from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, Submap, add_keyframe
 from dpmjax.slam.local_map import (
     RECENT_SHARE,
     PlacedElements,
     joined_surface,
     local_map_of,
-    placed_keyframe,
+    placed_keyframes,
     placed_scan,
     with_scan,
 )
@@ -112,7 +112,8 @@ def test_the_oldest_of_too_many_scans_leaves() -> None:
 def test_a_placed_scan_has_the_flat_elements() -> None:
     rough = SurfaceElements(np.eye(4)[:, :3], np.eye(4)[:, :3], np.array([1.0, 0.05, 0.5, 1.0]), np.arange(4) < 3)
     expanded = compact_of(0)._replace(elements=compact_elements(rough))
-    for placed in (placed_scan(surface_of_elements(rough), pose(1, 0, 0)), placed_keyframe(expanded, pose(1, 0, 0))):
+    placed_keyframe, *_ = placed_keyframes(Submap((expanded,), pose(1, 0, 0)[None]))
+    for placed in (placed_scan(surface_of_elements(rough), pose(1, 0, 0)), placed_keyframe):
         np.testing.assert_allclose(placed.positions, np.eye(3)[[0, 2]], atol=1e-4)
         np.testing.assert_allclose(placed.planarity, [1.0, 0.5], atol=1 / 255)
         assert placed.positions.dtype == placed.normals.dtype == placed.planarity.dtype == np.float32

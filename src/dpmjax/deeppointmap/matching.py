@@ -191,16 +191,13 @@ def _align(
     config: MatchConfig,
 ) -> Registration:
     # Weighted SVD with rounds of inliers over both directions of the pairs (DeepPointMap eq. 3).
-    offsets = jnp.concatenate(both_offsets)
-    scores = jnp.tile(pairs.scores, 2)
-    is_used = jnp.tile(pairs.mask, 2) & (jnp.sum(offsets**2, axis=1) <= MAX_OFFSET_M**2)
-    offsets = jnp.where(is_used[:, None], offsets, 0)
+    is_used = jnp.tile(pairs.mask, 2) & (jnp.sum(jnp.concatenate(both_offsets) ** 2, axis=1) <= MAX_OFFSET_M**2)
     # Metres keep the type of the points, whatever type the heads compute in.
-    offsets = offsets.astype(source_points.dtype)
-    num_pairs = len(source_points)
-    source = jnp.tile(source_points, (2, 1)).at[:num_pairs].add(offsets[:num_pairs])
-    target = jnp.tile(target_points, (2, 1)).at[num_pairs:].add(offsets[num_pairs:])
+    of_source, of_target = (offsets.astype(source_points.dtype) for offsets in both_offsets)
+    source = jnp.concatenate([source_points + of_source, source_points])
+    target = jnp.concatenate([target_points, target_points + of_target])
     source, target = (jnp.where(is_used[:, None], points, 0) for points in (source, target))
+    scores = jnp.tile(pairs.scores, 2)
     both = _PointPairs(source, target, scores, is_used)
     rows = jnp.tile(pairs.source_indices, 2), jnp.tile(pairs.target_indices, 2)
 
@@ -212,7 +209,7 @@ def _align(
         is_determined = jnp.minimum(*(_num_distinct(some, is_inlier) for some in rows)) >= MIN_NUM_POINTS
         is_scored = is_inlier & (jnp.cumsum(is_inlier) <= NUM_CONFIDENT)
         mean_score = jnp.sum(jnp.where(is_scored, scores, 0)) / jnp.maximum(jnp.sum(is_scored), 1)
-        half = slice(num_pairs)
+        half = slice(len(source_points))
         support = motion_support(T_target_source, source[half], target[half], is_inlier[half])
         return Registration(
             T_target_source=T_target_source,

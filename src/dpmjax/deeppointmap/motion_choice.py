@@ -7,6 +7,7 @@ surface elements that face the axis decide.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -14,13 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.deeppointmap.verification import (
-    MeasuredScan,
-    VerificationConfig,
-    compare_scans,
-    verify_motions,
-)
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
 from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import are_near
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
 from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
@@ -62,7 +59,7 @@ FACING_VISIBLE = 0.2
 HYPOTHESES_AT_ONCE = 4
 
 # Motions that differ by less end in the same place.
-DISTINCT_M, DISTINCT_RAD = 2.0, np.radians(5.0)
+DISTINCT_M, DISTINCT_RAD = 2.0, math.radians(5.0)
 
 # Fields of `Verification` that rest on all motions that were tried.
 OF_THE_SEARCH = ("gap", "num_tried", "num_slid", "facing_gap", "lookalike_gap")
@@ -220,6 +217,4 @@ def refine_motion(
 
 def _is_apart(T: Poses, T_other: Pose) -> Bool[np.ndarray, " s"]:
     """Returns True for motions to another place than that of `T_other`; only these compete with it."""
-    difference = rigid.inverse(T_other) @ T
-    cosine = (np.trace(difference[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    return (np.linalg.norm(difference[:, :3, 3], axis=1) > DISTINCT_M) | (cosine < np.cos(DISTINCT_RAD))
+    return np.array([not are_near(T_other, one, DISTINCT_M, DISTINCT_RAD) for one in T])

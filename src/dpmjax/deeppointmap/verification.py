@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scans.surface_alignment import AlignmentLevel, nearest_planes
+from dpmjax.scans.surface_alignment import nearest_planes
 from dpmjax.scans.surfaces import RangeImage, Surface, SurfaceConfig, range_image, scan_surface, view_points
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
 from dpmjax.types import Poses, Verification
@@ -173,8 +173,7 @@ def compare_scans(
     Returns:
         The samples under each motion.
     """
-    level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-    planes = nearest_planes(scan.surface, other.surface, T_other_scan, level)
+    planes = nearest_planes(scan.surface, other.surface, T_other_scan, config.plane_radius_m, config.num_samples)
     is_level = np.abs(scan.surface.normals[scan.surface.samples[: config.num_samples], 2]) > LEVEL_COSINE
     return ComparedScan(planes.meets, *view_points(other.image, planes.points), is_level)
 

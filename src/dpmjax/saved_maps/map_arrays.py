@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int8
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.prepared_scans import MAX_COMPONENT, CompactElements, CompactImage, CompactScan, round_features
+from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
 from dpmjax.geometry.se3 import orthonormal
+from dpmjax.scans.compact_surfaces import MAX_COMPONENT, CompactElements, CompactImage
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin, edge_arrays
 
 Precision = Literal["float32", "int8"]
@@ -50,13 +51,24 @@ def pack_map(slam_map: KeyframeMap, precision: Precision) -> Arrays:
 
     Args:
         slam_map: map with at least one keyframe; all scans have one number of descriptors and channels.
-        precision: see `save_map`.
+        precision: see `save_map`; "float32" keeps the float64 poses exactly, "int8" rounds them to float32.
 
     Returns:
         The arrays by name.
     """
-    scans = [keyframe.compact for keyframe in slam_map.keyframes]
-    return _pack_graph(slam_map, precision) | _pack_scans(scans, precision)
+    dtype = np.float64 if precision == "float32" else np.float32
+    edges = edge_arrays(slam_map.edges)
+    graph = {
+        **{name: slam_map.column(name).astype(kind) for name, kind in NUMBERS.items()},
+        "T_odometry_keyframe": slam_map.column("T_odometry_keyframe")[:, :3].astype(dtype),
+        "T_world_keyframe": slam_map.T_world_keyframe[:, :3].astype(dtype),
+        "vectors": slam_map.vectors if precision == "float32" else _encode_vectors(slam_map.vectors),
+        "edge_rows": np.stack([edges.source, edges.target], axis=1).astype(np.int32),
+        "edge_kind": np.array([KINDS.index(edge.kind) for edge in slam_map.edges], np.uint8),
+        "edge_T": edges.measurements[:, :3].astype(dtype),
+        "edge_information": edges.information[:, *TRIANGLE].astype(dtype, order="C"),
+    }
+    return graph | _pack_scans([keyframe.compact for keyframe in slam_map.keyframes], precision)
 
 
 def unpack_map(arrays: Arrays, precision: Precision, origin: MapOrigin) -> KeyframeMap:
@@ -73,26 +85,7 @@ def unpack_map(arrays: Arrays, precision: Precision, origin: MapOrigin) -> Keyfr
     Raises:
         ValueError: if arrays are missing or do not fit together.
     """
-    return _unpack_graph(arrays, _unpack_scans(arrays, precision), origin)
-
-
-def _pack_graph(slam_map: KeyframeMap, precision: Precision) -> Arrays:
-    """Makes the arrays of poses and edges; "float32" keeps float64 poses exactly, others round them to float32."""
-    dtype = np.float64 if precision == "float32" else np.float32
-    edges = edge_arrays(slam_map.edges)
-    return {
-        **{name: slam_map.column(name).astype(kind) for name, kind in NUMBERS.items()},
-        "T_odometry_keyframe": slam_map.column("T_odometry_keyframe")[:, :3].astype(dtype),
-        "T_world_keyframe": slam_map.T_world_keyframe[:, :3].astype(dtype),
-        "vectors": slam_map.vectors if precision == "float32" else _encode_vectors(slam_map.vectors),
-        "edge_rows": np.stack([edges.source, edges.target], axis=1).astype(np.int32),
-        "edge_kind": np.array([KINDS.index(edge.kind) for edge in slam_map.edges], np.uint8),
-        "edge_T": edges.measurements[:, :3].astype(dtype),
-        "edge_information": edges.information[:, *TRIANGLE].astype(dtype, order="C"),
-    }
-
-
-def _unpack_graph(arrays: Arrays, scans: Sequence[CompactScan], origin: MapOrigin) -> KeyframeMap:
+    scans = _unpack_scans(arrays, precision)
     k = len(scans)
     numbers = {name: _take(arrays, name, k, kind=np.dtype(kind).kind) for name, kind in NUMBERS.items()}
     if numbers["extent_m"].min() <= 0 or numbers["scan"].min() < 0:

@@ -42,9 +42,7 @@ NOT_IN_LOOPS = ("loops",)
 NOT_IN_FRONT_END = ("local_map", "recent", "lost", "scores")
 
 
-def save_map(
-    path: str | Path, slam_map: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None
-) -> Path:
+def save_map(path: str | Path, slam_map: KeyframeMap, precision: Precision = "float32") -> Path:
     """Writes a map to a file that `load_map` reads; an interruption never leaves half a file.
 
     Args:
@@ -53,8 +51,6 @@ def save_map(
         precision: with "float32" the loaded map equals the saved one. With "int8" the file is smallest, for
             localisation: it rounds features and elements to codes, keeps 256 elements a keyframe, and omits keyframes
             that those of other laps cover (`slam.thin_map`).
-        spacing_share: keyframes nearer to others than this share of their extent are left out; 0 keeps all. None takes
-            0.2 for "int8" and 0 for "float32".
 
     Returns:
         The path.
@@ -65,16 +61,15 @@ def save_map(
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"path: expected a file that ends in .npz, got {str(path)!r}")
-    return write_atomically(path, map_bytes(slam_map, precision, spacing_share=spacing_share))
+    return write_atomically(path, map_bytes(slam_map, precision))
 
 
-def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacing_share: float | None = None) -> bytes:
+def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32") -> bytes:
     """Makes the content of the file of a map; its length is the cost of the map.
 
     Args:
         slam_map: see `save_map`.
         precision: see `save_map`.
-        spacing_share: see `save_map`.
 
     Returns:
         The bytes.
@@ -83,10 +78,8 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32", *, spacin
         ValueError: if the precision is unknown or the map is empty.
     """
     require_one_of("precision", precision, get_args(Precision))
-    if spacing_share is None:
-        spacing_share = SPACING_SHARE if precision == "int8" else 0.0
-    if spacing_share != 0:
-        slam_map = thin_map(slam_map, spacing_share=spacing_share)
+    if precision == "int8":
+        slam_map = thin_map(slam_map, spacing_share=SPACING_SHARE)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, array in map_arrays(slam_map, precision).items():

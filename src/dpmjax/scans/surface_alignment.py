@@ -158,7 +158,7 @@ def align_surfaces(source: Surface, target: Surface, T_target_source: Poses, con
         is_active = has_pairs.copy()
         for _ in range(level.num_iterations):
             rows = np.flatnonzero(is_active)
-            planes = nearest_planes(source, target, T[rows], level)
+            planes = nearest_planes(source, target, T[rows], level.radius_m, level.num_points)
             is_enough = planes.is_paired.sum(axis=1) >= MIN_PAIRS
             lost = rows[~is_enough]
             has_pairs[lost], is_active[lost] = False, False
@@ -174,25 +174,28 @@ def align_surfaces(source: Surface, target: Surface, T_target_source: Poses, con
     return T
 
 
-def nearest_planes(source: Surface, target: Surface, T_target_source: Poses, level: AlignmentLevel) -> NearestPlanes:
+def nearest_planes(
+    source: Surface, target: Surface, T_target_source: Poses, radius_m: float, num_points: int
+) -> NearestPlanes:
     """Finds the planes of the target nearest to the first samples of the source, under several motions.
 
     Args:
         source: surface of a scan.
         target: the second surface.
         T_target_source: motions of the source.
-        level: radius and number of points.
+        radius_m: largest distance of a point from the point of the target that it is paired with.
+        num_points: number of points that are paired.
 
     Returns:
         A plane for each sample under each motion.
     """
-    rows, R_transposed = source.samples[: level.num_points], T_target_source[:, :3, :3].transpose(0, 2, 1)
+    rows, R_transposed = source.samples[:num_points], T_target_source[:, :3, :3].transpose(0, 2, 1)
     moved = source.points[rows] @ R_transposed + T_target_source[:, None, :3, 3]
     if len(target.points) == 0:
         nothing = np.zeros(moved.shape[:2])
         return NearestPlanes(nothing > 0, moved, nothing, np.zeros_like(moved), nothing, nothing)
     found, distances = target.tree.nearest(moved.reshape(-1, 3), 1)
-    nearest, is_paired = found.reshape(moved.shape[:2]), distances.reshape(moved.shape[:2]) < level.radius_m
+    nearest, is_paired = found.reshape(moved.shape[:2]), distances.reshape(moved.shape[:2]) < radius_m
     normals, own = target.normals[nearest], source.normals[rows]
     cosines = np.abs(np.einsum("snd,snd->sn", own @ R_transposed, normals))
     return NearestPlanes(

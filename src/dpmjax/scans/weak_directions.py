@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, AlignmentLevel, PlanePairs, nearest_planes
+from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, PlanePairs, nearest_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, firm_surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.types import Information, Pose, Poses
@@ -113,8 +113,7 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
         The direction and the standard deviation along it.
     """
     # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
-    level = AlignmentLevel(radius_m, max(1, len(source.samples)), 1)
-    pairs = nearest_planes(source, target, T_target_source[None], level).pairs
+    pairs = nearest_planes(source, target, T_target_source[None], radius_m, len(source.samples)).pairs
     R = T_target_source[:3, :3]
     covariance = R @ np.linalg.inv(plane_information(pairs, T_target_source))[:3, :3] @ R.T
     horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]

@@ -242,13 +242,7 @@ def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
         The map of the keyframes and edges of that component, with rows of its own.
     """
     is_taken = np.array(joined.component_of_map)[joined.map_of_keyframe] == component
-    new_row = np.cumsum(is_taken) - 1
-    edges = [
-        edge._replace(source=int(new_row[edge.source]), target=int(new_row[edge.target]))
-        for edge in joined.slam_map.edges
-        if is_taken[edge.source]
-    ]
-    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist(), edges)
+    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist())
 
 
 def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
@@ -268,13 +262,10 @@ def _in_own_frames(
     joined: KeyframeMap, map_of_row: np.ndarray, components: Sequence[int], maps: Sequence[KeyframeMap]
 ) -> Poses:
     """Moves each component, so that the first keyframe of its first map stays where it was."""
-    T_world = joined.T_world_keyframe.copy()
-    component_of_row = np.array(components)[map_of_row]
-    for component in np.unique(component_of_row):
-        rows = np.flatnonzero(component_of_row == component)
-        T_new_old = maps[map_of_row[rows[0]]].T_world_keyframe[0] @ rigid.inverse(T_world[rows[0]])
-        T_world[rows] = T_new_old @ T_world[rows]
-    return T_world
+    T_old = joined.T_world_keyframe
+    _, first_rows, component = np.unique(np.array(components)[map_of_row], return_index=True, return_inverse=True)
+    T_new_old = [maps[map_of_row[row]].T_world_keyframe[0] @ rigid.inverse(T_old[row]) for row in first_rows]
+    return np.reshape(T_new_old, (-1, 4, 4))[component] @ T_old
 
 
 def _traffic(agent: SlamResult) -> SentBytes:

@@ -79,7 +79,7 @@ class LoopClosureConfig:
         is_on: False leaves the map as odometry makes it.
         num_near: largest number of candidates by distance.
         num_similar: largest number of candidates by retrieval.
-        min_overlap: smallest overlap probability of a candidate that is registered; 0 uses no network.
+        min_overlap: smallest overlap probability of a candidate that is registered.
         num_asked: number of candidates whose overlap is predicted at a time, alternately by distance and by retrieval.
         num_registered: largest number of candidates that are registered.
         min_probability: smallest P(correct) of an accepted registration.

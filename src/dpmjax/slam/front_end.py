@@ -15,7 +15,7 @@ from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.scans.weak_directions import diagonal_information, sigma_along
-from dpmjax.slam.interfaces import Alignment, PreparedInput, SlamMethods, ThinnedScan
+from dpmjax.slam.interfaces import Alignment, PreparedInput, Proposal, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframe_map import Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
 from dpmjax.types import Information, Pose
@@ -111,8 +111,7 @@ class FrontEndState(NamedTuple):
 
     Attributes:
         num_scans: number of scans so far, those of a loaded map among them.
-        is_begun: True from the first keyframe of this run on.
-        recent: the last scans that were accepted some distance apart, oldest first.
+        recent: the last scans that were accepted some distance apart, oldest first; none before the first keyframe.
         local_map: nearest keyframes and recent scans; None where it has to be made from the map.
         T_keyframe_last: pose of the last scan.
         T_before_last: motion of the last scan since the scan before.
@@ -121,7 +120,6 @@ class FrontEndState(NamedTuple):
     """
 
     num_scans: int = 0
-    is_begun: bool = False
     recent: tuple[PlacedElements, ...] = ()
     local_map: LocalMap | None = None
     T_keyframe_last: Pose = np.eye(4)
@@ -159,7 +157,7 @@ def place_scan(
     if thinned is None:
         return state._replace(num_scans=state.num_scans + 1, T_keyframe_last=state.predicted), slam_map, report
     report = report._replace(T_turn=scan.T_turn)
-    if not state.is_begun:
+    if not state.recent:
         reason = "a new part of the map begins here" if len(slam_map) else "the map begins here"
         report = report._replace(status="first", reason=reason, T_keyframe_scan=np.eye(4), score=1.0)
         located = _Located(report, diagonal_information(UNKNOWN_M, np.pi), scan.compact)
@@ -192,13 +190,11 @@ class _Located(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    # The best pose; that from the prediction and other motions; the decoder's first motion.
+    # The best pose; that from the prediction and other motions; the poses that the decoder proposes.
     best: Alignment
     tracked: Alignment | None
-    T_map_scan: Pose | None = None
-    probability: float | None = None
+    proposal: Proposal | None = None
     compact: CompactScan | None = None
-    is_calibrated: bool = True
 
 
 class _Search(NamedTuple):
@@ -213,7 +209,7 @@ class _Search(NamedTuple):
         """Estimates the pose, and accepts it or guesses another one."""
         state, config, usual = self.state, self.methods.config.front_end, self.state.usual_score
         tried = self._attempt()
-        best, probability = tried.best, tried.probability
+        best, probability = tried.best, None if tried.proposal is None else tried.proposal.probability
         # A new part has no usual score yet, and sparse scans never score high.
         wanted = max(MIN_SCORE, MIN_SCORE_SHARE * usual if state.scores else 0.0)
         is_far = not are_near(state.predicted, best.T_map_scan, PLACE_M, PLACE_RAD)
@@ -276,7 +272,7 @@ class _Search(NamedTuple):
             is_sure = is_near or proposal.probability >= config.front_end.min_probability
             lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
             best = _better_of(tracked, matched, lead if state.scores else 0.0)
-        return _Attempt(best, tracked, starts[0], proposal.probability, compact, proposal.is_calibrated)
+        return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact)
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
@@ -294,12 +290,12 @@ def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
 
 def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
     """Returns True where the decoder is sure of the pose, or where it and the alignment from other starts end there."""
-    best, probability = tried.best, tried.probability or 0.0
-    if tried.T_map_scan is None or not are_near(tried.T_map_scan, best.T_map_scan, PLACE_M, CONFIRMED_RAD):
+    best, proposal = tried.best, tried.proposal
+    if proposal is None or not are_near(proposal.T_target_source[0], best.T_map_scan, PLACE_M, CONFIRMED_RAD):
         return False
-    if tried.is_calibrated and probability >= SURE_PROBABILITY:
+    if proposal.is_calibrated and proposal.probability >= SURE_PROBABILITY:
         return True
-    if tried.tracked is None or probability < min_probability or best.score < MIN_SCORE:
+    if tried.tracked is None or proposal.probability < min_probability or best.score < MIN_SCORE:
         return False
     return are_near(tried.tracked.T_map_scan, best.T_map_scan, PLACE_M, CONFIRMED_RAD)
 
@@ -333,7 +329,7 @@ def _make_keyframe(
     moved = tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in before)
     placed = placed_scan(scan.measured.surface, np.eye(4))
     recent = with_scan(moved, placed, scan.extent_m)
-    after = _advanced(state, report)._replace(is_begun=True, recent=recent, local_map=None, T_keyframe_last=np.eye(4))
+    after = _advanced(state, report)._replace(recent=recent, local_map=None, T_keyframe_last=np.eye(4))
     return after, slam_map, report._replace(keyframe=row, T_keyframe_scan=np.eye(4), is_keyframe=True)
 
 

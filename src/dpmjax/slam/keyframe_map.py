@@ -14,9 +14,10 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_positive
-from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
-from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
+from dpmjax.scans.compact_surfaces import expand_elements
 from dpmjax.slam.config import SlamConfig
 from dpmjax.types import Information, Pose, Poses
 
@@ -172,21 +173,23 @@ def joined_maps(slam_map: KeyframeMap, other: KeyframeMap) -> KeyframeMap:
     )
 
 
-def take_keyframes(slam_map: KeyframeMap, rows: Sequence[int], edges: Iterable[MapEdge]) -> KeyframeMap:
-    """Selects keyframes of a map.
+def take_keyframes(slam_map: KeyframeMap, rows: Sequence[int]) -> KeyframeMap:
+    """Selects keyframes of a map, and the edges between them.
 
     Args:
         slam_map: the map.
         rows: rows of the selected keyframes.
-        edges: edges of the result, with rows of the result.
 
     Returns:
         The smaller map.
     """
-    keyframes = tuple(slam_map.keyframes[row] for row in rows)
-    return KeyframeMap(
-        keyframes, slam_map.T_world_keyframe[rows], slam_map.vectors[rows], tuple(edges), slam_map.origin
+    keyframes, new_row = tuple(slam_map.keyframes[row] for row in rows), {row: new for new, row in enumerate(rows)}
+    edges = tuple(
+        edge._replace(source=new_row[edge.source], target=new_row[edge.target])
+        for edge in slam_map.edges
+        if edge.source in new_row and edge.target in new_row
     )
+    return KeyframeMap(keyframes, slam_map.T_world_keyframe[rows], slam_map.vectors[rows], edges, slam_map.origin)
 
 
 def with_origin(slam_map: KeyframeMap, origin: MapOrigin) -> KeyframeMap:
@@ -219,45 +222,27 @@ def connected_parts(num_nodes: int, edges: Iterable[Sequence[Any]]) -> Int[np.nd
     Returns:
         The number of the part of each node.
     """
-    return np.asarray(sp.csgraph.connected_components(_joined(num_nodes, edges), directed=False)[1], np.int64)
+    return label_parts(num_nodes, *_ends(edges))
 
 
-def nearest_in_graph(slam_map: KeyframeMap, row: int, num_keyframes: int, radius_m: float) -> Int[np.ndarray, " n"]:
-    """Finds the nearest keyframes among those that measured edges join to a keyframe.
-
-    Args:
-        slam_map: the map.
-        row: row of the keyframe.
-        num_keyframes: largest number of keyframes, and of edges between them and the first.
-        radius_m: keyframes farther away are left out.
-
-    Returns:
-        Rows, the keyframe itself first, then nearest first.
-    """
-    joined = _joined(len(slam_map), slam_map.edges_of("odometry", "loop"))
-    steps = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=num_keyframes)[0]
-    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
-    rows = np.flatnonzero(np.isfinite(steps) & (apart_m <= radius_m))
-    return rows[np.lexsort((apart_m[rows], rows != row))][:num_keyframes]
-
-
-def _joined(num_nodes: int, edges: Iterable[Sequence[Any]]) -> sp.csr_array:
-    ends = _ends(edges)
-    return sp.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), (num_nodes, num_nodes)).tocsr()
-
-
-def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int) -> Submap:
-    """Gathers a keyframe and its neighbours in the graph, nearest first.
+def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, *, radius_m: float = SUBMAP_RADIUS_M) -> Submap:
+    """Gathers a keyframe and the nearest of those that measured edges join to it.
 
     Args:
         slam_map: the map.
         row: row of the central keyframe.
-        num_keyframes: largest number of keyframes, the central one among them.
+        num_keyframes: largest number of keyframes, the central one among them, and of edges between them and it.
+        radius_m: keyframes farther away are left out.
 
     Returns:
-        The submap, in the frame of the central keyframe.
+        The submap, in the frame of the central keyframe; the others follow it, nearest first.
     """
-    rows = nearest_in_graph(slam_map, row, num_keyframes, SUBMAP_RADIUS_M)
+    source, target = _ends(slam_map.edges_of("odometry", "loop"))
+    joined = sp.coo_array((np.ones(len(source)), (source, target)), (len(slam_map), len(slam_map))).tocsr()
+    steps = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=num_keyframes)[0]
+    apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
+    rows = np.flatnonzero(np.isfinite(steps) & (apart_m <= radius_m))
+    rows = rows[np.lexsort((apart_m[rows], rows != row))][:num_keyframes]
     T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
     return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
 
@@ -319,15 +304,14 @@ def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMa
     if len(slam_map) == 0:
         return slam_map
     kept, cover = _covering(slam_map, spacing_share)
-    row_of = {row: number for number, row in enumerate(kept)}
     edges: dict[tuple[int, int, str], MapEdge] = {}
     for edge in slam_map.edges:
-        found = _contracted(slam_map, edge, cover, row_of)
+        found = _contracted(slam_map, edge, cover)
         key = (found.source, found.target, found.kind)
         is_better = key not in edges or np.trace(found.information) > np.trace(edges[key].information)
         if found.source != found.target and is_better:
             edges[key] = found
-    return take_keyframes(slam_map, kept, edges.values())
+    return take_keyframes(replace(slam_map, edges=tuple(edges.values())), kept)
 
 
 def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], Int[np.ndarray, " k"]]:
@@ -347,7 +331,7 @@ def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], I
     return kept, np.array([kept[int(np.argmin(apart_m(row)))] for row in range(len(slam_map))], np.int64)
 
 
-def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"], row_of: dict[int, int]) -> MapEdge:
+def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k"]) -> MapEdge:
     """Moves both ends of an edge to the keyframes that cover them."""
     source, target = int(cover[edge.source]), int(cover[edge.target])
     T_world = slam_map.T_world_keyframe
@@ -356,7 +340,7 @@ def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k
     T = T_target_end @ edge.T_target_source @ T_start_source
     num_steps = 1 + (source != edge.source) + (target != edge.target)
     information = _moved_information(edge.information, T_start_source) / num_steps
-    return MapEdge(row_of[source], row_of[target], T, information, edge.kind)
+    return MapEdge(source, target, T, information, edge.kind)
 
 
 def _moved_information(information: Information, T_old_new: Pose) -> np.ndarray:

@@ -11,13 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
+from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad
+from dpmjax.scans.compact_surfaces import expand_elements
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig
-from dpmjax.slam.keyframe_map import KeyframeMap, nearest_in_graph
+from dpmjax.slam.keyframe_map import KeyframeMap, Submap, submap_around
 from dpmjax.types import AnyArray, Pose
 
 # Smallest distance between the last scans, as a share of the extent.
@@ -76,17 +77,18 @@ def local_map_of(slam_map: KeyframeMap, recent: Sequence[PlacedElements], config
     Returns:
         The local map.
     """
-    rows = nearest_in_graph(slam_map, len(slam_map) - 1, config.num_keyframes, np.inf)
-    T_map_keyframe = rigid.inverse(slam_map.T_world_keyframe[-1]) @ slam_map.T_world_keyframe[rows]
-    compact = tuple(slam_map.keyframes[row].compact for row in rows)
-    placed = tuple(placed_keyframe(scan, T) for scan, T in zip(compact, T_map_keyframe, strict=True))
-    return LocalMap(placed, compact, joined_surface((*placed, *recent)))
+    near = submap_around(slam_map, len(slam_map) - 1, config.num_keyframes, radius_m=np.inf)
+    placed = placed_keyframes(near)
+    return LocalMap(placed, near.scans, joined_surface((*placed, *recent)))
 
 
-def placed_keyframe(scan: CompactScan, T_map_scan: Pose) -> PlacedElements:
-    """Returns the flat elements of a keyframe with a pose."""
-    elements = expand_elements(scan.elements)
-    return _placed(T_map_scan, elements.positions, elements.normals, np.where(elements.mask, elements.planarity, 0))
+def placed_keyframes(submap: Submap) -> tuple[PlacedElements, ...]:
+    """Returns the flat elements of the keyframes of a submap, with their poses in its frame."""
+    elements = (expand_elements(scan.elements) for scan in submap.scans)
+    return tuple(
+        _placed(T, one.positions, one.normals, np.where(one.mask, one.planarity, 0))
+        for one, T in zip(elements, submap.T_submap_keyframe, strict=True)
+    )
 
 
 def placed_scan(surface: Surface, T_map_scan: Pose) -> PlacedElements:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
-from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, num_accepted, with_match
+from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, has_new_loops, with_match
 from dpmjax.slam.map_optimization import optimize_map
 
 # Upper bound of the radius (DeepPointMap: 100 m).
@@ -67,11 +67,10 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     config, row = methods.config.loops, len(slam_map) - 1
     if not config.is_on or row < 1 or is_resting(slam_map, state.loops, row):
         return slam_map, state
-    loops = examine_candidates(methods, slam_map, state.loops, find_loop_candidates(slam_map, row, config))
-    is_stale = state.is_stale or num_accepted(loops) > num_accepted(state.loops)
-    state = LoopState(loops, state.num_optimized, is_stale)
+    candidates = find_loop_candidates(slam_map, row, config)
+    state = state._replace(loops=examine_candidates(methods, slam_map, state.loops, candidates))
     wait = max(EVERY_KEYFRAMES, int(EVERY_SHARE * len(slam_map)))
-    if is_stale and len(slam_map) - state.num_optimized >= wait:
+    if len(slam_map) - state.num_optimized >= wait and has_new_loops(slam_map, state.loops):
         slam_map, state = optimize_map(slam_map, state)
         return slam_map, search_again(methods, slam_map, state)
     return slam_map, state
@@ -101,7 +100,7 @@ def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) 
         first = bisect_right(loops, candidate.source, key=lambda loop: loop.source)
         loops = (*loops[:first], *_register_candidates(methods, slam_map, [candidate]), *loops[first:])
         loops = accept_consistent(slam_map, loops, first, methods.config.loops)
-    return state._replace(loops=loops, is_stale=num_accepted(loops) > num_accepted(state.loops))
+    return state._replace(loops=loops)
 
 
 def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
@@ -164,14 +163,12 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
     config, loops = methods.config.loops, list(candidates)
     for start in range(0, len(candidates), config.num_asked):
         some = candidates[start : start + config.num_asked]
-        overlaps = [1.0] * len(some)
-        if config.min_overlap > 0:
-            scans = [slam_map.keyframes[loop.target].compact for loop in some]
-            overlaps = methods.matcher.overlaps(slam_map.keyframes[some[0].source].compact, scans).tolist()
+        scans = [slam_map.keyframes[loop.target].compact for loop in some]
+        overlaps = methods.matcher.overlaps(slam_map.keyframes[some[0].source].compact, scans).tolist()
         for number, overlap in enumerate(overlaps, start):
             status: LoopStatus = "no overlap" if overlap < config.min_overlap else "not registered"
             loops[number] = loops[number]._replace(status=status, overlap=overlap)
-        if config.min_overlap > 0 and max(overlaps) >= SURE_OVERLAP:
+        if max(overlaps) >= SURE_OVERLAP:
             break
     return loops
 

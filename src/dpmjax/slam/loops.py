@@ -68,7 +68,8 @@ class Loop(NamedTuple):
         target: row of an older one.
         found_by: search that found it; "map" is a loop of the map that was extended.
         status: outcome.
-        overlap: probability of overlap; 1 where no network predicts it, None where another candidate surely overlaps.
+        overlap: probability of overlap; 1 for a loop of the map that was extended, None where another candidate surely
+            overlaps.
         probability: P(correct) of the registration; None without one.
         rmse: root mean square error of the registration, metres; None without one.
         T_target_source: motion of the registration; None without one.
@@ -98,12 +99,10 @@ class LoopState(NamedTuple):
     Attributes:
         loops: every candidate, in the order in which they were found.
         num_optimized: number of keyframes at the last optimisation.
-        is_stale: True if edges other than further steps of odometry were added since.
     """
 
     loops: tuple[Loop, ...] = ()
     num_optimized: int = 0
-    is_stale: bool = False
 
 
 def loops_of_map(slam_map: KeyframeMap) -> LoopState:
@@ -133,6 +132,19 @@ def num_accepted(loops: Iterable[Loop]) -> int:
         The number.
     """
     return sum(loop.status == "accepted" for loop in loops)
+
+
+def has_new_loops(slam_map: KeyframeMap, loops: Iterable[Loop]) -> bool:
+    """Returns True if loops were accepted since the last optimisation, which makes edges of them.
+
+    Args:
+        slam_map: the map.
+        loops: all candidates.
+
+    Returns:
+        False where the edges hold all accepted loops.
+    """
+    return num_accepted(loops) > len(slam_map.edges_of("loop"))
 
 
 def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> Loop:

@@ -28,7 +28,7 @@ from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import AlignmentLevel, NearestPlanes, align_surfaces, nearest_planes
+from dpmjax.scans.surface_alignment import NearestPlanes, align_surfaces, nearest_planes
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
 from dpmjax.scans.weak_directions import (
     plane_information,
@@ -36,10 +36,11 @@ from dpmjax.scans.weak_directions import (
     with_least_covariance,
     without_noise_along,
 )
+from dpmjax.sequences import homogeneous
 from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap
-from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframe
+from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframes
 from dpmjax.types import DescriptorCloud, Pose, Poses, Registration
 
 # Turns about the x and y axes among the further starts.
@@ -160,7 +161,8 @@ class SurfaceGeometry:
             The motions.
         """
         R, step = T_last_scan[:3, :3], T_last_scan[:3, 3]
-        turns, spins = ([R @ _turned(turn_deg) for turn_deg in several] for several in (TURNS_DEG, SPINS_DEG))
+        turns = [R @ Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in TURNS_DEG]
+        spins = [R @ Rotation.from_euler("z", turn, degrees=True).as_matrix() for turn in SPINS_DEG]
         tilts = [Rotation.from_euler(*tilt, degrees=True).as_matrix() for tilt in itertools.product("xy", TILTS_DEG)]
         motions = [(R, factor * step) for factor in STEP_FACTORS]
         motions += [(R, np.array([share * extent_m, 0.0, 0.0])) for share in AHEAD_SHARES]
@@ -169,9 +171,8 @@ class SurfaceGeometry:
         # A rocking vehicle tilts back, so its last rotation does not continue.
         motions.append((np.eye(3), step))
         motions += [(rotation, step) for tilt in tilts for rotation in (R @ tilt, tilt)]
-        found = np.tile(np.eye(4), (len(motions), 1, 1))
-        found[:, :3, :3], found[:, :3, 3] = (np.array(parts) for parts in zip(*motions, strict=True))
-        return found
+        rotations, translations = (np.array(parts) for parts in zip(*motions, strict=True))
+        return homogeneous(rotations, translations)
 
     def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Poses) -> list[Alignment]:
         found = align_surfaces(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
@@ -189,13 +190,7 @@ class SurfaceGeometry:
         return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
 
     def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
-        level = AlignmentLevel(self.config.plane_radius_m, num_samples, 1)
-        return nearest_planes(surface, local_map.surface, T_map_scan[None], level)
-
-
-def _turned(turn_deg: float) -> Float[np.ndarray, "3 3"]:
-    """Returns a rotation about the vertical."""
-    return np.asarray(Rotation.from_euler("z", turn_deg, degrees=True).as_matrix())
+        return nearest_planes(surface, local_map.surface, T_map_scan[None], self.config.plane_radius_m, num_samples)
 
 
 def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
@@ -315,16 +310,11 @@ class NetworkMatcher:
 
     def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
-        scan, union = _surface(source._replace(scans=source.scans[:1])), _surface(target)
+        scan, union = joined_surface(placed_keyframes(source)[:1]), joined_surface(placed_keyframes(target))
         T = align_surfaces(scan, union, np.asarray(found.T_target_source)[None], REFINEMENT)
-        level = AlignmentLevel(config.plane_radius_m, config.num_samples, 1)
-        information = plane_information(nearest_planes(scan, union, T, level).pairs, T[0])
+        pairs = nearest_planes(scan, union, T, config.plane_radius_m, config.num_samples).pairs
+        information = plane_information(pairs, T[0])
         return Match(T[0], float(found.confidence), float(found.rmse), found.verification, information)
-
-
-def _surface(submap: Submap) -> Surface:
-    placed = zip(submap.scans, submap.T_submap_keyframe, strict=False)
-    return joined_surface([placed_keyframe(scan, T) for scan, T in placed])
 
 
 def _merged(submap: Submap) -> PreparedScan:

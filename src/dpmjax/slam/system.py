@@ -24,7 +24,7 @@ from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
 from dpmjax.slam.loop_closure import close_loops
-from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
+from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods
 from dpmjax.types import Pose, Poses
@@ -130,7 +130,7 @@ def finish_slam(state: SlamState, reports: Iterable[ScanReport], config: SlamCon
         Trajectory, keyframes, loops and graph.
     """
     reports, slam_map, loops = tuple(reports), state.slam_map, state.loops
-    if loops.is_stale:
+    if has_new_loops(slam_map, loops.loops):
         slam_map, loops = optimize_map(slam_map, loops)
     return SlamResult(
         T_world_scan=place_scans(slam_map.T_world_keyframe, reports),
