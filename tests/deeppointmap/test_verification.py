@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
+from dpmjax.deeppointmap.prepared_scans import compact_elements, expand_elements
 from dpmjax.deeppointmap.verification import (
     EVIDENCE,
     VerificationConfig,
@@ -13,7 +14,6 @@ from dpmjax.deeppointmap.verification import (
     measure_scan,
     verify_motions,
 )
-from dpmjax.scans.compact_surfaces import compact_elements, expand_elements
 from dpmjax.scans.surfaces import Surface, surface_of_elements
 from dpmjax.types import SurfaceElements, Verification
 from tests.scans.surface_scenes import motion, seen_from, street

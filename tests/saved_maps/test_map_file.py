@@ -27,7 +27,7 @@ from dpmjax.slam.keyframe_map import (
     with_origin,
 )
 from dpmjax.types import DescriptorCloud
-from tests.scans.test_compact_surfaces import room
+from tests.deeppointmap.test_compact import room
 from tests.slam.truth import noise
 
 RNG = np.random.default_rng(3)

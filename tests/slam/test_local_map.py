@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpmjax.deeppointmap.prepared_scans import compact_elements
 from dpmjax.geometry import rigid
-from dpmjax.scans.compact_surfaces import compact_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, Submap, add_keyframe

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.scans.compact_surfaces import expand_elements
+from dpmjax.deeppointmap.prepared_scans import expand_elements
 from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry, ThinnedScan
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from

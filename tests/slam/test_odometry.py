@@ -8,10 +8,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpmjax import model_preset
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_elements, compact_image
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.compact_surfaces import compact_elements, compact_image
 from dpmjax.scans.weak_directions import diagonal_information, sigma_along
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
 from dpmjax.slam.keyframe_map import Keyframe, add_keyframe

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactElements, CompactImage, CompactScan, expand_elements
 from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
-from dpmjax.scans.compact_surfaces import CompactElements, CompactImage, expand_elements
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import Alignment, LocalMap, Match, Proposal, Submap, ThinnedScan
 

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int8
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan, round_features
+from dpmjax.deeppointmap.prepared_scans import MAX_COMPONENT, CompactElements, CompactImage, CompactScan, round_features
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.compact_surfaces import MAX_COMPONENT, CompactElements, CompactImage
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin, edge_arrays
 
 Precision = Literal["float32", "int8"]

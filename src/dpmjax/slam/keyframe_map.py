@@ -14,10 +14,9 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_positive
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
-from dpmjax.scans.compact_surfaces import expand_elements
 from dpmjax.slam.config import SlamConfig
 from dpmjax.types import Information, Pose, Poses
 

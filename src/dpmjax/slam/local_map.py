@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad
-from dpmjax.scans.compact_surfaces import expand_elements
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.slam.config import OdometryConfig
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap, submap_around
