@@ -6,7 +6,7 @@ import functools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -232,9 +232,9 @@ def _shared_scale(
 
 def _in_metres(hypotheses: Registration, scale: float) -> Registration:
     """Scales the hypotheses from the units of the descriptors to metres."""
-    T: Any = np.array(hypotheses.T_target_source)
+    T = np.array(hypotheses.T_target_source)
     T[:, :3, 3] /= scale
-    return replace(hypotheses, T_target_source=T, rmse=hypotheses.rmse / np.float32(scale))
+    return replace(hypotheses, T_target_source=jnp.asarray(T), rmse=hypotheses.rmse / np.float32(scale))
 
 
 def _unregistered(*scans: DescriptorCloud | PreparedScan) -> _RegisteredMotion:
