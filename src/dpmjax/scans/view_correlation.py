@@ -101,11 +101,12 @@ def correlate_views(
     images = _images(source, levels[0], turns, cell_m)
     fixed = _images(target, levels[1], np.zeros(1), cell_m)[0]
     fixed = gaussian_filter(fixed, (0, BLUR_CELLS, BLUR_CELLS), mode="wrap")
-    norms = np.sqrt(np.sum(images**2, axis=(2, 3)) * np.sum(fixed**2, axis=(1, 2)))
+    norms = np.sqrt(np.sum(images**2, axis=(2, 3)).mean(axis=0) * np.sum(fixed**2, axis=(1, 2)))
     if not norms.any():
         return np.zeros((0, 4, 4))
-    # Each direction has the same weight, so that walls along a street do not outweigh those across.
-    images /= np.where(norms > 0, norms, 1)[:, :, None, None]
+    # Each direction of the target has the same weight, so that walls along a street do not outweigh those across. The
+    # mean over all turns weights the source: a direction that few points have at one turn must not count as much.
+    fixed /= np.where(norms > 0, norms, 1)[:, None, None]
     spectra = np.conj(fft.rfft2(images)) * fft.rfft2(fixed)
     scores = fft.irfft2(spectra.sum(axis=1), s=images.shape[2:])
     if beside is None:
