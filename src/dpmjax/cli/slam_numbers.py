@@ -94,7 +94,7 @@ def localization_errors(
 
 
 UNSURE = {
-    "network": "placed by the network, because alignment with the scans before failed",
+    "network": "placed by the network: at the start, or because alignment with the scans before failed",
     "predicted": "placed by the predicted motion only: uncertain",
     "restarted": "not placed: a new part of the map begins there",
     "empty": "without enough points",
