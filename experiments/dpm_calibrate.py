@@ -10,8 +10,8 @@ corridors, tunnels, halls, open fields and streets with queues of moving cars, b
 is another regression, on the evidence of the match (similarities of descriptors, consensus support ...) of pairs of
 further towns, half of them less than 20 m apart. Results go to results/dpm_calibrate/<time>/: model.safetensors,
 metrics.json, reliability.png, reliability_clouds.png and reliability_overlap.png. The file model.safetensors is the
-model with all regressions. The file metrics.json has the Brier scores, and the AUC of overlap, of places that were left
-out of the fits. `python -m experiments.dpm_confidence` checks the confidence on other places.
+model with all regressions. The file metrics.json has the Brier scores, the calibration errors, and the AUC of overlap,
+of places that were left out of the fits. `python -m experiments.dpm_confidence` checks the confidence on other places.
 """
 
 from __future__ import annotations

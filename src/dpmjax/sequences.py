@@ -68,6 +68,19 @@ def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: st
         raise InputError(source, found, advice)
 
 
+def counted(number: int, noun: str) -> str:
+    """Returns a number with its noun, in the plural unless the number is 1.
+
+    Args:
+        number: the number.
+        noun: its noun in the singular.
+
+    Returns:
+        Text for messages and pictures.
+    """
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def homogeneous(rotations: FloatArray, translations: FloatArray) -> FloatArray:
     """Builds homogeneous matrices.
 

@@ -80,7 +80,6 @@ from .slam_files import write_map_file as write_map_file
 from .slam_files import write_scans as write_scans
 from .slam_files import write_trajectory as write_trajectory
 from .slam_numbers import SlamRun as SlamRun
-from .slam_numbers import counted as counted
 from .slam_numbers import localization_errors as localization_errors
 from .slam_numbers import trajectory_errors as trajectory_errors
 from .slam_run import map_drive as map_drive

@@ -25,6 +25,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
+from dpmjax.sequences import counted
 
 NAME = "merge"
 
@@ -124,7 +125,7 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
     cloud = cli.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
-    return cli.map_track(f"{short_name(path)}, {cli.counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
+    return cli.map_track(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 
 def merge_text(metrics: dict[str, Any]) -> str:
@@ -134,6 +135,6 @@ def merge_text(metrics: dict[str, Any]) -> str:
     for part in metrics["parts"]:
         members = ", ".join(names[number] for number in part["maps"])
         text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
-        lines.append(f"{members}: {text}, {cli.counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
-    loops, candidates = cli.counted(metrics["num_loops"], "loop"), cli.counted(metrics["num_candidates"], "candidate")
+        lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
+    loops, candidates = counted(metrics["num_loops"], "loop"), counted(metrics["num_candidates"], "candidate")
     return "\n".join([*lines, f"{loops} between maps, of {candidates}"])

@@ -133,7 +133,7 @@ def _choice_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | Non
 
 @_REGISTRY.primitive_rule
 def _optional_rule(info: PrimitiveTypeInfo) -> Any:
-    """Reads `X | None` as X; None is what is not given."""
+    """Reads `X | None` as X; an option that is not given is None."""
     origin: Any = info.type_origin
     kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
     if origin not in (Union, UnionType) or len(kinds) != 1:

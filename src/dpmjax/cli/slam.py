@@ -29,7 +29,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from dpmjax import cli, io, slam, viz, weights
 from dpmjax.cli import slam_files as files
 from dpmjax.cli import slam_numbers as numbers
-from dpmjax.sequences import InputError, LidarSequence, require
+from dpmjax.sequences import InputError, LidarSequence, counted, require
 
 NAME = "slam"
 
@@ -80,12 +80,12 @@ def main(config: Config) -> None:
     reader = cli.ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
     beginning = find_beginning(cli.find_run(NAME, config.output) if config.resume else None, methods, start)
     num_done = len(beginning.reports)
-    found = f"{numbers.counted(num_done, 'scan')} done, {len(sequence)} wanted"
+    found = f"{counted(num_done, 'scan')} done, {len(sequence)} wanted"
     require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
     folder = cli.open_run_folder(config, NAME)
     with cli.recording(folder), cli.StopFlag() as stop:
         done = f", {len(beginning.reports)} done before" if beginning.reports else ""
-        cli.tell(f"{sequence.name}: {numbers.counted(len(sequence), 'scan')}{done}")
+        cli.tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
         notes = cli.report_notes(sequence.notes)
         viewer = viz.LiveViewer(sequence.name, folder / "slam.rrd") if config.visualize else None
         with nullcontext() if viewer is None else closing(viewer):

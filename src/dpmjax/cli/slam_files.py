@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
 from dpmjax.cli.result_files import write_poses, write_table
-from dpmjax.cli.slam_numbers import count_parts, counted, distances_to_reference
-from dpmjax.sequences import LidarSequence
+from dpmjax.cli.slam_numbers import count_parts, distances_to_reference
+from dpmjax.sequences import LidarSequence, counted
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)

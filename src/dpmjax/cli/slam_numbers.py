@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dpmjax import geometry, metrics, slam
-from dpmjax.sequences import LidarSequence
+from dpmjax.sequences import LidarSequence, counted
 
 MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
 """Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres."""
@@ -253,8 +253,3 @@ def summary(numbers: Mapping[str, Any]) -> str:
         stages = ", ".join(f"{name} {ms:.0f}" for name, ms in slowest)
         lines.append(f"{speed:.1f} scans/s (ms a scan: {stages}); compilation took {numbers['compile_s']:.0f} s more")
     return "\n".join(lines)
-
-
-def counted(number: int, noun: str) -> str:
-    """Returns a number with its noun, in the plural unless the number is 1."""
-    return f"{number} {noun}{'s' * (number != 1)}"

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from dpmjax import cli, slam, viz
 from dpmjax.saved_maps import RunState, load_state, save_state
-from dpmjax.sequences import LidarSequence
+from dpmjax.sequences import LidarSequence, counted
 
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
@@ -203,7 +203,7 @@ def write_interim(
 
 def _progress(state: slam.SlamState, report: slam.ScanReport, watch: Stopwatch) -> str:
     num_loops = len(cli.accepted_ends(state.loops.loops))
-    parts = [cli.counted(len(state.slam_map), "keyframe"), cli.counted(num_loops, "loop"), f"score {report.score:.2f}"]
+    parts = [counted(len(state.slam_map), "keyframe"), counted(num_loops, "loop"), f"score {report.score:.2f}"]
     if report.status not in ("first", "tracked"):
         parts.append(report.status)
     return ", ".join([*parts, f"compiled {watch.compile_s:.0f} s"])

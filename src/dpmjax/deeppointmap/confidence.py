@@ -180,10 +180,10 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
 def lookalike_share(lookalike_gap: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
     """Computes the share of the probability that a place keeps beside the best other one that looks alike.
 
-    Of two places under which the scans agree, one is right: the odds are those of their scores.
+    One of two places under which the scans agree is right; the odds are those of their scores.
 
     Args:
-        lookalike_gap: lead of its score over that of the other place, as log odds.
+        lookalike_gap: lead in log odds over the best other place.
 
     Returns:
         In [0, 1]; 1 for an infinite lead.

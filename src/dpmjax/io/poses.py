@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
-from dpmjax.sequences import FloatArray, InputError, Unit, homogeneous, require
+from dpmjax.sequences import FloatArray, InputError, Unit, counted, homogeneous, require
 
 _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), EuRoC (with its line of names), KITTI (12 numbers a row), or .npy of "
@@ -91,7 +91,7 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         if named and named.group(1) != unit:
             raise InputError(path, f"poses in {named.group(1)}, the scans are in {unit}", f"give poses in {unit}")
     poses, _ = _read(path)
-    found = f"{len(poses)} pose{'s' * (len(poses) != 1)} for {num_scans} scans"
+    found = f"{counted(len(poses), 'pose')} for {num_scans} scans"
     require(len(poses) == num_scans, path, found, "give one pose a scan, in the scans' order")
     if poses.ndim == 2:
         return poses

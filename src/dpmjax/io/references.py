@@ -12,7 +12,7 @@ from dpmjax.geometry import rigid
 from dpmjax.io.files import read_table
 from dpmjax.io.poses import StampedPoses, interpolate_poses, read_poses
 from dpmjax.io.scan_names import match_rows, stamps_in_names
-from dpmjax.sequences import FloatArray, InputError, Note, Relations, require
+from dpmjax.sequences import FloatArray, InputError, Note, Relations, counted, require
 
 # Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.
 _LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
@@ -56,11 +56,8 @@ def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatAr
     """
     matched = match_rows(poses, files)
     if matched is None:
-        raise InputError(
-            path,
-            f"{len(poses)} pose{'s' * (len(poses) != 1)} for {len(files)} scans",
-            "give one pose a scan, in their order",
-        )
+        found = f"{counted(len(poses), 'pose')} for {len(files)} scans"
+        raise InputError(path, found, "give one pose a scan, in their order")
     return matched
 
 
@@ -169,7 +166,7 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
             return Reference(T, _note_of(path, f"time, tolerance {tolerance_s:.3g} s", T))
         reason, is_doubt = "no scan has the time of a pose", True
     advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
-    require(count == num_scans, path, f"{count} pose{'s' * (count != 1)} for {num_scans} scans, and {reason}", advice)
+    require(count == num_scans, path, f"{counted(count, 'pose')} for {num_scans} scans, and {reason}", advice)
     note = Note(f"{path}: {reason}; poses are matched by their order", is_doubt=True)
     return Reference(found.poses, (note,) if is_doubt else ())
 

@@ -17,7 +17,7 @@ from dpmjax.io.deepmapping_folder import read_deepmapping_folder
 from dpmjax.io.files import load_arrays, log_notes, read_bytes, to_float32
 from dpmjax.io.poses import check_poses
 from dpmjax.io.scan_bags import is_bag, read_scan_bag
-from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, require
+from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, counted, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _log = logging.getLogger(__name__)
@@ -70,9 +70,7 @@ def read_sequence(
     whole = _without_maxima(_read(path, unit, topic), path)
     sequence = _without_constant_odometry(whole, path).take(slice(start, stop, stride))
     is_part = len(sequence) < len(whole)
-    found = (
-        f"{len(sequence)} of {len(whole)} scans chosen" if is_part else f"{len(whole)} scan{'s' * (len(whole) != 1)}"
-    )
+    found = f"{len(sequence)} of {len(whole)} scans chosen" if is_part else counted(len(whole), "scan")
     require(len(sequence) >= 2, path, found, "give two or more")
     _check_beams(sequence, path, start, stride)
     sequence = replace(sequence, notes=(*sequence.notes, *_check_unit(sequence, path)))

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from dpmjax.sequences import counted
 from dpmjax.viz import figures
 from dpmjax.viz.figures import INK, MUTED, Limits
 
@@ -214,7 +215,7 @@ def _draw_panel(axes: Axes, panel: AgentPanel, limits: Limits, size: tuple[float
         axes.plot(*path, color=agent.color, lw=width, label=agent.label, zorder=4, solid_capstyle="round")
         axes.plot(*path[:, :1], "o", ms=width + 4, color=agent.color, mec="white", zorder=8)
     if len(panel.loops):
-        label = f"{len(panel.loops)} loop{'s' * (len(panel.loops) != 1)} between them"
+        label = f"{counted(len(panel.loops), 'loop')} between them"
         figures.draw_loops(axes, panel.loops, label, INK)
     figures.frame_map(axes, limits, "m")
     axes.set_title(panel.title, fontsize=9, color=MUTED, loc="left")

@@ -18,6 +18,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from dpmjax.sequences import counted
 from dpmjax.viz import figures
 from dpmjax.viz.figures import ACCENT, INK, MUTED, Limits
 
@@ -79,7 +80,7 @@ def trajectory_figure(
     for track in tracks:
         axes.plot(*track.positions[:, :2].T, label=track.label, zorder=4, **_style(track, tracks))
     if len(loops):
-        figures.draw_loops(axes, loops, f"{len(loops)} loop" + "s" * (len(loops) != 1), LOOP)
+        figures.draw_loops(axes, loops, counted(len(loops), "loop"), LOOP)
     axes.plot(*tracks[-1].positions[:1, :2].T, "o", ms=6, color=INK, mec="white", zorder=7, label="start")
     figures.frame_map(axes, limits, "m")
     figures.set_title(axes, title, 11, loc="left", fontweight="bold")
@@ -160,7 +161,7 @@ def localization_figure(
     axes = figures.add_axes(figure, (0.15, 0.37, width_in, height_in))
     figures.show_clouds(axes, [points], [POINTS], limits)
     # The rings lie on the arrows: a keyframe under a scan is visible, and so is the scan.
-    keyframes = f"{len(path)} keyframe" + "s" * (len(path) != 1)
+    keyframes = counted(len(path), "keyframe")
     axes.plot(*path[:, :2].T, "o", mfc="none", mec=INK, mew=0.8, ms=6, label=keyframes, zorder=7)
     length = HEAD_SHARE * max(limits.width, limits.height)
     right = (~wrong, OURS, "o", 4, "found (arrow: forward)")
