@@ -74,7 +74,7 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
 def matches_figure(
     pair: RegisteredPair, source_matched: ArrayLike, target_matched: ArrayLike, is_right: ArrayLike
 ) -> Figure:
-    """Draws two scans side by side from above with lines between matches, and one on the other by the estimated motion.
+    """Draws two scans from above: side by side with lines between matches, and together by the estimated motion.
 
     Lines of right matches are black, those of wrong ones red and dashed; at most 30 of each kind are drawn.
 
