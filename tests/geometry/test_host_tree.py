@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
+from dpmjax.geometry import neighbours
 from dpmjax.geometry.neighbours import WAIT_POLICY, HostTree
 
 
+@pytest.mark.parametrize("ordered_from", [1, 1000])
 @pytest.mark.parametrize("num_threads", [1, 3])
 @pytest.mark.parametrize("k", [1, 7, 40])
 @pytest.mark.parametrize("case", ["random", "coinciding", "a line"])
-def test_distances_are_the_smallest_of_all(case: str, k: int, num_threads: int) -> None:
+def test_distances_are_the_smallest_of_all(
+    case: str, k: int, num_threads: int, ordered_from: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(neighbours, "ORDERED_FROM", ordered_from)
     points = np.random.default_rng(0).normal(size=(40, 3))
     points *= {"random": 1, "coinciding": 0, "a line": np.array([1, 0, 0])}[case]
     queries = np.random.default_rng(1).normal(size=(25, 3)).astype(np.float32)

