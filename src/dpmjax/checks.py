@@ -242,3 +242,19 @@ def require_one_of(name: str, value: str, options: Iterable[str]) -> None:
     """
     if value not in options:
         raise ValueError(f"{name}: expected one of {', '.join(options)}, got {value!r}")
+
+
+def require_type(name: str, value: object, expected: type, source: str) -> None:
+    """Checks the type of an argument that another function makes.
+
+    Args:
+        name: name of the argument, for messages.
+        value: the argument.
+        expected: its type.
+        source: the function or class that makes it.
+
+    Raises:
+        ValueError: `value` is something else, such as a path.
+    """
+    if not isinstance(value, expected):
+        raise ValueError(f"{name}: expected one from {source}, got {type(value).__name__}")

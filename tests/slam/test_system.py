@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from dpmjax import encode
 from dpmjax.geometry import rigid, se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.scans.weak_directions import diagonal_information
@@ -21,6 +22,8 @@ from dpmjax.slam import (
     ThinnedScan,
     finish_slam,
     init_slam,
+    localize,
+    merge_maps,
     run_slam,
     slam_preset,
     step_slam,
@@ -355,6 +358,22 @@ def test_a_scan_of_another_shape_is_refused(as_user) -> None:
         step_slam(methods, init_slam(), np.zeros((5, 4)))
     with pytest.raises(ValueError, match="config: expected None"):
         run_slam(methods, [], CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda methods: run_slam("dpm_small", []), "model: expected one from load_model, got str"),
+        (lambda methods: encode("dpm_small", EMPTY), "model: expected one from load_model, got str"),
+        (lambda methods: run_slam(methods, [], slam_map="map.npz"), "slam_map: expected one from load_map, got str"),
+        (lambda methods: localize(methods, "map.npz", EMPTY), "slam_map: expected one from load_map, got str"),
+        (lambda methods: merge_maps(methods, "a.npz", "b.npz"), "maps: expected one from load_map, got str"),
+    ],
+)
+def test_names_and_paths_in_place_of_models_and_maps_are_refused(as_user, call, message) -> None:
+    methods = SlamMethods(TruthMatcher(np.eye(4)[None]), TruthGeometry(np.eye(4)[None]), CONFIG)
+    with pytest.raises(ValueError, match=message):
+        call(methods)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points, require_positive, require_some
+from dpmjax.checks import as_host_points, require_positive, require_some, require_type
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
@@ -44,6 +44,7 @@ def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: i
         `model.config.num_descriptors` descriptors and the further elements, metres, same frame, in the order of
         farthest points. The mask of an empty scan is all False.
     """
+    require_type("model", model, Model, "load_model")
     pyramid = pyramid_of_scan(points, model.config, scale=scale)
     return encode_pyramid(model, pyramid, num_elements=num_elements)
 
@@ -64,6 +65,7 @@ def encode_scans(
     Returns:
         Stacked clouds, as `merge_clouds` takes them: positions (s, n, 3), features (s, m, c), mask (s, n).
     """
+    require_type("model", model, Model, "load_model")
     require_some("scans", scans)
     parts = []
     for start in range(0, len(scans), CHUNK):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dpmjax.checks import require_pairs
+from dpmjax.checks import require_pairs, require_type
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
@@ -106,8 +106,7 @@ def register_each(
     Raises:
         ValueError: see `register`.
     """
-    if not isinstance(model, Model):
-        raise ValueError(f"model: expected one from load_model, got {type(model).__name__}")
+    require_type("model", model, Model, "load_model")
     refine = model.config.calibration is not None if refine is None else refine
     scale = _scale_of(pairs, scale, model)
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None

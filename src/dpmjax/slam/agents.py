@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from dpmjax.checks import require_type
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
@@ -177,10 +178,12 @@ def merge_maps(model: Model | SlamMethods, *maps: KeyframeMap, on_keyframe: OnKe
         One map, or several where no loop joins them, and the maps that have met.
 
     Raises:
-        ValueError: if there are fewer than two maps, or if a map was made with other weights.
+        ValueError: if there are fewer than two maps, if one is no map, or if one was made with other weights.
     """
     if len(maps) < 2:
         raise ValueError(f"maps: expected at least two, got {len(maps)}")
+    for slam_map in maps:
+        require_type("maps", slam_map, KeyframeMap, "load_map")
     joined = join_maps(methods_for(model, maps[0]), maps, on_keyframe=on_keyframe)
     numbers = joined.component_of_map
     merged = [

@@ -159,11 +159,10 @@ def localize_each(
     Raises:
         ValueError: see `localize`.
     """
-    if not isinstance(slam_map, KeyframeMap):
-        raise ValueError(f"slam_map: expected a map from load_map, got {type(slam_map).__name__}")
+    methods = methods_for(model, slam_map)
     if slam_map.origin is None:
         raise ValueError("slam_map: expected keyframes, got an empty map")
-    search = _Search(methods_for(model, slam_map), slam_map, config or LocalizationConfig())
+    search = _Search(methods, slam_map, config or LocalizationConfig())
     with_origin(slam_map, search.methods.origin)
     yield from map(search.localized, scans)
 

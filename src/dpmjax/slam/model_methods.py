@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from dpmjax.checks import require_type
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud, thin_scan
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
@@ -358,13 +359,19 @@ def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str
 
     Returns:
         The methods.
+
+    Raises:
+        ValueError: if the model is none, or the settings are no `SlamConfig`.
     """
     config = config or SlamConfig()
+    require_type("model", model, Model, "load_model")
+    require_type("config", config, SlamConfig, "SlamConfig or slam_preset")
     return SlamMethods(NetworkMatcher(model), SurfaceGeometry(model.config, config.odometry), config, weights)
 
 
 def methods_for(model: Model | SlamMethods, slam_map: KeyframeMap) -> SlamMethods:
     """Returns given methods unchanged, and makes the methods of a model with the settings of a map."""
+    require_type("slam_map", slam_map, KeyframeMap, "load_map")
     if isinstance(model, SlamMethods):
         return model
     return make_methods(model, None if slam_map.origin is None else slam_map.origin.config)

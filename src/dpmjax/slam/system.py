@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points, require_shape
+from dpmjax.checks import as_host_points, require_shape, require_type
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
@@ -86,8 +86,13 @@ def init_slam(slam_map: KeyframeMap | None = None) -> SlamState:
 
     Returns:
         The state before the first scan.
+
+    Raises:
+        ValueError: if it is no map.
     """
-    if slam_map is None or len(slam_map) == 0:
+    slam_map = KeyframeMap() if slam_map is None else slam_map
+    require_type("slam_map", slam_map, KeyframeMap, "load_map")
+    if len(slam_map) == 0:
         return SlamState(FrontEndState(), KeyframeMap(), LoopState())
     return SlamState(FrontEndState(num_scans=slam_map.keyframes[-1].scan + 1), slam_map, loops_of_map(slam_map))
 
@@ -182,8 +187,8 @@ def run_slam(
         `T_world_scan` of every scan, keyframes, loops, graph, map and reports.
 
     Raises:
-        ValueError: if a scan is not (n, 3), if methods come with another configuration, or if the map was made with
-            other weights.
+        ValueError: if a scan is not (n, 3), if an argument is of another type, if methods come with a configuration, or
+            if the map was made with other weights.
     """
     methods, state, reports = as_methods(model, config), init_slam(slam_map), []
     for scan in in_advance(partial(prepare_ahead, methods), scans):
