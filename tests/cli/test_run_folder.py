@@ -84,6 +84,18 @@ def test_force_never_touches_a_folder_that_is_no_run(tmp_path):
     assert (tmp_path / "thesis.txt").read_text() == "years"
 
 
+@pytest.mark.parametrize("name", ["scans.npy", "rows/a.txt", "."])
+def test_force_never_removes_an_input(tmp_path, name):
+    run = open_run(output=tmp_path / "out")
+    (run / "rows").mkdir()
+    for kept in ("scans.npy", "rows/a.txt"):
+        (run / kept).write_text("1")
+    with pytest.raises(ValueError, match="--force would remove"):
+        open_run(output=run.path, data=Path("out") / name, force=True)
+    assert (run / "scans.npy").exists()
+    assert (run / "rows" / "a.txt").exists()
+
+
 def test_a_run_that_was_killed_before_it_had_a_configuration_may_start_again(tmp_path):
     (tmp_path / ".config.json.x1").write_text("{")
     assert open_run(output=tmp_path).path == tmp_path

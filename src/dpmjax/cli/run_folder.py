@@ -160,7 +160,8 @@ def check_run_folder(config: Any, experiment: str) -> None:
 
     Raises:
         ValueError: `output` is not empty, and neither `resume` nor `force` is given. Also if there is nothing to
-            resume, if the resumed run had other options, or if the folder cannot be written.
+            resume, if the resumed run had other options, if the folder cannot be written, or if `force` would remove
+            an input.
     """
     if getattr(config, "resume", False):
         if config.force:
@@ -168,6 +169,7 @@ def check_run_folder(config: Any, experiment: str) -> None:
         _check_same_options(config, find_run(experiment, config.output))
     elif config.output is not None:
         _check_replaceable(config.output, config.force)
+        _check_inputs_stay(config)
 
 
 def find_run(experiment: str, output: Path | None) -> Path:
@@ -335,10 +337,34 @@ def _cannot_write(path: Path, reason: str) -> str:
     return f"cannot write to {path}: {reason}; name another folder with -o"
 
 
+def _check_inputs_stay(config: Any) -> None:
+    """Raises a ValueError where an option names the folder of results, or a file in it that `_clear` removes."""
+    removed = [entry.resolve() for entry in _results_in(config.output)]
+    options = (option if isinstance(option, tuple) else (option,) for option in vars(config).values())
+    for value in itertools.chain(*options):
+        if value is config.output or not isinstance(value, str | Path):
+            continue
+        path = Path(value).resolve()
+        # A text may be a name, such as that of weights.
+        is_folder = isinstance(value, Path) and path == config.output.resolve()
+        if removed and (is_folder or any(path.is_relative_to(entry) for entry in removed)):
+            raise ValueError(f"--force would remove files of {value}, an input: name another folder with -o")
+
+
 def _clear(path: Path) -> None:
     """Removes the results of an earlier run."""
-    for entry in path.iterdir():
-        if entry.name in RESULT_FOLDERS and entry.is_dir():
+    for entry in _results_in(path):
+        if entry.is_dir():
             shutil.rmtree(entry)
-        elif entry.is_file() and entry.suffix in RESULT_SUFFIXES:
+        else:
             entry.unlink()
+
+
+def _results_in(path: Path) -> list[Path]:
+    """Returns the folders and files of an earlier run that a new one replaces; none where there is no folder."""
+    entries = path.iterdir() if path.is_dir() else ()
+    return [
+        entry
+        for entry in entries
+        if (entry.name in RESULT_FOLDERS and entry.is_dir()) or (entry.suffix in RESULT_SUFFIXES and entry.is_file())
+    ]
