@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 
@@ -34,6 +35,16 @@ def test_distances_are_the_smallest_of_all(
 def test_without_points_queries_or_neighbours_nothing_is_found(num_points: int, num_queries: int, k: int) -> None:
     rows, distances = HostTree(np.ones((num_points, 3)), num_threads=2).nearest(np.ones((num_queries, 3)), k)
     assert rows.shape == distances.shape == (num_queries, k)
+
+
+@pytest.mark.parametrize("num_points", [0, 40])
+def test_a_pickled_tree_finds_the_same(num_points: int) -> None:
+    points = np.random.default_rng(0).normal(size=(num_points, 3))
+    tree = HostTree(points, num_threads=1)
+    again = pickle.loads(pickle.dumps(tree))
+    assert again.num_threads == 1
+    k = min(num_points, 3)
+    np.testing.assert_array_equal(again.nearest(points, k), tree.nearest(points, k))
 
 
 @pytest.mark.parametrize("policy", [None, "ACTIVE"])

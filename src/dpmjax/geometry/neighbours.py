@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -179,6 +180,10 @@ class HostTree:
         self._order = _along_curve(self.points) if len(points) >= ORDERED_FROM else None
         ordered = self.points if self._order is None else self.points.take(self._order, axis=0)
         self._tree = small_gicp.KdTree(ordered, num_threads=num_threads) if len(points) > 0 else None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The tree itself cannot be pickled or copied; it is built again.
+        return functools.partial(HostTree, num_threads=self.num_threads), (self.points,)
 
     def nearest(
         self, queries: Float[np.ndarray, "m 3"], k: int
