@@ -111,6 +111,17 @@ def test_names_of_seconds_and_nanoseconds_are_times(form: str) -> None:
     np.testing.assert_allclose(stamps_in_names(files), EPOCH + 1e-9 * stamps_ns, atol=1e-6)
 
 
+@pytest.mark.parametrize("rows", [[2, 1], [1, 1]])
+def test_times_that_do_not_increase_are_doubted(folder: Path, rows: list[int]) -> None:
+    times = EPOCH + 0.1 * np.arange(NUM)
+    write_times(folder, times)
+    assert open_lidar_sequence(folder).notes == ()
+    times[1:3] = times[rows]
+    write_times(folder, times)
+    (note,) = open_lidar_sequence(folder).notes
+    assert f"1 of {NUM} times are not later than the one before, the first is that of scan 2" in note.text
+
+
 @pytest.mark.parametrize("first", [0, 1])
 def test_numbers_of_rows_are_no_times(folder: Path, first: int) -> None:
     times = EPOCH + 0.1 * np.arange(NUM)

@@ -13,7 +13,7 @@ from dpmjax.io.files import log_notes, natural_key
 from dpmjax.io.lidar_datasets import LAYOUTS, Drive3D, find_pose_file, read_learned_folder, read_plain_folder
 from dpmjax.io.lidar_file import check_size, columns_of_drive, read_point_times, read_timed_cloud, unit_note
 from dpmjax.io.poses import read_stamped_poses
-from dpmjax.io.references import camera_note, match_reference
+from dpmjax.io.references import camera_note, match_reference, order_note
 from dpmjax.io.scan_bags import is_bag, open_lidar_bag
 from dpmjax.io.scan_names import folder_note, scan_files
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
@@ -60,8 +60,9 @@ def open_lidar_sequence(
     is_recording = is_bag(path) and not _is_drive(path)
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
     whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
-    note = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
-    notes = whole.notes if note is None else (*whole.notes, note)
+    of_poses = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
+    of_times = None if whole.times is None else order_note(whole.times, path)
+    notes = (*whole.notes, *(note for note in (of_poses, of_times) if note is not None))
     log_notes(notes)
     whole = replace(whole, read_scan=_with_unit_doubt(whole), notes=notes)
     part = whole.take(selection)

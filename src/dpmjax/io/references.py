@@ -196,6 +196,23 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
     return Note(f"{source}: {found}; {advice}", is_doubt=True)
 
 
+def order_note(times: FloatArray, source: str | Path) -> Note | None:
+    """Finds times that do not increase from scan to scan.
+
+    Args:
+        times: (n,) s.
+        source: source for the note.
+
+    Returns:
+        The note, or None.
+    """
+    rows = 1 + np.flatnonzero(np.diff(times) <= 0)
+    if not len(rows):
+        return None
+    found = f"{len(rows)} of {len(times)} times are not later than the one before, the first is that of scan {rows[0]}"
+    return Note(f"{source}: {found}; scans stay in the order of their names, check their times", is_doubt=True)
+
+
 def read_lidar_trajectory(path: str | Path) -> FloatArray:
     """Reads the poses of a drive; those of a camera, which moves along its z axis, are turned into the lidar's axes.
 
