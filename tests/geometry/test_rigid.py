@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry import rigid
+from dpmjax.geometry import rigid, se2, se3
 from tests.tolerances import ACCUMULATED, DOUBLE, ROUNDING
 
 
@@ -94,3 +94,11 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
     rigid.transform_points(np.eye(4, dtype=np.float32), np.ones((5, 3), np.float32))
     with assert_compiles_nothing():
         rigid.transform_points(2 * np.eye(4, dtype=np.float32), np.zeros((5, 3), np.float32))
+
+
+def test_twists_keep_float32_where_jax_has_64_bits(float64) -> None:
+    for twist, algebra in ((jnp.ones(3, jnp.float32), se2), (jnp.ones(6, jnp.float32), se3)):
+        T = rigid.exp(twist)
+        found = algebra.log(se2.from_matrix(T) if algebra is se2 else T)
+        assert T.dtype == found.dtype == np.float32
+        np.testing.assert_allclose(found, twist, **ROUNDING)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -120,3 +122,21 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
     icp(source, source, "plane", np.eye(3, dtype=np.float32))
     with assert_compiles_nothing():
         icp(source + np.float32(0.1), source, "plane", np.eye(3, dtype=np.float32))
+
+
+@pytest.mark.parametrize("metric", ["point", "plane"])
+def test_float32_stays_float32_where_jax_has_64_bits(metric: str, float64) -> None:
+    source, true = surface(2).astype(np.float32), motion(2, 3.0, 0.2)
+    target = apply(true, source).astype(np.float32)
+    result = icp(source, target, metric)
+    gradient = jax.grad(lambda source: icp(source, target, metric).T_target_source.sum())(jnp.asarray(source))
+    assert result.T_target_source.dtype == result.rmse.dtype == gradient.dtype == np.float32
+    assert error_of(result.T_target_source, true, source) < 2e-3
+    assert np.isfinite(gradient).all()
+
+
+def test_a_single_point_moves_the_translation_only() -> None:
+    point = jnp.asarray([[0.1257302, -0.13210486]])
+    derivative = jax.jacfwd(lambda source: icp(source, point, "point").T_target_source)(point)[:, :, 0]
+    np.testing.assert_allclose(derivative[:2, :2], 0.0, atol=1e-6)
+    np.testing.assert_allclose(derivative[:2, 2], -np.eye(2), atol=1e-6)

@@ -11,6 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+from dpmjax.checks import as_float
 from dpmjax.types import AnyArray
 
 
@@ -85,17 +86,18 @@ def exp(tangent: Float[AnyArray, "... k"]) -> Float[Array, "... d1 d1"]:
         tangent: (..., 3) vx, vy, angle in the plane, or (..., 6) vx, vy, vz, wx, wy, wz in space.
 
     Returns:
-        (..., 3, 3) or (..., 4, 4) homogeneous matrices.
+        (..., 3, 3) or (..., 4, 4) homogeneous matrices, dtype of the twist.
 
     Raises:
         ValueError: the twist has neither 3 nor 6 numbers.
     """
-    tangent = jnp.asarray(tangent)
+    tangent = as_float("tangent", tangent)
     groups: dict[int, Any] = {3: jaxlie.SE2, 6: jaxlie.SE3}
     if tangent.shape[-1] not in groups:
         raise ValueError(f"tangent: expected shape (..., 3) or (..., 6), got {tangent.shape}")
     with jax.default_matmul_precision("highest"):
-        return groups[tangent.shape[-1]].exp(tangent).as_matrix()
+        # jaxlie computes in 64 bits wherever JAX has them.
+        return groups[tangent.shape[-1]].exp(tangent).as_matrix().astype(tangent.dtype)
 
 
 @jax.jit

@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from dpmjax.checks import as_float
 from dpmjax.geometry.rigid import namespace_of
 from dpmjax.types import AnyArray
 
@@ -235,8 +235,9 @@ def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     Returns:
         (..., 3), the angle in [-pi, pi].
     """
+    pose_a_b = as_float("pose_a_b", pose_a_b)
     with jax.default_matmul_precision("highest"):
-        return _motion(pose_a_b).log()
+        return _motion(pose_a_b).log().astype(pose_a_b.dtype)
 
 
 @jax.jit
@@ -249,10 +250,11 @@ def log_jacobian(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
     Returns:
         (..., 3, 3).
     """
+    pose_a_b = as_float("pose_a_b", pose_a_b)
     with jax.default_matmul_precision("highest"):
-        return _motion(pose_a_b).jlog()
+        return _motion(pose_a_b).jlog().astype(pose_a_b.dtype)
 
 
-def _motion(pose_a_b: AnyArray) -> jaxlie.SE2:
-    pose_a_b = jnp.asarray(pose_a_b)
+def _motion(pose_a_b: Float[Array, "... 3"]) -> jaxlie.SE2:
+    # jaxlie computes in 64 bits wherever JAX has them.
     return jaxlie.SE2.from_xy_theta(pose_a_b[..., 0], pose_a_b[..., 1], pose_a_b[..., 2])

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
+from dpmjax.checks import as_float
 from dpmjax.geometry import rigid
 from dpmjax.types import AnyArray
 
@@ -32,8 +33,10 @@ def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
     Returns:
         (..., 6) vx, vy, vz, wx, wy, wz, of angle at most pi.
     """
+    T = as_float("T", T)
+    # jaxlie computes in 64 bits wherever JAX has them.
     with jax.default_matmul_precision("highest"):
-        return jaxlie.SE3.from_matrix(jnp.asarray(T)).log()
+        return jaxlie.SE3.from_matrix(T).log().astype(T.dtype)
 
 
 def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
@@ -45,8 +48,9 @@ def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     Returns:
         (..., 6, 6) for tangents (translation, rotation).
     """
+    T = as_float("T", T)
     with jax.default_matmul_precision("highest"):
-        return jaxlie.SE3.from_matrix(jnp.asarray(T)).jlog()
+        return jaxlie.SE3.from_matrix(T).jlog().astype(T.dtype)
 
 
 def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
@@ -58,8 +62,9 @@ def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     Returns:
         (..., 6, 6) for tangents (translation, rotation).
     """
+    T_a_b = as_float("T_a_b", T_a_b)
     with jax.default_matmul_precision("highest"):
-        return jaxlie.SE3.from_matrix(jnp.asarray(T_a_b)).adjoint()
+        return jaxlie.SE3.from_matrix(T_a_b).adjoint().astype(T_a_b.dtype)
 
 
 def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:

@@ -179,10 +179,12 @@ def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, A
     # The balance b(step, clouds) is 0 at the solution: d step = -(db / dstep)^-1 (db / dclouds) dclouds.
     source, target, normals, _ = primals
     T, converged = _solve(metric, *primals)
-    centre, size = rigid.transform_points(T, _mean(source)[None])[0], jnp.maximum(_size(source), _resolution(target))
+    centre, size, least = rigid.transform_points(T, _mean(source)[None])[0], _size(source), _resolution(target)
     dim = source.points.shape[1]
-    # Angles count in lengths at the rim of the cloud, so that all directions have one unit.
-    scales = jnp.where(jnp.arange(dim * (dim + 1) // 2) < dim, 1.0, 1.0 / size).astype(T.dtype)
+    # Angles count in lengths at the rim of the cloud, so that all directions have one unit. A cloud without extent
+    # constrains none.
+    of_angles = jnp.where(size > least, 1.0 / jnp.maximum(size, least), 0.0)
+    scales = jnp.where(jnp.arange(dim * (dim + 1) // 2) < dim, 1.0, of_angles).astype(T.dtype)
 
     def moved(step: Array) -> Array:
         return rigid.compose(_about(scales * step, centre), T)
