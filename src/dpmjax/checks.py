@@ -28,7 +28,12 @@ def as_float(name: str, value: AnyArray) -> jax.Array:
     Raises:
         ValueError: `value` is no array of real numbers.
     """
-    array = jnp.asarray(value)
+    if isinstance(value, np.ndarray):
+        value = value.astype(value.dtype.newbyteorder("="), copy=False)  # JAX takes the processor's byte order only.
+    try:
+        array = jnp.asarray(value)
+    except TypeError as error:
+        raise ValueError(f"{name}: expected real numbers, got dtype {np.asarray(value).dtype}") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array
     if jnp.issubdtype(array.dtype, jnp.integer):

@@ -164,3 +164,15 @@ def test_wrong_arguments_are_named(as_user) -> None:
         k_nearest(jnp.ones((3, 3)), jnp.ones((4, 3)), 0)
     with pytest.raises(ValueError, match="^radius: expected a number above 0"):
         radius_search(jnp.ones((3, 3)), jnp.ones((4, 3)), 0.0, 1)
+
+
+def test_arrays_of_another_byte_order_are_the_same_numbers() -> None:
+    queries, points = clouds(0, 3)
+    swapped = (array.astype(array.dtype.newbyteorder()) for array in (queries, points))
+    np.testing.assert_array_equal(k_nearest(*swapped, 3).indices, k_nearest(queries, points, 3).indices)
+
+
+@pytest.mark.parametrize("dtype", [object, str, bool, complex])
+def test_arrays_without_real_numbers_are_named(as_user, dtype: type) -> None:
+    with pytest.raises(ValueError, match="^queries: expected real numbers, got dtype"):
+        k_nearest(np.ones((3, 2)).astype(dtype), np.ones((3, 2)), 1)

@@ -95,3 +95,5 @@ def test_wrong_arguments_are_named(as_user) -> None:
         chamfer_distance(jnp.ones((4, 2)), jnp.ones((4, 3)))
     with pytest.raises(ValueError, match="^mask_b: expected bool of shape"):
         chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), None, jnp.ones(4, bool))
+    with pytest.raises(ValueError, match="^max_distance: expected a number above 0"):
+        chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), max_distance=-1.0)

@@ -134,3 +134,9 @@ def test_scans_recorded_twice_and_a_standing_robot_add_no_scan() -> None:
     found = choose_scans(ScanSet(noisy, walk.mask[standing]), true[standing], 1.0, 0.5)
     np.testing.assert_array_equal(standing[found.chosen], np.arange(12))
     np.testing.assert_allclose(found.between(true), true[standing], atol=1e-9)
+
+
+def test_equal_scans_are_refused(as_user) -> None:
+    points = np.repeat(np.random.default_rng(0).normal(size=(1, 40, 2)), 3, axis=0).astype(np.float32)
+    with pytest.raises(ValueError, match="^scans: expected two different ones, got 3"):
+        choose_scans(ScanSet(points, np.ones((3, 40), bool)), None, 1.0, 1.0)

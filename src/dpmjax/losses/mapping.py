@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import as_float, as_mask, as_points
+from dpmjax.checks import as_float, as_mask, as_points, require_positive
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.types import AnyArray
@@ -39,11 +39,13 @@ def chamfer_distance(
         distance is taken as 0.
 
     Raises:
-        ValueError: the shapes do not match.
+        ValueError: the shapes do not match, or `max_distance` is not above 0.
     """
     a, b = as_points("a", a), as_points("b", b)
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"b: expected {a.shape[1]} columns like a, got {b.shape[1]}")
+    if max_distance is not None:
+        require_positive("max_distance", max_distance)
     limit = jnp.asarray(jnp.inf if max_distance is None else max_distance, a.dtype)
     return _chamfer_distance(
         a, b, as_mask("mask_a", mask_a, a.shape[:1]), as_mask("mask_b", mask_b, b.shape[:1]), limit

@@ -187,8 +187,9 @@ def register_scans(
         RegisteredScans.
 
     Raises:
-        ValueError: the scans, the start or the odometry have a wrong shape or are not finite, or a scan has no valid
-            beam. Also if there is no odometry to start from, or if the start needs an order that the scans do not have.
+        ValueError: the scans, the start or the odometry have a wrong shape or are not finite, a scan has no valid
+            beam, or all scans are equal. Also if there is no odometry to start from, or if the start needs an order
+            that the scans do not have.
     """
     config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
     all_scans = as_scan_set(scans)

@@ -101,9 +101,14 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
 
     Returns:
         Recording; a scan that repeats the scan before is not registered, and has the pose of that scan.
+
+    Raises:
+        ValueError: all scans are equal.
     """
     originals = find_originals(scans)
     rows = np.unique(originals)
+    if len(rows) < 2:
+        raise ValueError(f"scans: expected two different ones, got {len(originals)} that are equal beam by beam")
     if motion is None:
         return Recording(scans, rows, None, originals)
     chosen = choose_by_motion(motion[rows], min_distance, min_turn)
