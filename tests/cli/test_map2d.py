@@ -199,12 +199,14 @@ def test_a_truncated_cloud_is_named(as_user, walk, tmp_path, capsys) -> None:
 
 @pytest.mark.parametrize(
     ("spoil", "found"),
-    [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan")],
+    [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan"), ("all_equal", "all scans are equal")],
 )
-def test_scans_without_a_valid_beam_are_refused(as_user, walk, tmp_path, capsys, spoil, found) -> None:
+def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_path, capsys, spoil, found) -> None:
     points = np.where(walk.mask[..., None], walk.points, 0.0)
     if spoil == "one_scan":
         points = points[:1]
+    elif spoil == "all_equal":
+        points[:] = points[:1]
     else:
         points[:] = np.nan if spoil == "all_nan" else 0.0
     np.save(tmp_path / "scans.npy", points)

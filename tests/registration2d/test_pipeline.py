@@ -238,7 +238,7 @@ def test_scans_without_an_order_refuse_starts_that_need_one(few, start: str) -> 
 def test_one_scan_recorded_again_and_again_is_refused(few) -> None:
     points = np.repeat(few.points[:1], 3, axis=0)
     for odometry in (None, np.zeros((3, 3))):
-        with pytest.raises(ValueError, match="^scans: expected at least 2"):
+        with pytest.raises(ValueError, match="^scans: expected two different ones, got 3"):
             register_scans(points, SHORT, key=KEY, odometry=odometry)
 
 

@@ -210,7 +210,11 @@ def read_scans(config: Config) -> ScanSequence:
     """Returns the chosen scans of DATA or of the built-in world."""
     chosen = config.selection
     if config.data is not None:
-        return io.read_sequence(config.data, selection=chosen, topic=config.topic)
+        sequence = io.read_sequence(config.data, selection=chosen, topic=config.topic)
+        first = sequence.take(slice(1))
+        if (sequence.points == first.points).all() and (sequence.mask == first.mask).all():
+            raise ValueError(f"{config.data}: all scans are equal beam by beam; give scans of a robot that moves")
+        return sequence
     sequence = simulation.simulate_sequence(
         config.world, chosen.stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
     )

@@ -60,7 +60,7 @@ def read_sequence(
     Raises:
         InputError: one line with the file, the finding and the advice. The file is missing, of an unknown format or
             damaged, or an argument is out of range. Also for too few scans or beams, a scan without a valid beam, scans
-            of a single point, equal scans, or impossible lengths.
+            of a single point, or impossible lengths.
     """
     path = Path(path)
     start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
@@ -153,8 +153,6 @@ def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) ->
     points = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
     differ = (sequence.points != points[:, None]).any(axis=2) & sequence.mask
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
-    is_new = (sequence.points != sequence.points[:1]).any() or (sequence.mask != sequence.mask[:1]).any()
-    require(is_new, path, "all scans are one and the same, beam by beam", "give scans of a robot that moves")
 
 
 def _check_unit(sequence: ScanSequence, path: Path) -> list[Note]:
