@@ -235,6 +235,15 @@ def test_scans_without_an_order_refuse_starts_that_need_one(few, start: str) -> 
         register(few, unordered, odometry=few.reference_poses)
 
 
+def test_the_registration_is_the_same_where_jax_has_64_bits(few, float64) -> None:
+    with jax.enable_x64(False):
+        expected = register_scans(few.points, SHORT, key=KEY)
+    found = register_scans(few.points, SHORT, key=KEY)
+    np.testing.assert_array_equal(found.poses, expected.poses)
+    start = incremental_icp(planar_scans(scan_set(few))).poses
+    np.testing.assert_allclose(refine(planar_scans(scan_set(few)), start).poses, found.poses, atol=0.5)
+
+
 def test_one_scan_recorded_again_and_again_is_refused(few) -> None:
     points = np.repeat(few.points[:1], 3, axis=0)
     for odometry in (None, np.zeros((3, 3))):

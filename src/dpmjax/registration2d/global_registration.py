@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import jax
 import numpy as np
 import scipy.spatial
 from jaxtyping import Float
@@ -99,6 +100,7 @@ class _Task(NamedTuple):
         return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
 
 
+@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) -> GlobalRegistration:
     """Registers all scans without initial poses.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from dpmjax.geometry import se2
@@ -38,6 +39,7 @@ class IncrementalResult(NamedTuple):
     steps: PairMatches
 
 
+@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def incremental_icp(
     scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None, prior: StepPrior | None = None
 ) -> IncrementalResult:

@@ -157,6 +157,7 @@ class RegisteredScans(NamedTuple):
         return se2.to_matrix(self.poses)
 
 
+@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def register_scans(
     scans: ScanSet | ArrayLike,
     config: RegistrationConfig | None = None,

@@ -114,6 +114,7 @@ class PlanarScans(flax.struct.PyTreeNode):
         return self.replace(**{name: getattr(self, name)[kept] for name in names})
 
 
+@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is_ordered: bool = True) -> PlanarScans:
     """Prepares planar scans for registration: fits lines, measures noise and typical range.
 

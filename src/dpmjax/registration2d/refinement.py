@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -67,6 +68,7 @@ class Refined(NamedTuple):
         return se2.to_matrix(self.poses)
 
 
+@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def refine(
     scans: PlanarScans | ScanSet | ArrayLike,
     poses: ArrayLike,
