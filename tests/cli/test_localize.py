@@ -166,6 +166,20 @@ def test_a_stopped_run_is_interrupted(case, tmp_path, monkeypatch) -> None:
     assert load_json(tmp_path / "out" / "metrics.json")["status"] == "interrupted"
 
 
+def test_a_damaged_scan_leaves_the_results_so_far(case, tmp_path, capsys) -> None:
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    scans.mkdir()
+    drive = open_lidar_sequence(scans_of(case))
+    for number in range(2):
+        np.save(scans / f"{number}.npy", drive.read_points(number))
+    (scans / "1.npy").write_bytes((scans / "1.npy").read_bytes()[:-30])
+    arguments = (case / "map.npz", scans, "--weights", case / "model.safetensors", "-o", out)
+    assert run(*arguments) == EXIT_FAILED
+    assert "1.npy" in capsys.readouterr().err.splitlines()[-1]
+    assert load_json(out / "metrics.json")["num_scans"] == 1
+    assert (out / "trajectory_tum.txt").exists()
+
+
 def test_scans_without_points_are_a_failure(case, tmp_path, capsys) -> None:
     """The map is fine; nothing could be looked for."""
     scans, out = tmp_path / "scans", tmp_path / "out"

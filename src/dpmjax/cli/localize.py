@@ -86,15 +86,17 @@ def main(config: Config) -> None:
     ):
         notes = cli.report_notes(drive.notes)
         clock = time.perf_counter()
-        while len(rows) < len(drive) and not stop.is_requested:
-            row = as_row(len(rows), case, next(results), time.perf_counter() - clock)
-            clock = time.perf_counter()
-            table.append(**row)
-            rows.append(row)
-            bar.update(1)
-            bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        bar.close()  # so that the result stands below it
-        print(write_found(folder, config, case, rows, notes))
+        try:
+            while len(rows) < len(drive) and not stop.is_requested:
+                row = as_row(len(rows), case, next(results), time.perf_counter() - clock)
+                clock = time.perf_counter()
+                table.append(**row)
+                rows.append(row)
+                bar.update(1)
+                bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
+        finally:  # also where a scan cannot be read
+            bar.close()  # so that the result stands below it
+            print(write_found(folder, config, case, rows, notes))
         if _are_all_empty(rows) and not stop.is_requested:
             found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
             raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
