@@ -93,6 +93,7 @@ def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None
     [
         ((), "model.safetensors", "two or more maps"),
         (("a.npz",), "model.safetensors", "two or more maps"),
+        (("a.npz", "b.npz", "a.npz"), "model.safetensors", "a.npz is given twice"),
         (("a.npz", "none.npz"), "model.safetensors", "none.npz: no such file"),
         (("a.npz", "model.safetensors"), "model.safetensors", "model.safetensors"),
         (("a.npz", "b.npz"), "none.safetensors", "none.safetensors"),

@@ -43,6 +43,9 @@ def main(config: Config) -> None:
     started = time.perf_counter()
     if len(config.maps) < 2:
         raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
+    for number, path in enumerate(config.maps):
+        if path.resolve() in [before.resolve() for before in config.maps[:number]]:
+            raise ValueError(f"{path} is given twice; give each map once")
     methods = slam.make_methods(weights.load_model(config.weights), weights=config.weights)
     maps = [cli.open_map(path, methods) for path in config.maps]
     folder = cli.open_run_folder(config, NAME)
