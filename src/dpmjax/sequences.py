@@ -69,15 +69,7 @@ def require(is_good: bool | np.bool_, source: str | Path, found: str, advice: st
 
 
 def counted(number: int, noun: str) -> str:
-    """Returns a number with its noun, in the plural unless the number is 1.
-
-    Args:
-        number: the number.
-        noun: its noun in the singular.
-
-    Returns:
-        Text for messages and pictures.
-    """
+    """Returns a number with its noun, which is given in the singular, in the plural unless the number is 1."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 

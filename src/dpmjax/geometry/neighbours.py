@@ -175,8 +175,8 @@ class HostTree:
     def __init__(self, points: Float[np.ndarray, "n 3"], *, num_threads: int = 2) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
         self.num_threads = num_threads
-        # Where a tree is larger than a cache, points near in space lie together, and are searched one after another: a
-        # quarter less time.
+        # Where a tree is larger than a cache, points near in space lie together, and are searched one after another:
+        # neighbours are found in less time.
         self._order = _along_curve(self.points) if len(points) >= ORDERED_FROM else None
         ordered = self.points if self._order is None else self.points.take(self._order, axis=0)
         self._tree = small_gicp.KdTree(ordered, num_threads=num_threads) if len(points) > 0 else None
