@@ -67,7 +67,7 @@ class LocalizationConfig:
     num_similar: int = 16
     num_registered: int = 8
     min_support: int = 2
-    min_best: float = 0.95
+    min_best: float = 0.98
 
     def __post_init__(self) -> None:
         require_fields(self, "num_similar", "num_registered", "min_support", low=1)
