@@ -25,7 +25,7 @@ STRANGERS = range(len(ROUND) + len(OTHERS), len(TRUTH))
 
 
 def methods(gross_share: float, seed: int = 0) -> SlamMethods:
-    matcher = TruthMatcher(TRUTH, gross_share=gross_share, seed=seed, least_probability=0.9)
+    matcher = TruthMatcher(TRUTH, gross_share=gross_share, seed=seed, least_probability=0.98)
     return SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig())
 
 
@@ -62,7 +62,7 @@ def test_scans_of_another_place_are_not_found(slam_map, seed) -> None:
 class SeeingMatcher(TruthMatcher):
     """The share of points that meet planes falls with the distance of the two scans."""
 
-    probability: float = 0.97
+    probability: float = 0.99
     nearest_share: float = 0.6
     share_per_m: float = 0.03
 
@@ -74,7 +74,7 @@ class SeeingMatcher(TruthMatcher):
 
 
 @pytest.mark.parametrize(
-    ("nearest_share", "probability", "is_found"), [(0.6, 0.97, True), (0.3, 0.97, False), (0.6, 0.85, False)]
+    ("nearest_share", "probability", "is_found"), [(0.6, 0.99, True), (0.3, 0.99, False), (0.6, 0.85, False)]
 )
 def test_a_clear_registration_whose_scans_agree_is_supported_by_those_farther_off(
     slam_map, nearest_share, probability, is_found
