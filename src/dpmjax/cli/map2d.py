@@ -211,8 +211,7 @@ def read_scans(config: Config) -> ScanSequence:
     chosen = config.selection
     if config.data is not None:
         sequence = io.read_sequence(config.data, selection=chosen, topic=config.topic)
-        first = sequence.take(slice(1))
-        if (sequence.points == first.points).all() and (sequence.mask == first.mask).all():
+        if not registration2d.find_originals(results.scan_set_of(sequence)).any():
             raise ValueError(f"{config.data}: all scans are equal beam by beam; give scans of a robot that moves")
         return sequence
     sequence = simulation.simulate_sequence(

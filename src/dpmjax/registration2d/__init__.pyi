@@ -25,6 +25,7 @@ from .recordings import Recording as Recording
 from .recordings import align_between as align_between
 from .recordings import choose_by_motion as choose_by_motion
 from .recordings import fill_between as fill_between
+from .recordings import find_originals as find_originals
 from .refinement import Refined as Refined
 from .refinement import RefinementConfig as RefinementConfig
 from .refinement import refine as refine
