@@ -315,6 +315,14 @@ def test_padding_changes_nothing(kernel: Kernel) -> None:
     assert_close(jax.jit(lambda arrays: kernel.call(**arrays))(padded(kernel, arrays)), kernel.call(**arrays))
 
 
+@pytest.mark.parametrize("name", ["weighted_svd", "estimate_normals", "info_nce", "icp to planes"])
+def test_half_precision_is_computed_in_float32(name: str) -> None:
+    kernel = KERNELS[name]
+    half = example(kernel, dtype=jnp.bfloat16)
+    rounded = {name: jnp.asarray(value, example(kernel)[name].dtype) for name, value in half.items()}
+    assert_close(kernel.call(**half), kernel.call(**rounded))
+
+
 def total(kernel: Kernel, arrays: Arrays) -> Any:
     """A weighted sum of all numbers that a kernel returns."""
     leaves = map(jnp.asarray, jax.tree.leaves(kernel.call(**arrays)))

@@ -16,7 +16,7 @@ from dpmjax.types import AnyArray, ScanSet
 
 
 def as_float(name: str, value: AnyArray) -> jax.Array:
-    """Makes a JAX float array; floating dtypes are kept, integers become the default float.
+    """Makes a JAX float array; half precision becomes float32, integers the default float, others are kept.
 
     Args:
         name: name of the argument, for messages.
@@ -35,7 +35,7 @@ def as_float(name: str, value: AnyArray) -> jax.Array:
     except TypeError as error:
         raise ValueError(f"{name}: expected real numbers, got dtype {np.asarray(value).dtype}") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
-        return array
+        return array.astype(jnp.promote_types(array.dtype, jnp.float32))  # Decompositions need 32 bits.
     if jnp.issubdtype(array.dtype, jnp.integer):
         return array.astype(float)
     raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
