@@ -177,8 +177,8 @@ class Registration:
         verification: agreement of the scans themselves; None where only descriptors were registered.
         weak_direction: the horizontal direction in which the translation is least certain, as a unit vector in the
             target frame; in a corridor its axis. None where only descriptors were registered.
-        weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet; None in the same
-            case.
+        weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet and how far parts
+            of the scans disagree. It does not cover other places that look alike. None in the same case.
     """
 
     T_target_source: Float[Array, "4 4"]

@@ -24,6 +24,14 @@ NUM_INDEPENDENT = 200
 
 MIN_SIGMA_M = 0.01
 
+# Residuals are independent between cubes of this size, not within one.
+CUBE_M = 8.0
+# Errors of simulated pairs over those that the scatter of residuals explains: two scans do not measure the same planes.
+SCATTER_FACTOR = 5.0
+
+# Fewer planes constrain no motion.
+MIN_PLANES = 6
+
 # One normal of each voxel counts, so that many points of a near wall do not outweigh a far one.
 VOXEL_M = 1.0
 
@@ -77,6 +85,32 @@ def diagonal_information(sigma_m: float, sigma_rad: float) -> Information:
 UNKNOWN = diagonal_information(10.0, 1.0)
 
 
+class _PlaneSystem(NamedTuple):
+    """Residuals of an alignment to planes, over their standard deviation.
+
+    Attributes:
+        points: (m, 3) points that meet planes, in the frame of the source.
+        jacobian: (m, 6) derivatives by the tangent of the source, translation first.
+        residuals: (m,) distances to the planes.
+    """
+
+    points: Float[np.ndarray, "m 3"]
+    jacobian: Float[np.ndarray, "m 6"]
+    residuals: Float[np.ndarray, " m"]
+
+
+def _plane_system(pairs: PlanePairs, T_target_source: Pose) -> _PlaneSystem:
+    """Keeps the pairs that meet, none if these are too few; both functions below say what the arguments are."""
+    is_used = np.abs(pairs.residuals) < PLANE_DISTANCE_M
+    is_used &= is_used.sum() >= MIN_PLANES
+    normals = pairs.normals[is_used] @ T_target_source[:3, :3]
+    points = (pairs.points[is_used] - T_target_source[:3, 3]) @ T_target_source[:3, :3]
+    jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
+    residuals = pairs.residuals[is_used]
+    sigma_m = max(float(np.linalg.norm(residuals)) / np.sqrt(max(len(residuals), 1)), MIN_SIGMA_M)
+    return _PlaneSystem(points, jacobian / sigma_m, residuals / sigma_m)
+
+
 def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
     """Computes the normal equations of point-to-plane residuals.
 
@@ -87,15 +121,30 @@ def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
     Returns:
         Inverse covariance in the tangent of the source, translation first.
     """
-    is_used = np.abs(pairs.residuals) < PLANE_DISTANCE_M
-    if is_used.sum() < 6:
-        return UNKNOWN.copy()
-    normals = pairs.normals[is_used] @ T_target_source[:3, :3]
-    points = (pairs.points[is_used] - T_target_source[:3, 3]) @ T_target_source[:3, :3]
-    jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
-    variance = max(float(np.mean(pairs.residuals[is_used] ** 2)), MIN_SIGMA_M**2)
-    system = NUM_INDEPENDENT / len(jacobian) / variance * jacobian.T @ jacobian
-    return np.asarray(system + UNKNOWN)
+    jacobian = _plane_system(pairs, T_target_source).jacobian
+    return np.asarray(NUM_INDEPENDENT / max(len(jacobian), 1) * jacobian.T @ jacobian + UNKNOWN)
+
+
+def scattered_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
+    """Computes the inverse covariance of an alignment where parts of space disagree on the motion, as foliage does.
+
+    The covariance of Liang and Zeger (1986) is that of the gradients of cubes of space. It is zero where one cube alone
+    holds a direction, so that of `plane_information` is added.
+
+    Args:
+        pairs: pairs under the motion, as in `plane_information`.
+        T_target_source: the motion.
+
+    Returns:
+        Inverse covariance in the tangent of the source, translation first.
+    """
+    points, jacobian, residuals = _plane_system(pairs, T_target_source)
+    covariance = np.linalg.inv(jacobian.T @ jacobian + UNKNOWN)
+    cubes, inverse = np.unique(np.floor(points / CUBE_M), axis=0, return_inverse=True)
+    gradients = np.zeros((len(cubes), 6))
+    np.add.at(gradients, inverse.ravel(), jacobian * residuals[:, None])
+    scatter = SCATTER_FACTOR * covariance @ gradients.T
+    return np.asarray(np.linalg.inv(np.linalg.inv(plane_information(pairs, T_target_source)) + scatter @ scatter.T))
 
 
 def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, radius_m: float) -> WeakDirection:
@@ -119,7 +168,7 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
     horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]
     direction = np.linalg.eigh(horizontal @ covariance @ horizontal.T)[1][:, 1] @ horizontal
     held = without_noise_along(pairs, direction, np.ones(len(pairs.residuals), bool))
-    return WeakDirection(direction, sigma_along(plane_information(held, T_target_source), R.T @ direction))
+    return WeakDirection(direction, sigma_along(scattered_information(held, T_target_source), R.T @ direction))
 
 
 def without_noise_along(

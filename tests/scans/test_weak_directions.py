@@ -1,0 +1,59 @@
+"""The covariance of an alignment against the scatter of alignments with other noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpmjax.scans.surface_alignment import PlanePairs
+from dpmjax.scans.weak_directions import (
+    CUBE_M,
+    SCATTER_FACTOR,
+    UNKNOWN,
+    plane_information,
+    scattered_information,
+    sigma_along,
+)
+
+IDENTITY = np.eye(4)
+
+
+def walls(rng: np.random.Generator, num: int = 1500) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals of the walls and the floor of a hall, 60 by 40 by 8 m."""
+    axis = rng.integers(0, 3, num)
+    points = rng.uniform(-1, 1, (num, 3)) * [30.0, 20.0, 4.0]
+    side = np.where(axis == 2, -1.0, rng.choice([-1.0, 1.0], num))
+    points[np.arange(num), axis] = side * np.array([30.0, 20.0, 4.0])[axis]
+    return points, np.eye(3)[axis]
+
+
+def test_sigma_covers_alignments_whose_cubes_disagree() -> None:
+    rng = np.random.default_rng(0)
+    points, normals = walls(rng)
+    cubes = np.unique(np.floor(points / CUBE_M), axis=0, return_inverse=True)[1].ravel()
+    jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
+    errors, variances, before = [], [], []
+    for _ in range(300):
+        residuals = rng.normal(0, 0.05, cubes.max() + 1)[cubes] + rng.normal(0, 0.01, len(points))
+        step = np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
+        pairs = PlanePairs(points, residuals - jacobian @ step, normals)
+        before.append(np.linalg.inv(plane_information(pairs, IDENTITY))[0, 0])
+        variances.append(sigma_along(scattered_information(pairs, IDENTITY), np.array([1.0, 0, 0])) ** 2 - before[-1])
+        errors.append(step[0])
+    assert np.sqrt(np.mean(before)) < np.std(errors)
+    # One cube of many disagrees with the rest as the motion does, so that the scatter is some percent too small.
+    np.testing.assert_allclose(np.sqrt(np.mean(variances)), SCATTER_FACTOR * np.std(errors), rtol=0.2)
+
+
+def test_one_cube_alone_is_as_uncertain_as_its_planes() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(0, CUBE_M, (200, 3))
+    normals = np.tile([1.0, 0, 0], (200, 1))
+    pairs = PlanePairs(points, np.full(200, 1e-9), normals)
+    by_planes, scattered = plane_information(pairs, IDENTITY), scattered_information(pairs, IDENTITY)
+    np.testing.assert_allclose(scattered, by_planes, rtol=1e-6, atol=1e-6)
+
+
+def test_few_planes_constrain_nothing() -> None:
+    pairs = PlanePairs(np.ones((5, 3)), np.zeros(5), np.eye(3)[[0, 1, 2, 0, 1]])
+    np.testing.assert_allclose(plane_information(pairs, IDENTITY), UNKNOWN)
+    np.testing.assert_allclose(scattered_information(pairs, IDENTITY), UNKNOWN)
