@@ -24,7 +24,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli
 from dpmjax.geometry import se2
-from dpmjax.registration2d import DEEPMAPPING
+from dpmjax.registration2d import DEEPMAPPING, START_NAMES
 from dpmjax.simulation import scan_world, simulate_odometry
 
 EXPERIMENT = "deepmapping_logs"
@@ -69,6 +69,7 @@ def main(config: Config) -> list[cli.Row]:
         raise ValueError("no log: name a folder of logs, a log, or --corridors")
     if len(set(names)) < len(names):
         raise ValueError(f"{len(names)} logs have {len(set(names))} different names; a name has one row for each start")
+    cli.check_names("--inits", config.inits, ("auto", *START_NAMES))
     corrected = {} if config.corrected is None else {drive_of(log): log for log in logs_of(config.corrected)}
     by_name: dict[str, Path | int] = dict(zip(names, (*logs, *config.corridors), strict=True))
 
@@ -79,7 +80,10 @@ def main(config: Config) -> list[cli.Row]:
         return _run(run, path, init, corrected.get(drive_of(path)), config)
 
     cases = [{"log": name, "init": init} for name, init in itertools.product(names, config.inits)]
-    return cli.run_table(config, EXPERIMENT, cases, work, report)
+    rows = cli.run_table(config, EXPERIMENT, cases, work, report)
+    if not any("num_scans" in row for row in rows):
+        raise ValueError("every run was refused, for the reasons above")
+    return rows
 
 
 def logs_of(folder: Path) -> list[Path]:
@@ -115,9 +119,10 @@ def _run(table: cli.TableRun, log: Path, init: str, corrected: Path | None, conf
 
 
 def report(rows: list[cli.Row]) -> cli.Summary:
-    """Returns the table and the shares of trust; runs that were refused are left out."""
+    """Returns the table and the shares of trust; runs that were refused are named below it."""
     done = [row for row in rows if "num_scans" in row]
-    text = "\n".join([cli.markdown(COLUMNS, map(_cells, done)), *trust_lines(done)])
+    refused = [f"refused: {row['log']} from {row['init']}" for row in rows if "num_scans" not in row]
+    text = "\n".join([cli.markdown(COLUMNS, map(_cells, done)), *trust_lines(done), *refused])
     return cli.Summary({}, text, rows=done)
 
 

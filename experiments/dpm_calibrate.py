@@ -63,7 +63,7 @@ NUM_PAIRS, NUM_OVERLAP_PAIRS = 30, 96
 class Config(cli.RunOptions):
     """Options of the run."""
 
-    model: Annotated[Positional[str], arg(metavar="NAME|FILE")]
+    model: Annotated[Positional[str], arg(metavar="NAME|FILE")] = "dpm_small"
     """The model: a .safetensors file, or the name of a shipped one."""
 
     def __post_init__(self) -> None:

@@ -16,6 +16,7 @@ from functools import partial
 from typing import Annotated, Any, get_args
 
 import numpy as np
+from tqdm import tqdm
 from tyro.conf import arg
 
 from dpmjax import cli, viz
@@ -57,7 +58,8 @@ def main(config: Config) -> None:
         paper = dm.ToyConfig(num_steps=config.steps)
         ends, figure = run_paper(paper, config)
         variants = []
-        for initialization, rate in itertools.product(get_args(dm.Initialization), LEARNING_RATES):
+        settings = list(itertools.product(get_args(dm.Initialization), LEARNING_RATES))
+        for initialization, rate in tqdm(settings, desc="initialisations and learning rates", dynamic_ncols=True):
             runs = descend(replace(paper, initialization=initialization, learning_rate=rate), config)
             shares = {form: share_at_minimum(run.poses) for form, run in runs.items()}
             variants.append({"initialization": initialization, "learning_rate": rate, **shares})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,27 @@ def as_float(name: str, value: AnyArray) -> jax.Array:
     if jnp.issubdtype(array.dtype, jnp.integer):
         return array.astype(float)
     raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
+
+
+def as_key(name: str, value: Any) -> jax.Array:
+    """Makes a typed key of random numbers.
+
+    Args:
+        name: name of the argument, for messages.
+        value: a key of `jax.random.key`, or of the older `jax.random.PRNGKey`.
+
+    Returns:
+        The key.
+
+    Raises:
+        ValueError: `value` is something else.
+    """
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        return cast(jax.Array, value)
+    if dtype == jnp.uint32 and value.ndim == 1:
+        return jax.random.wrap_key_data(value)
+    raise ValueError(f"{name}: expected a key such as jax.random.key(0), got {type(value).__name__}")
 
 
 def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = None) -> jax.Array:
@@ -119,7 +140,10 @@ def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
     Raises:
         ValueError: the shape is another one, or a valid beam of a ScanSet is not finite.
     """
-    points: Any = value.points if isinstance(value, ScanSet) else np.asarray(value, np.float32)
+    try:
+        points: Any = value.points if isinstance(value, ScanSet) else np.asarray(value, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected numbers (n, b, 2), got {type(value).__name__}") from error
     if points.ndim != 3 or points.shape[-1] != 2:
         raise ValueError(f"{name}: expected shape (n, b, 2), got {points.shape}")
     if isinstance(value, ScanSet):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dpmjax.cli import depth_errors
@@ -38,6 +39,14 @@ def test_a_turned_camera_is_the_largest_error_of_a_turn(walk) -> None:
     assert found["largest_turn_error_deg"] == pytest.approx(7.0, abs=1e-6)
     assert found["ate_m"] < 1e-9
     assert found["point_distance_m"] > 0.02
+
+
+def test_a_blank_image_is_named(tmp_path) -> None:
+    np.savetxt(tmp_path / "intrinsics.txt", [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    for name, depth_mm in (("1", 2000), ("2", 0), ("3", 2000)):
+        Image.fromarray(np.full((48, 64), depth_mm, np.uint16)).save(tmp_path / f"{name}.depth.png")
+    with pytest.raises(InputError, match=r"2\.depth\.png: no pixel measures up to .* leave out such images, 1 of 3"):
+        read_images(Config(data=tmp_path))
 
 
 def test_a_folder_without_images_is_refused_and_a_selection_is_taken(tmp_path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -77,6 +79,21 @@ def test_earlier_run_is_refused_resumed_or_replaced(tmp_path):
     assert sorted(path.name for path in run.path.iterdir()) == ["config.json", "notes.md"]
 
 
+def test_no_second_process_may_write_a_run_before_the_first_one_ends(tmp_path):
+    folder = open_run(output=tmp_path / "out")
+    program = (
+        "import sys; from pathlib import Path; from dpmjax import cli\n"
+        "try: cli.open_run_folder(cli.RunOptions(output=Path(sys.argv[1]), resume=True), 'toy')\n"
+        "except ValueError as error: print(error)"
+    )
+    other = [sys.executable, "-c", program, str(folder.path)]
+    said = subprocess.run(other, capture_output=True, text=True, check=True).stdout
+    assert said == f"{folder.path}: another process is writing this run; let it end, or stop it\n"
+    with recording(folder):
+        pass
+    assert subprocess.run(other, capture_output=True, text=True, check=True).stdout == ""
+
+
 def test_force_never_touches_a_folder_that_is_no_run(tmp_path):
     (tmp_path / "thesis.txt").write_text("years")
     with pytest.raises(ValueError, match="no earlier run"):
@@ -102,7 +119,7 @@ def test_a_run_that_was_killed_before_it_had_a_configuration_may_start_again(tmp
 
 
 def test_resume_takes_the_latest_run_and_refuses_other_options():
-    with pytest.raises(ValueError, match="nothing to resume"):
+    with pytest.raises(ValueError, match="is no run of"):
         open_run(resume=True)
     first = open_run(seed=1)
     assert open_run(seed=1, resume=True).path.resolve() == first.path.resolve()

@@ -107,7 +107,7 @@ def test_help_shows_examples(capsys) -> None:
         (["--sequence", "00"], "--sequence"),
         (["/no/such/folder"], "no such file or folder"),
         (["--weights", "no_such_model"], "no_such_model"),
-        (["--resume", "-o", "/no/such/run"], "nothing to resume"),
+        (["--resume", "-o", "/no/such/run"], "it is no run of slam"),
     ],
 )
 def test_wrong_usage_is_one_line(options, message, capsys) -> None:

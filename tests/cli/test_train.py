@@ -253,6 +253,14 @@ def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
         train_run.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
 
 
+def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_run.draw_sets(TRAINING, 2, [], length_m=100.0, on_wait=stop)
+
+
 @pytest.mark.parametrize("num_drives", [1, 2])
 def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, num_drives: int) -> None:
     def stop() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -34,7 +36,8 @@ def returning(T: np.ndarray, scans: DepthScans) -> Callable[..., dm.Fit]:
     poses[:, :3, 3] /= typical_range(scans.points, scans.mask)
 
     def engine(problem, data, *, key):
-        return dm.fit(problem, data, key=key, stop=lambda: True)._replace(poses=poses)
+        done = dm.fit(problem, data, key=key, stop=lambda: True)
+        return done._replace(poses=poses, state=done.state.replace(step=jnp.ones((), jnp.int32)))
 
     return engine
 
@@ -48,6 +51,15 @@ def test_of_start_and_fit_the_more_consistent_one_is_kept(walk, scans) -> None:
         np.testing.assert_allclose(found.T_world_scan, right, atol=1e-6)
         assert (found.misfit < found.start_misfit) == (kept == "fit")
         assert found.misfit == pytest.approx(1.0 - float(projective_consistency(scans, fitted)), abs=1e-4)
+
+
+def test_a_fit_without_a_step_is_not_kept(walk, scans) -> None:
+    apart = np.array(walk.T_world_camera)
+    apart[:, 0, 3] += np.arange(4.0)
+    engine = partial(dm.fit, stop=lambda: True)
+    found = dm.register_depth(scans, CONFIG, key=KEY, start=apart, engine=engine)
+    assert found.kept == "start"
+    np.testing.assert_array_equal(found.T_world_scan, apart)
 
 
 def test_a_fit_that_is_not_finite_is_not_kept(walk, scans) -> None:

@@ -106,6 +106,20 @@ def test_each_of_several_starts_is_a_fit_of_its_own() -> None:
     assert together.state.step.tolist() == [80, 80, 80]
 
 
+def test_an_older_key_is_the_same_key_and_a_number_is_refused() -> None:
+    older = fit(valley(), jnp.zeros(()), key=jax.random.PRNGKey(3))
+    np.testing.assert_array_equal(older.poses, fit(valley(), jnp.zeros(()), key=jax.random.key(3)).poses)
+    with pytest.raises(ValueError, match=r"^key: expected a key such as jax.random.key\(0\), got int"):
+        fit(valley(), jnp.zeros(()), key=3)
+
+
+def test_a_fit_without_jit_is_the_fit() -> None:
+    expected = fit(valley(), jnp.zeros(()), key=KEY)
+    with jax.disable_jit():
+        found = fit(valley(), jnp.zeros(()), key=KEY)
+    np.testing.assert_allclose(found.poses, expected.poses, **ACCUMULATED)
+
+
 def test_stop_ends_the_fit_and_a_state_goes_on_to_the_same_numbers() -> None:
     problem, calls = valley(), []
     unbroken = fit(problem, jnp.zeros(()), key=KEY)

@@ -324,3 +324,11 @@ def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -
     options = [str(tmp_path), *options[:1]]
     assert run_command(main, config, name="logs", description=None, args=options) == 2
     assert "4 logs have 2 different names" in capsys.readouterr().err
+
+
+def test_logs_refuse_an_unknown_start(tmp_path, capsys) -> None:
+    log = write_corridor_log(tmp_path / "a.npz", 0)
+    options = [str(log), "-o", str(tmp_path / "out"), "--inits", "compass"]
+    assert run_command(deepmapping_logs.main, deepmapping_logs.Config, name="logs", description=None, args=options) == 2
+    assert "--inits: expected some of auto" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -104,6 +104,8 @@ def with_value(index, value):
         ({"points": np.ones((5, 40, 2))}, "one and the same"),
         ({"points": POINTS[:1]}, "1 scan; give two or more"),
         ({"points": POINTS[:0]}, "0 scans; give two or more"),
+        ({"points": POINTS[:0], "poses": POSES[:0]}, "0 scans; give two or more"),
+        ({"ranges": np.ones((6, NUM_BEAMS), complex), "angles": np.ones(NUM_BEAMS)}, "complex128"),
         ({"points": POINTS * 1000}, "millimetres"),
         ({"points": POINTS / 1000}, "median range"),
         ({"points": POINTS, "poses": POSES[:4]}, "poses are"),

@@ -47,6 +47,12 @@ def test_saved_model_is_the_loaded_one(model: Model, tmp_path: Path) -> None:
     assert read_card(tmp_path / "m.safetensors") == "trained on a town"
 
 
+def test_a_model_is_read_by_whom_the_folder_lets(model: Model, tmp_path: Path) -> None:
+    save_model(model, tmp_path / "m.safetensors")
+    (tmp_path / "other").touch()
+    assert (tmp_path / "m.safetensors").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
 def test_half_precision_costs_three_digits_and_is_half_the_size(model: Model, tmp_path: Path) -> None:
     for dtype in ("float16", "float32"):
         save_model(model, tmp_path / f"{dtype}.safetensors", dtype=dtype)

@@ -28,7 +28,7 @@ from dpmjax.sequences import InputError
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-STOPPING = "\nstopping, results are kept; a second Ctrl-C ends at once\n"
+STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
 ConfigT = TypeVar("ConfigT")
 
 

@@ -82,6 +82,8 @@ class Config(cli.ScanOptions, cli.RunOptions):
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
         if not self.ordered and self.init != "global":
             raise ValueError(f"--no-ordered: only --init global needs no order, got --init {self.init}")
+        if self.data is not None and (self.world != 0 or self.range_noise_px != 0):
+            raise ValueError("--world and --range-noise-px choose simulated scans; leave them out beside DATA")
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -293,7 +295,7 @@ def read_map2d_run(path: Path) -> Map2dRun:
         )
     sequence = read_scans(config)
     if sequence.unit == "m":
-        raise ValueError(f"{path} is a run on {sequence.name}, in metres, whose fit may have a part of the scans")
+        raise ValueError(f"{path} is a run on {sequence.name}, in metres: give a run on a built-in world (--world)")
     settings = fit_settings(config, sequence)
     data, unit = deepmapping.mapping_data(
         results.scan_set_of(sequence), None if config.init == "zero" else np.load(trajectory)

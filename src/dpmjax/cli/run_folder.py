@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, arg
@@ -18,6 +19,12 @@ from tyro.conf import FlagCreatePairsOff, arg
 from dpmjax.cli.info import environment
 from dpmjax.cli.result_files import as_json, commits_note, load_json, write_json
 from dpmjax.sequences import InputError
+
+fcntl: ModuleType | None
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 CONFIG, METRICS, HISTORY, LOG = "config.json", "metrics.json", "metrics.csv", "log.txt"
 CHECKPOINTS, BEST, AGENTS, DRIVES = "checkpoints", "checkpoints_best", "agents", "drives"
@@ -30,6 +37,8 @@ FREE_OPTIONS = frozenset(
     {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
 )
 RESULTS = Path("results")
+# Handles of the folders that this process has locked.
+_LOCKS: dict[Path, int] = {}
 
 ConfigT = TypeVar("ConfigT")
 
@@ -131,7 +140,7 @@ def open_run_folder(config: Any, experiment: str) -> RunFolder:
         The open folder.
 
     Raises:
-        ValueError: as `check_run_folder`; or the folder cannot be made.
+        ValueError: as `check_run_folder`; or the folder cannot be made, or another process is writing in it.
     """
     check_run_folder(config, experiment)
     is_resumed = getattr(config, "resume", False)
@@ -143,12 +152,29 @@ def open_run_folder(config: Any, experiment: str) -> RunFolder:
         else:
             path = config.output
             path.mkdir(parents=True, exist_ok=True)
+        _lock(path)
+        if config.output is not None and not is_resumed:
             _clear(path)
         write_json(path / CONFIG, config)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ValueError(_cannot_write(config.output or RESULTS / experiment, reason)) from error
     return RunFolder(path, is_resumed=is_resumed)
+
+
+def _lock(path: Path) -> None:
+    """Keeps other processes out of a folder, where the system can lock folders; `recording` ends it."""
+    if fcntl is None or path.resolve() in _LOCKS:
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise ValueError(f"{path}: another process is writing this run; let it end, or stop it") from error
+    except OSError:
+        pass  # a network file system without locks
+    _LOCKS[path.resolve()] = handle
 
 
 def check_run_folder(config: Any, experiment: str) -> None:
@@ -187,7 +213,7 @@ def find_run(experiment: str, output: Path | None) -> Path:
     """
     path = output or RESULTS / experiment / "latest"
     if not (path / CONFIG).is_file():
-        raise ValueError(f"nothing to resume: {path} holds no {CONFIG}; name the folder of a run with -o")
+        raise ValueError(f"{path} holds no {CONFIG}: it is no run of {experiment}; name one (--resume -o OUT)")
     return path if output else path.resolve()
 
 
@@ -276,6 +302,8 @@ def recording(folder: RunFolder) -> Iterator[None]:
             logger.removeHandler(handler)
             logger.setLevel(level)
         handler.close()
+        if folder.path.resolve() in _LOCKS:
+            os.close(_LOCKS.pop(folder.path.resolve()))
 
 
 def tell(text: str) -> None:

@@ -25,9 +25,10 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import cli, deeppointmap, simulation, viz, weights
@@ -136,7 +137,8 @@ def main(config: Config) -> None:
             records = None
             if folder is not None:
                 print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
-                sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=config.town_length_m)
+                length_m = config.town_length_m
+                sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=length_m, on_wait=on_wait)
                 records = Records(folder, settings, sets, seed=config.seed, weights=first)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
         plateau_s = plateau_seconds(config)
@@ -146,8 +148,11 @@ def main(config: Config) -> None:
         bad = merged(store.bad)
         if folder is None or records is None:
             return
-        evaluation, metrics = measure(trained, records)
-        metrics |= {
+        # The evaluation takes minutes, which a stopped run does not have.
+        evaluation = None if stop.is_requested else evaluate(trained, records)
+        metrics = {
+            **training_numbers(trained, records),
+            **({} if evaluation is None else evaluation.numbers),
             "num_scans": len(store.table),
             "bad_scans": bad,
             "wall_s": time.perf_counter() - started,
@@ -158,7 +163,8 @@ def main(config: Config) -> None:
         cli.write_metrics(folder, metrics)
         write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
         draw_curves(folder)
-        draw_matches(folder, evaluation, records.sets.held_out)
+        if evaluation is not None:
+            draw_matches(folder, evaluation.trained, records.sets.held_out)
         print_summary(folder, metrics)
 
 
@@ -193,15 +199,16 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 
-def measure(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation, dict[str, Any]]:
-    """Returns recall and errors of the trained and of the untrained network, and times."""
-    from dpmjax.cli.train_run import KIND_NAMES
+class Measured(NamedTuple):
+    """Evaluation of the trained network, and the numbers of both networks for `metrics.json`."""
 
-    pairs = records.sets.held_out
-    models = {"": trained.model, "_untrained": records.untrained}
-    evaluations = {suffix: deeppointmap.evaluate_registration(model, pairs) for suffix, model in models.items()}
-    metrics: dict[str, Any] = {
-        "num_held_out_pairs": len(pairs.pairs[0].sources),
+    trained: deeppointmap.Evaluation
+    numbers: dict[str, Any]
+
+
+def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[str, Any]:
+    """Returns steps, selection score and seconds for `metrics.json`."""
+    return {
         "steps": int(trained.progress.state.step),
         "best_step": int(trained.progress.best_step) or None,
         "selection_score": float(trained.progress.best_score),
@@ -209,24 +216,39 @@ def measure(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointm
         "compile_s": trained.speed.compile_s,
         "scans_per_s": trained.speed.scans_per_s,
     }
+
+
+def evaluate(trained: deeppointmap.Trained, records: Records) -> Measured:
+    """Returns recall and errors of the trained and of the untrained network."""
+    from dpmjax.cli.train_run import KIND_NAMES
+
+    pairs = records.sets.held_out
+    models = {"": trained.model, "_untrained": records.untrained}
+    evaluations = {
+        suffix: deeppointmap.evaluate_registration(model, pairs)
+        for suffix, model in tqdm(models.items(), desc="evaluate", unit=" networks", dynamic_ncols=True)
+    }
+    metrics: dict[str, Any] = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
     for suffix, evaluation in evaluations.items():
         near = evaluation.recalls[0]
         of_kinds = zip(KIND_NAMES, evaluation.recalls, strict=True)
         metrics |= {f"{name}{suffix}": recall.recall for name, recall in of_kinds}
         metrics[f"translation_error_median{suffix}_m"] = float(np.median(near.translation_errors_m))
         metrics[f"rotation_error_median{suffix}_deg"] = float(np.median(near.rotation_errors_deg))
-    return evaluations[""], metrics
+    return Measured(evaluations[""], metrics)
 
 
 def write_model(folder: cli.RunFolder, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
     """Writes model.safetensors with a description of its training, which begins with the preset and the data."""
     best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
-    card = (
-        f"{origin} ({metrics['num_scans']} scans), "
-        f"{metrics['steps']} steps{best}, seed {metrics['seed']}. Held-out town, {metrics['num_held_out_pairs']} pairs "
-        f"2-10 m apart, any yaw: recall (2 m, 5 deg) {metrics['recall']:.3f}, "
-        f"untrained {metrics['recall_untrained']:.3f}."
-    )
+    card = f"{origin} ({metrics['num_scans']} scans), {metrics['steps']} steps{best}, seed {metrics['seed']}. "
+    if "recall" in metrics:
+        card += (
+            f"Held-out town, {metrics['num_held_out_pairs']} pairs 2-10 m apart, any yaw: recall (2 m, 5 deg) "
+            f"{metrics['recall']:.3f}, untrained {metrics['recall_untrained']:.3f}."
+        )
+    else:
+        card += "Stopped before its evaluation."
     unfinished = folder / f".tmp_{MODEL}"
     weights.save_model(model, unfinished, card=card)
     unfinished.replace(folder / MODEL)
@@ -263,7 +285,10 @@ def draw_matches(
 def print_summary(folder: cli.RunFolder, metrics: dict[str, Any]) -> None:
     """Prints the recall, the scans that were left out, and the folder."""
     at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
-    print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
+    if "recall" in metrics:
+        print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
+    else:
+        print(f"stopped after step {metrics['steps']}{at}; not evaluated on the held-out town")
     bad = metrics["bad_scans"]
     if bad:
         print(f"{len(bad)} scans left out, all of them in {folder / cli.METRICS}:")

@@ -56,9 +56,17 @@ class EvaluationSets(NamedTuple):
 
 
 def draw_sets(
-    settings: dpm.TrainingConfig, held_out_pairs: int, validate: Sequence[Path], *, length_m: float
+    settings: dpm.TrainingConfig,
+    held_out_pairs: int,
+    validate: Sequence[Path],
+    *,
+    length_m: float,
+    on_wait: Callable[[], object] = lambda: None,
 ) -> EvaluationSets:
-    """Returns the pairs of a run; `validate` names folders of real scans, `length_m` is that of towns."""
+    """Returns the pairs of a run; `validate` names folders of real scans, `length_m` is that of towns.
+
+    `on_wait` is called before each drive; an error of it ends the preparation.
+    """
     draw = partial(dpm.draw_evaluation_pairs, config=settings.model)
     num = max(1, SELECTION_PAIRS // (len(KINDS) * len(SELECTION_SCENES)))
     towns = [
@@ -69,7 +77,10 @@ def draw_sets(
     work = [partial(draw, town, num, kinds=KINDS, max_scans=64) for town in towns]
     work += [partial(draw, open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate]
     work += [partial(draw, held_out, held_out_pairs, kinds=KINDS)]
-    sets = [one() for one in tqdm(work, desc="prepare evaluation", unit=" drives", dynamic_ncols=True)]
+    sets = []
+    for one in tqdm(work, desc="prepare evaluation", unit=" drives", dynamic_ncols=True):
+        on_wait()
+        sets.append(one())
     return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from dpmjax.checks import require_count
+from dpmjax.checks import as_key, require_count
 from dpmjax.deepmapping.problem import Problem
 
 
@@ -116,9 +116,10 @@ def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) ->
         The state.
 
     Raises:
-        ValueError: there is no start.
+        ValueError: there is no start, or `key` is no key.
     """
     require_count("num_starts", num_starts)
+    key = as_key("key", key)
     return _init(problem, data, key if num_starts == 1 else jax.random.split(key, num_starts))
 
 
@@ -264,8 +265,10 @@ def resume(
         begun = time.perf_counter()
         state = _enter_phase(problem, state, data)
         # Compiled ahead, so that compile time is counted apart; JAX keeps the program of each phase and number of
-        # starts.
-        program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
+        # starts. Under `jax.disable_jit` there is nothing to compile.
+        program: Callable[..., Any] = partial(_advance, problem, _scalar(state.phase))
+        if not jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+            program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
         compiled = time.perf_counter()
         state, report = jax.block_until_ready(program(state, data))
         compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled

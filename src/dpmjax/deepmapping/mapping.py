@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import require_type
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Report, fit
@@ -154,6 +155,7 @@ def fit_deepmapping(
         ValueError: as `mapping_data`.
     """
     config = config or DeepMappingConfig()
+    require_type("config", config, DeepMappingConfig, "DeepMappingConfig or preset")
     data, unit = mapping_data(scans, start)
     done = engine(mapping_problem(config, data), data, key=key)
     poses = _SENSORS[type(data.scans)].unscaled(done.poses, unit)
@@ -232,14 +234,14 @@ def register_clouds(
 
 
 def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..., float]) -> Registered:
-    """Returns the poses of the fit or the initial poses, those of the smaller misfit."""
+    """Returns the poses of the fit or the initial poses, those of the smaller misfit; initial ones without a step."""
     T, misfit = fitted.T_world_scan, misfit_of(fitted.T_world_scan)
     if start is None:
         return Registered(T, "fit", misfit, None, None, fitted)
     T_start = np.asarray(start, np.float64)
     start_misfit = misfit_of(T_start)
     # The comparison is False for a misfit that is not finite, so the start is kept then.
-    if misfit < start_misfit:
+    if fitted.num_steps > 0 and misfit < start_misfit:
         return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
     return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
-import gzip
 import logging
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.io.files import read_bytes, refusing, to_lines
+from dpmjax.io.files import read_lines, refusing
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, pad_scans, require
 
 _log = logging.getLogger(__name__)
@@ -72,11 +70,8 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
         InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
             that are no numbers.
     """
-    content = read_bytes(path)
-    with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
-        text = to_lines(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ("FLASER", "ROBOTLASER1", "ODOM", "NEFF")}
-    for number, words in enumerate(map(str.split, text), 1):
+    for number, words in enumerate(map(str.split, read_lines(path)), 1):
         if words and words[0] in lines:
             lines[words[0]].append((number, words))
     is_newer = not lines["FLASER"]

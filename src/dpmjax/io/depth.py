@@ -154,7 +154,7 @@ def _read_clouds(
     images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
 ) -> tuple[NDArray[np.float32], BoolArray]:
     """Reads points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres; warns of most pixels too deep."""
-    clouds, depths = [], []
+    images, clouds, depths = list(images), [], []
     for image in images:
         depth_mm = read_depth_png(image)
         depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
@@ -167,6 +167,10 @@ def _read_clouds(
     require(any(map(np.any, mask)), image.parent, found, advice)
     if np.median(depths) > max_depth_m:
         _log.warning("%s: %s; %s", image.parent, found, advice)
+    blank = [image for image, one in zip(images, mask, strict=True) if not one.any()]
+    if blank:
+        advice = f"leave out such images, {len(blank)} of {len(images)}"
+        raise InputError(blank[0], f"no pixel measures up to {max_depth_m:g} m", advice)
     return np.stack(points), np.stack(mask)
 
 

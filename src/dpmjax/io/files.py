@@ -6,6 +6,7 @@ Arrays are those of NumPy, variables of MATLAB, and depth images of 16 bits in P
 from __future__ import annotations
 
 import codecs
+import gzip
 import importlib
 import io
 import logging
@@ -157,7 +158,7 @@ def read_lines(path: str | Path) -> list[str]:
     """Reads the lines of a text file in UTF-8, or UTF-16 with its mark in front; other bytes are replaced.
 
     Args:
-        path: the file.
+        path: the file, plain or packed by gzip.
 
     Returns:
         The lines without their ends.
@@ -165,18 +166,10 @@ def read_lines(path: str | Path) -> list[str]:
     Raises:
         InputError: there is no such file, or it cannot be read.
     """
-    return to_lines(read_bytes(path))
-
-
-def to_lines(content: bytes) -> list[str]:
-    """Decodes the lines of a text; see `read_lines`.
-
-    Args:
-        content: the bytes of the text.
-
-    Returns:
-        The lines without their ends.
-    """
+    content = read_bytes(path)
+    if content.startswith(b"\x1f\x8b"):
+        with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
+            content = gzip.decompress(content)
     encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     return content.decode(encoding, errors="replace").splitlines()
 

@@ -131,7 +131,7 @@ def _read_arrays(path: Path) -> TimedCloud:
     table = load_arrays(path, None if path.suffix.lower() == ".npy" else (*_NPZ_KEYS, _NPZ_TIMES))
     values = next((table[key] for key in _NPZ_KEYS if key in table), None)
     if values is None:
-        raise InputError(path, "no array of points", "call it lidar_pcd or points")
+        raise InputError(path, "no array of points", f"call it one of {', '.join(_NPZ_KEYS)}")
     is_good = values.ndim in (2, 3) and values.shape[-1] >= 3 and values.dtype.kind in "fiu"
     found = f"an array of {values.shape} {values.dtype}"
     is_good = is_good and not (values.ndim == 2 and len(values) < _MOST_ROWS_OF_TRANSPOSE < values.shape[1])

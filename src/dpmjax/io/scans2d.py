@@ -149,7 +149,7 @@ def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) ->
     if len(empty):
         first = start + stride * empty[0]
         found = f"{len(empty)} of {len(sequence)} scans have no valid beam, the first is scan {first}"
-        raise InputError(path, found, "remove such scans, or choose others by start, stop and stride")
+        raise InputError(path, found, "remove such scans, or choose others")
     points = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
     differ = (sequence.points != points[:, None]).any(axis=2) & sequence.mask
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
@@ -199,6 +199,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     is_good = given.shape == mask.shape and given.dtype.kind in "biu"
     require(is_good, path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
     mask &= given.astype(bool)
+    require(len(points) > 0, path, "0 scans", "give two or more")
     stored = np.where(mask[..., None], to_float32(points), np.float32(0))
     bad = ~np.isfinite(stored).all(axis=2)
     if bad.any():
@@ -239,8 +240,8 @@ def _from_ranges(table: Table, path: str | Path) -> tuple[tuple[FloatArray, Bool
     ranges, angles = table["ranges"], table["angles"]
     is_good = ranges.ndim == 2 and _is_numeric(ranges, ranges.shape)
     is_good &= _is_numeric(angles, ranges.shape, ranges.shape[1:])
-    found = f"ranges are {ranges.shape}, angles {angles.shape}"
-    require(is_good, path, found, "give (n, b) and (b,) or (n, b)")
+    found = f"ranges are {ranges.shape} {ranges.dtype}, angles {angles.shape} {angles.dtype}"
+    require(is_good, path, found, "give numbers, (n, b) and (b,) or (n, b)")
     distance, theta = ranges.astype(np.float64), angles.astype(np.float64)
     found = "angles hold NaN, infinite or huge values"
     require((np.abs(theta) < 1e6).all(), path, found, "give a direction to every beam, in radians")

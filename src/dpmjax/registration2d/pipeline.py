@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dpmjax.checks import require_one_of, require_positive
+from dpmjax.checks import as_key, require_one_of, require_positive, require_type
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
@@ -192,7 +192,8 @@ def register_scans(
             beam, or all scans are equal. Also if there is no odometry to start from, or if the start needs an order
             that the scans do not have.
     """
-    config, hooks = config or RegistrationConfig(), hooks or RegistrationHooks()
+    config, hooks, key = config or RegistrationConfig(), hooks or RegistrationHooks(), as_key("key", key)
+    require_type("config", config, RegistrationConfig, "RegistrationConfig")
     all_scans = as_scan_set(scans)
     count = len(all_scans.points)
     odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, count)

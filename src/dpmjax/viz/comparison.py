@@ -45,7 +45,8 @@ def error_boxes_figure(
         ax.set_ylabel(measure, color=INK)
         ax.grid(axis="y", alpha=0.25)
         if threshold is not None and number == 0:
-            ax.axhline(threshold, color=ACCENT, linewidth=0.8, linestyle="--")
+            ax.axhline(threshold, color=ACCENT, linewidth=0.8, linestyle="--", label=f"right below {threshold:g}")
+            ax.legend(fontsize=7, frameon=False)
     return figure
 
 
@@ -90,6 +91,7 @@ def success_grids_figure(
     for ax in axes[:, 0]:
         ax.set_yticks(range(len(row_names)), list(row_names), fontsize=8)
         ax.set_ylabel(row_label, fontsize=8)
+    figure.suptitle("right sets, %", fontsize=9)
     return figure
 
 
@@ -157,7 +159,7 @@ def endings_figure(
         axes.hist(np.clip(finite, edges[0], edges[-1]), edges, color=ACCENT if "network" in name else DIRECT)
         axes.set_yscale("symlog", linthresh=1.0)
         figures.annotate_corner(axes, f"{name}: {100 * shares[name]:.1f} % at the global minimum", (3, 2), color=INK)
-        figures.style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "")
+        figures.style_axes(axes, "x at the end of a seed" if axes is rows[-1] else "", "seeds")
     return figure
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from dpmjax.deeppointmap.model import Model, model_shapes
 from dpmjax.deeppointmap.model_config import ModelConfig
@@ -47,8 +47,8 @@ def load_model(path_or_name: str | Path) -> Model:
     if path.name in shipped_models() and path == Path(path.name):
         return _load_safetensors(SHIPPED / (path.name + SUFFIX))
     shipped = ", ".join(shipped_models()) or "none yet"
-    expected = f"expected a {SUFFIX} or .pth file, or the name of a shipped model ({shipped})"
-    raise ValueError(f"no weights {str(path_or_name)!r}: {expected}")
+    expected = f"give a {SUFFIX} or .pth file, or the name of a shipped model ({shipped})"
+    raise ValueError(f"{path_or_name}: neither weights nor the name of a model; {expected}")
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -85,7 +85,7 @@ def save_model(
             raise ValueError(f"model: {name} holds numbers that are not finite in {dtype}")
     config = json.dumps(dataclasses.asdict(model.config))
     header = {"format": FORMAT, "format_version": FORMAT_VERSION, "config": config, "card": card}
-    save_file(arrays, path, metadata=header)
+    path.write_bytes(save(arrays, metadata=header))  # `save_file` gives the owner alone the right to read.
 
 
 def read_card(path_or_name: str | Path) -> str:
