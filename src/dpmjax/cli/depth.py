@@ -9,7 +9,8 @@
 Depth is 16 bit, millimetres, 0 or 65535 for nothing. Where each image has a NAME.pose.txt, the result is measured by
 these poses. Results go to results/depth/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI
 and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png. A search gives the first
-poses and DeepMapping improves them; the poses of higher consistency are kept, chosen without ground truth.
+poses and DeepMapping improves them; the poses of higher consistency are kept, chosen without ground truth. Consistency
+is the share of pixels that other images confirm; flat walls alone confirm many motions.
 """
 
 from __future__ import annotations
