@@ -100,7 +100,7 @@ class _PlaneSystem(NamedTuple):
 
 
 def _plane_system(pairs: PlanePairs, T_target_source: Pose) -> _PlaneSystem:
-    """Keeps the pairs that meet, none if these are too few; both functions below say what the arguments are."""
+    """Returns the system of the pairs that meet, of none below `MIN_PLANES`; arguments as in `plane_information`."""
     is_used = np.abs(pairs.residuals) < PLANE_DISTANCE_M
     is_used &= is_used.sum() >= MIN_PLANES
     normals = pairs.normals[is_used] @ T_target_source[:3, :3]
