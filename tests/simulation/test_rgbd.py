@@ -171,17 +171,21 @@ def test_damaged_pose_folders_are_told_in_one_line(pose_folder, spoil, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("scale", "is_refused"), [(0, True), (10, True), (3, False)])
-def test_depth_of_another_unit_is_named(pose_folder, caplog, scale, is_refused):
+@pytest.mark.parametrize("scale", [0, 3, 10])
+def test_depth_of_another_unit_is_refused_where_an_image_is_empty(pose_folder, scale):
     """Images of 1 and 5 m."""
     for index in (2, 10):
         write_png(pose_folder / f"frame-{index}.depth.png", np.full((6, 8), 500 * index * scale))
-    if is_refused:
-        with pytest.raises(InputError, match=f"median depth is {3 * scale} m, .* give millimetres"):
-            io.read_pose_folder(pose_folder, height=6, width=8)
-    else:
-        assert io.read_pose_folder(pose_folder, height=6, width=8).mask[0].all()
-        assert "the median depth is 9 m" in caplog.text
+    with pytest.raises(InputError, match=f"median depth is {3 * scale} m, .* give millimetres"):
+        io.read_pose_folder(pose_folder, height=6, width=8)
+
+
+def test_depth_of_another_unit_is_warned_of(pose_folder, caplog):
+    """A quarter of the pixels is near."""
+    for index in (2, 10):
+        write_png(pose_folder / f"frame-{index}.depth.png", np.where(np.arange(8) < 2, 3000, 9000) + np.zeros((6, 1)))
+    assert io.read_pose_folder(pose_folder, height=6, width=8).mask.mean() == 0.25
+    assert "the median depth is 9 m" in caplog.text
 
 
 @pytest.fixture

@@ -267,7 +267,7 @@ def resume(
         # Compiled ahead, so that compile time is counted apart; JAX keeps the program of each phase and number of
         # starts. Under `jax.disable_jit` there is nothing to compile.
         program: Callable[..., Any] = partial(_advance, problem, _scalar(state.phase))
-        if not jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        if not _is_jit_disabled():
             program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
         compiled = time.perf_counter()
         state, report = jax.block_until_ready(program(state, data))
@@ -275,6 +275,12 @@ def resume(
         share = min(1.0, _scalar(state.step) / total)
         on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
     return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
+
+
+def _is_jit_disabled() -> bool:
+    """Returns True in a block of `jax.disable_jit`."""
+    config: Any = jax.config  # stubs of some versions of JAX lack the flag
+    return bool(config.jax_disable_jit)
 
 
 def _scalar(count: Array) -> int:

@@ -164,10 +164,12 @@ def _read_clouds(
     points, mask = zip(*clouds, strict=True)
     found = f"the median depth is {np.median(depths):.3g} m, deeper pixels than {max_depth_m:g} m are left out"
     advice = "give millimetres, 0 for nothing; TUM's images have 5000 a metre"
-    require(any(map(np.any, mask)), image.parent, found, advice)
-    if np.median(depths) > max_depth_m:
-        _log.warning("%s: %s; %s", image.parent, found, advice)
     blank = [image for image, one in zip(images, mask, strict=True) if not one.any()]
+    # Where most pixels are too deep, the unit is wrong, not an image.
+    is_deep = float(np.median(depths)) > max_depth_m
+    require(len(blank) < (1 if is_deep else len(images)), image.parent, found, advice)
+    if is_deep:
+        _log.warning("%s: %s; %s", image.parent, found, advice)
     if blank:
         advice = f"leave out such images, {len(blank)} of {len(images)}"
         raise InputError(blank[0], f"no pixel measures up to {max_depth_m:g} m", advice)
