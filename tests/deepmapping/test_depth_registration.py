@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +55,12 @@ def test_of_start_and_fit_the_more_consistent_one_is_kept(walk, scans) -> None:
 def test_a_fit_without_a_step_is_not_kept(walk, scans) -> None:
     apart = np.array(walk.T_world_camera)
     apart[:, 0, 3] += np.arange(4.0)
-    engine = partial(dm.fit, stop=lambda: True)
+    trained = returning(walk.T_world_camera, scans)
+
+    def engine(problem, data, *, key):
+        done = trained(problem, data, key=key)
+        return done._replace(state=done.state.replace(step=jnp.zeros((), jnp.int32)))
+
     found = dm.register_depth(scans, CONFIG, key=KEY, start=apart, engine=engine)
     assert found.kept == "start"
     np.testing.assert_array_equal(found.T_world_scan, apart)

@@ -213,7 +213,7 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
     Raises:
         InputError: names the first bad pose.
     """
-    bad = ~np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
+    bad = ~np.isfinite(poses).all(axis=tuple(range(1, poses.ndim)))
     if bad.any():
         raise InputError(source, f"NaN or infinite values in pose {bad.argmax()}", "give a pose to every scan")
     if poses.ndim == 3:

@@ -199,7 +199,6 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     is_good = given.shape == mask.shape and given.dtype.kind in "biu"
     require(is_good, path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
     mask &= given.astype(bool)
-    require(len(points) > 0, path, "0 scans", "give two or more")
     stored = np.where(mask[..., None], to_float32(points), np.float32(0))
     bad = ~np.isfinite(stored).all(axis=2)
     if bad.any():
