@@ -10,6 +10,7 @@ import pytest
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.slam_numbers import run_status, why_failed
+from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from tests.cli.test_slam import run
 from tests.cli.test_slam_fuzz import leave_networks_out
@@ -108,6 +109,13 @@ def test_a_reference_in_millimetres_is_doubted(tmp_path: Path, capsys: pytest.Ca
     write_tum(drive / "poses_lidar.txt", truth)
     assert run(drive, "-o", tmp_path / "other") == EXIT_OK
     assert "2e+03 m long, the trajectory 2 m: is the reference in metres?" in capsys.readouterr().out
+
+
+def test_inverted_reference_poses_are_doubted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    drive = tmp_path / "drive"
+    write_tum(drive / "poses_lidar.txt", rigid.inverse(write_room(drive, 6)))
+    assert run(drive, "-o", tmp_path / "out") == EXIT_OK
+    assert "does the reference map the world to the lidar, not the lidar to the world?" in capsys.readouterr().out
 
 
 def test_millimetres_and_a_map_are_named_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

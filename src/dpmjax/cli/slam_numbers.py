@@ -15,6 +15,9 @@ from dpmjax.sequences import LidarSequence, counted
 MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
 """Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres."""
 
+INVERTED_SHARE = 0.2
+"""Share of the error of the reference, below which the error of its inverse makes the reference doubtful."""
+
 
 class SlamRun(NamedTuple):
     """A run until its end or its stop.
@@ -122,14 +125,21 @@ def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, su
 
 
 def reference_doubt(T_world_scan: np.ndarray, sequence: LidarSequence) -> str | None:
-    """Returns a doubt where the reference is far longer or shorter than the trajectory, as in another unit; or None."""
-    reference, known = sequence.T_world_lidar, sequence.has_reference
-    if reference is None:
+    """Returns a doubt where the reference seems to be in another unit, or of inverted poses; None without a doubt."""
+    if sequence.T_world_lidar is None:
         return None
-    way_m, reference_m = (metrics.path_lengths(T[known]).max(initial=0.0) for T in (T_world_scan, reference))
-    if min(way_m, reference_m) < MIN_WAY_M or 1 / MAX_LENGTH_RATIO < reference_m / way_m < MAX_LENGTH_RATIO:
+    T, reference = T_world_scan[sequence.has_reference], sequence.T_world_lidar[sequence.has_reference]
+    way_m, reference_m = (metrics.path_lengths(poses).max(initial=0.0) for poses in (T, reference))
+    if min(way_m, reference_m) < MIN_WAY_M:
         return None
-    return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
+    if not 1 / MAX_LENGTH_RATIO < reference_m / way_m < MAX_LENGTH_RATIO:
+        return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
+    references = reference, geometry.rigid.inverse(reference)
+    given, inverted = (metrics.relative_pose_error(T, poses).translation_rmse for poses in references)
+    if inverted < INVERTED_SHARE * given:
+        errors = f"RPE {given:.3g} m; with each pose inverted it would be {inverted:.3g} m"
+        return f"{errors}: does the reference map the world to the lidar, not the lidar to the world?"
+    return None
 
 
 def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | None) -> np.ndarray | None:
