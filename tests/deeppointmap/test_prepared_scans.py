@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import init_model, model_preset
+from dpmjax.deeppointmap import init_model, model_preset, prepared_scans
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
-from dpmjax.deeppointmap.model import model_fingerprint
+from dpmjax.deeppointmap.model import Model, model_fingerprint
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.prepared_scans import compact_scan, expand_scan, round_directions, round_features
 from dpmjax.deeppointmap.verification import VerificationConfig, measure_scan
@@ -104,3 +104,20 @@ def test_other_parameters_have_another_fingerprint() -> None:
     assert model_fingerprint(first) == model_fingerprint(jax.device_get(first))
     assert model_fingerprint(first) != model_fingerprint(other)
     assert len(model_fingerprint(first)) == 16
+
+
+def test_a_scan_is_prepared_for_each_use_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a cloud it needs surface elements, with another scan its measured surface."""
+    model = Model({}, model_preset("tiny"))
+    cloud, with_elements, measured = (
+        DescriptorCloud(np.full((1, 3), value, np.float32), np.zeros((1, 2), np.float32), np.ones(1, bool))
+        for value in range(3)
+    )
+    first, second = np.zeros((5, 3)), np.ones((5, 3))
+    monkeypatch.setattr(prepared_scans, "encode", lambda *_, **__: with_elements)
+    monkeypatch.setattr(prepared_scans, "prepare_scans", lambda _model, scans, scale: [measured] * len(scans))
+    for pairs in ([(first, cloud), (first, second)], [(first, second), (first, cloud)]):
+        ready = prepared_scans.prepare_each(model, pairs, 1.0, num_elements=7)
+        assert ready[id(first), False] is with_elements
+        assert ready[id(first), True] is measured
+        assert ready[id(cloud), False] is cloud

@@ -130,7 +130,7 @@ def test_pixels_of_a_plane_have_its_normal_and_pixels_across_an_edge_none() -> N
     points = rays * (-2.0 / (rays @ normal))[..., None]
     points[:, 5:] *= 2.0
     mask = np.ones((7, 9), bool)
-    mask[0, 0] = False
+    mask[0, 0], points[0, 0] = False, np.nan
     normals, is_surface = image_normals(points.astype(np.float32), mask)
     expected = np.ones((6, 8), bool)
     expected[:, 4], expected[0, 0] = False, False

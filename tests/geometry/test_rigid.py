@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -27,9 +28,27 @@ def test_exp_is_the_matrix_exponential(scale: float, num: int) -> None:
         vx, vy, w = tangent.astype(np.float64)
         twist = np.array([[0, -w, vx], [w, 0, vy], [0, 0, 0]])
     else:
-        vx, vy, vz, wx, wy, wz = tangent.astype(np.float64)
-        twist = np.array([[0, -wz, wy, vx], [wz, 0, -wx, vy], [-wy, wx, 0, vz], [0, 0, 0, 0]])
+        twist = twist_matrix(tangent)
     np.testing.assert_allclose(rigid.exp(tangent), expm(twist), **ACCUMULATED)
+
+
+def twist_matrix(tangent: np.ndarray) -> np.ndarray:
+    vx, vy, vz, wx, wy, wz = tangent.astype(np.float64)
+    return np.array([[0, -wz, wy, vx], [wz, 0, -wx, vy], [-wy, wx, 0, vz], [0, 0, 0, 0]])
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-6, 1e-3, 3e-3, 0.03, 0.3, 0.4, 3.0])
+def test_exp_of_a_long_way_with_a_small_turn_is_the_matrix_exponential(turn: float) -> None:
+    tangent = np.array([1, 20, -3, 0, 0.6 * turn, 0.8 * turn], np.float32)
+    np.testing.assert_allclose(rigid.exp(tangent), expm(twist_matrix(tangent)), atol=2e-5)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-4])
+def test_derivative_of_exp_is_that_of_finite_differences(turn: float, float64) -> None:
+    tangent, h = np.array([1.0, 20, -3, 0, 0, turn]), 1e-4
+    steps = h * np.eye(6)
+    expected = [(expm(twist_matrix(tangent + s)) - expm(twist_matrix(tangent - s))) / (2 * h) for s in steps]
+    np.testing.assert_allclose(jax.jacobian(rigid.exp)(tangent), np.stack(expected, axis=-1), atol=1e-6)
 
 
 def test_a_twist_of_the_plane_is_one_of_space() -> None:

@@ -43,6 +43,18 @@ def test_derivative_of_log_is_that_of_finite_differences(scale: float, float64) 
     np.testing.assert_allclose(se3.log_jacobian(T), expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("turn", [1e-5, 3e-3, 0.1, 0.6, 0.8, 2.5])
+def test_derivative_of_log_keeps_its_digits_at_any_turn(turn: float) -> None:
+    """The oracle inverts the right Jacobian, the series of (-ad)^k / (k + 1)!, in float64."""
+    twist = np.array([1, -2, 3, 0.48 * turn, -0.6 * turn, 0.64 * turn], np.float32)
+    v, w = (np.cross(np.eye(3), part.astype(np.float64)) for part in (twist[:3], twist[3:]))
+    ad = np.block([[w, v], [np.zeros((3, 3)), w]])
+    right, term = np.zeros((6, 6)), np.eye(6)
+    for k in range(40):
+        right, term = right + term, term @ -ad / (k + 2)
+    np.testing.assert_allclose(se3.log_jacobian(rigid.exp(twist)), np.linalg.inv(right), atol=2e-5)
+
+
 def test_rounding_errors_of_a_rotation_are_removed() -> None:
     T = random_motions(6, 1)[0]
     rough = T.copy()

@@ -11,7 +11,7 @@ import dpmjax
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import AgentsResult, SlamConfig, SlamMethods, run_agents, run_slam, take_component
+from dpmjax.slam import AgentsResult, LoopClosureConfig, SlamConfig, SlamMethods, run_agents, run_slam, take_component
 from dpmjax.slam.agents import join_agents
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
@@ -154,6 +154,15 @@ def test_maps_of_different_days_are_merged() -> None:
     found = extended.map.T_world_keyframe[:, :3, 3]
     assert absolute_trajectory_error(found, TRUTH[rows][:, :3, 3]) < 1.0
     assert len({keyframe.scan for keyframe in extended.map.keyframes}) == len(rows)
+
+
+def test_a_merged_map_has_the_settings_of_the_first() -> None:
+    first = methods_of(TRUTH)
+    second = first._replace(config=SlamConfig(loops=LoopClosureConfig(min_probability=0.9)))
+    a, b = (dpmjax.run_slam(methods, scans_of(part)).map for methods, part in zip((first, second), PARTS, strict=False))
+    assert a.origin != b.origin
+    assert dpmjax.merge_maps(first, a, b).maps[0].origin == a.origin
+    assert dpmjax.merge_maps(second, b, a).maps[0].origin == b.origin
 
 
 def test_maps_that_do_not_meet_are_returned_as_they_were() -> None:

@@ -13,7 +13,7 @@ from dpmjax.slam import SlamConfig, SlamMethods, localize_each, run_slam
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import KeyframeMap, thin_map
 from dpmjax.types import Verification
-from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, pose, scans_of
+from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
 # The second half of the poses is beside the first, and the last ten are far away.
 ROUND = laps(1, side_m=40.0, step_m=2.0)
@@ -91,6 +91,47 @@ def test_no_keyframe_is_registered_twice(slam_map) -> None:
     for one in localize_each(SlamMethods(matcher, TruthGeometry(TRUTH), SlamConfig()), slam_map, scans_of(QUERIES)):
         rows = [evidence.keyframe for evidence in one.evidence]
         assert len(set(rows)) == len(rows)
+
+
+@dataclass(frozen=True)
+class OneSureMatcher(TruthMatcher):
+    """One keyframe is matched surely and wrongly, beside the street; all others are not matched."""
+
+    side_m: float = 0.0
+
+    def _match(self, source: int, target: int) -> Match:
+        found, is_sure = super()._match(source, target), target == 30
+        shares = Verification(1.0, 0.6, 0.0, 2.0) if is_sure else Verification(1.0, 0.1, 0.3, -5.0)
+        T = pose(0.0, self.side_m if is_sure else 0.0, 0.0)
+        return found._replace(T_target_source=T, probability=0.99 if is_sure else 0.01, verification=shares)
+
+
+STREET = np.array([pose(2.0 * step, 0, 0) for step in range(60)])
+
+
+@pytest.mark.parametrize("side_m", [1.0, 9.0, 12.0, 19.0])
+def test_one_registration_is_not_enough_where_other_keyframes_are_near(side_m: float) -> None:
+    truth = np.concatenate([STREET, [pose(60.0, 0, 0)]])
+    geometry = TruthGeometry(truth)
+    street = run_slam(SlamMethods(TruthMatcher(truth, gross_share=0.0), geometry, SlamConfig()), scans_of(range(60)))
+    matcher = OneSureMatcher(truth, gross_share=0.0, side_m=side_m)
+    (scan,) = scans_of([60])
+    assert not localize(SlamMethods(matcher, geometry, SlamConfig()), street.map, scan).is_in_map
+
+
+def test_a_scan_of_a_part_that_no_loop_joins_is_placed_in_that_part() -> None:
+    """The second street is driven somewhere else, from an unknown pose."""
+    far = np.array([pose(0, 1000.0, 0) @ T for T in STREET])
+    truth = np.concatenate([STREET, far, [pose(60.3, 0.2, 0), pose(60.3, 1000.2, 0)]])
+    both = SlamMethods(TruthMatcher(truth, gross_share=0.0, least_probability=0.98), TruthGeometry(truth), SlamConfig())
+    slam_map = run_slam(both, scans_of(range(60))).map
+    slam_map = run_slam(both, scans_of(range(60, 120)), slam_map=slam_map).map
+    near, away = localize_each(both, slam_map, scans_of([120, 121]))
+    assert (near.part, away.part) == (0, 1)
+    for number, found in ((120, near), (121, away)):
+        keyframe = number_of(slam_map.keyframes[found.keyframe].compact)
+        T = rigid.inverse(slam_map.T_world_keyframe[found.keyframe]) @ found.T_world_scan
+        np.testing.assert_allclose(T, rigid.inverse(truth[keyframe]) @ truth[number], atol=0.5)
 
 
 def test_an_empty_scan_is_said_to_be_empty(slam_map) -> None:

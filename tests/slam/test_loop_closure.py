@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.pose_graph import optimize_pose_graph
 from dpmjax.scans.surface_alignment import PlanePairs
 from dpmjax.scans.weak_directions import diagonal_information, plane_information, with_least_covariance
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
-from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, submap_around
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, as_pose_graph, submap_around
 from dpmjax.slam.loop_closure import (
     MAX_AGAIN,
     MIN_PATH_SHARE,
@@ -20,7 +23,7 @@ from dpmjax.slam.loop_closure import (
     search_again,
 )
 from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.map_optimization import optimize_map, with_motions
 from dpmjax.slam.model_methods import pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
@@ -226,3 +229,19 @@ def test_a_submap_is_in_the_frame_of_its_centre(num_keyframes) -> None:
 def test_of_equal_vectors_the_first_are_returned() -> None:
     vectors = np.tile(np.float32([0.6, 0.8]), (250, 1))
     np.testing.assert_array_equal(most_similar(vectors, vectors[0], 16)[0], np.arange(16))
+
+
+def test_a_guess_that_loops_replaced_bends_neither_the_graph_nor_a_refined_map() -> None:
+    truth = laps(1, side_m=40.0, step_m=2.0)
+    truth = rigid.inverse(truth[0]) @ truth
+    slam_map = map_of(truth, segments=[0] * 40 + [1] * (len(truth) - 40))
+    guess = slam_map.edges[39]._replace(kind="guess", information=diagonal_information(1.0, 0.2))
+    guess = guess._replace(T_target_source=guess.T_target_source @ pose(-10.0, 0, 0.6))
+    slam_map = replace(slam_map, edges=(*slam_map.edges[:39], guess, *slam_map.edges[40:]))
+    assert len(as_pose_graph(slam_map).edges.source) == len(slam_map.edges)
+    loops = tuple(loop_between(truth, len(truth) - 1 - row, row) for row in (0, 3, 6))
+    joined, _ = optimize_map(slam_map, LoopState(loops))
+    solved = optimize_pose_graph(as_pose_graph(joined)).graph.poses
+    motions = {row: rigid.inverse(truth[row - 1]) @ truth[row] for row in range(1, len(truth))}
+    for poses in (joined.T_world_keyframe, solved, with_motions(joined, motions).T_world_keyframe):
+        np.testing.assert_allclose(poses, truth, atol=1e-6)

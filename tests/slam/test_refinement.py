@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -16,6 +17,7 @@ from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 TRUTH = laps(1, side_m=60.0, step_m=2.0)
 KEY = jax.random.key(0)
+START = SimpleNamespace(kept="start")
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +84,15 @@ def test_a_stop_leaves_the_remaining_windows_as_they_are(drifted, monkeypatch) -
 
 def test_a_map_without_two_keyframes_stays(drifted) -> None:
     assert refine_keyframes(KeyframeMap(), read_row, key=KEY).num_improved == 0
+
+
+def test_no_window_has_keyframes_of_two_parts(drifted, monkeypatch) -> None:
+    """Their relative pose is a guess, from which no fit may start."""
+    half = len(drifted) // 2
+    edges = [edge for edge in drifted.edges if (edge.source < half) == (edge.target < half)]
+    fitted = []
+    monkeypatch.setattr(map_optimization, "register_clouds", lambda clouds, **_: fitted.append(clouds) or START)
+    refine_keyframes(replace(drifted, edges=tuple(edges)), read_row, key=KEY)
+    rows = [[int(cloud[0, 0]) for cloud in clouds] for clouds in fitted]
+    assert sorted({row for window in rows for row in window}) == list(range(len(drifted)))
+    assert all(window[-1] < half or window[0] >= half for window in rows)

@@ -26,7 +26,7 @@ from dpmjax.sequences import InputError, LidarSequence
 
 NAME = "localize"
 POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
-COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "seconds", *POSE, "reason"]
+COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "part", "seconds", *POSE, "reason"]
 # Largest distance from a keyframe at which a scan is expected in the map.
 REACH_M = 15.0
 NUM_MAP_POINTS = 200_000
@@ -123,6 +123,7 @@ def as_row(number: int, case: Case, result: slam.Localization, seconds: float) -
     if result.T_world_scan is None or result.keyframe is None:
         return row
     row |= {"keyframe": str(result.keyframe), "keyframe_scan": str(case.slam_map.keyframes[result.keyframe].scan)}
+    row |= {"part": str(result.part)}
     return row | dict(zip(POSE, (f"{value:.9f}" for value in result.T_world_scan[:3].ravel()), strict=True))
 
 
@@ -132,7 +133,8 @@ def as_localization(row: dict[str, str]) -> slam.Localization:
         return slam.Localization("empty" if row["status"] == "empty" else "not in this map", None, 0.0, None, "")
     T = np.eye(4)
     T[:3] = np.reshape([float(row[name]) for name in POSE], (3, 4))
-    return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"])
+    part = int(row["part"])
+    return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"], part=part)
 
 
 def write_found(
@@ -168,6 +170,8 @@ def write_found(
     if errors:
         found += f"; {errors['num_inside']} are within {REACH_M:g} m of a keyframe; "
         found += f"{errors['num_right']} right, {errors['num_wrong']} wrong"
+    if any(result.part for result in results):
+        found += "; poses in parts of the map that no loop joins to the first have no common frame (column part)"
     return found + ("" if case.is_calibrated else "; the probabilities are scores (these weights are not calibrated)")
 
 

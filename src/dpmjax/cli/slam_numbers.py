@@ -224,8 +224,7 @@ def run_status(numbers: Mapping[str, Any], is_interrupted: bool) -> str:
 
 def count_parts(slam_map: slam.KeyframeMap) -> int:
     """Returns the number of parts of a map that measured motions join."""
-    measured = [edge for edge in slam_map.edges if edge.kind != "guess"]
-    return len(set(slam.connected_parts(len(slam_map), measured).tolist()))
+    return len(set(slam.measured_parts(slam_map).tolist()))
 
 
 def summary(numbers: Mapping[str, Any]) -> str:

@@ -87,10 +87,15 @@ def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0)
         return [PreparedScan(cloud, future.result(), scale) for cloud, future in zip(clouds, measured, strict=True)]
 
 
+def is_verified_pair(pair: tuple[ScanOrCloud, ScanOrCloud]) -> bool:
+    """Returns True where both sides are scans, so that their surfaces can verify a motion."""
+    return not any(isinstance(scan, DescriptorCloud) for scan in pair)
+
+
 def prepare_each(
     model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
-) -> dict[int, DescriptorCloud | PreparedScan]:
-    """Prepares each scan object of pairs once; surfaces are measured only where both sides of a pair are scans.
+) -> dict[tuple[int, bool], DescriptorCloud | PreparedScan]:
+    """Prepares each scan object of pairs once for each use: surfaces are measured where both sides are scans.
 
     Args:
         model: encoder and configuration.
@@ -99,19 +104,20 @@ def prepare_each(
         num_elements: see `encode`, for a scan that is registered with a cloud.
 
     Returns:
-        Prepared scans, or descriptors, by the id of each object.
+        Prepared scans, or descriptors, by the id of each object and `is_verified_pair` of its pair.
     """
-    raw: dict[int, RawScan] = {}
-    ready: dict[int, DescriptorCloud | PreparedScan] = {}
+    raw: dict[tuple[int, bool], RawScan] = {}
+    ready: dict[tuple[int, bool], DescriptorCloud | PreparedScan] = {}
     for pair in pairs:
-        is_verified = not any(isinstance(scan, DescriptorCloud) for scan in pair)
+        is_verified = is_verified_pair(pair)
         for scan in pair:
+            use = id(scan), is_verified
             if isinstance(scan, DescriptorCloud | PreparedScan):
-                ready[id(scan)] = scan
+                ready[use] = scan
             elif is_verified:
-                raw[id(scan)] = scan
-            elif id(scan) not in ready:
-                ready[id(scan)] = encode(model, scan, scale=scale, num_elements=num_elements)
+                raw[use] = scan
+            elif use not in ready:
+                ready[use] = encode(model, scan, scale=scale, num_elements=num_elements)
     return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values()), scale=scale), strict=True))}
 
 

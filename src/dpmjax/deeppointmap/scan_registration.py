@@ -19,7 +19,14 @@ from dpmjax.deeppointmap.encoding import scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
-from dpmjax.deeppointmap.prepared_scans import PreparedScan, Scale, ScanOrCloud, descriptors_of, prepare_each
+from dpmjax.deeppointmap.prepared_scans import (
+    PreparedScan,
+    Scale,
+    ScanOrCloud,
+    descriptors_of,
+    is_verified_pair,
+    prepare_each,
+)
 from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
@@ -115,7 +122,7 @@ def register_each(
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         started = []
         for pair in pairs:
-            source, target = (prepared[id(scan)] for scan in pair)
+            source, target = (prepared[id(scan), is_verified_pair(pair)] for scan in pair)
             clouds = descriptors_of(source), descriptors_of(target)
             in_cloud_units = match_clouds(model, *clouds, config=matching)
             pair_scale = _shared_scale(source, target, scale)

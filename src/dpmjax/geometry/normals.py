@@ -54,7 +54,7 @@ def image_normals(
     is_surface = is_surface & (np.ptp(depth, axis=0) < _SAME_SURFACE * depth.max(axis=0))
     normals = np.cross(right - here, below - here)
     length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
-    return normals * (is_surface / length)[..., None], is_surface
+    return np.where(is_surface[..., None], normals / length[..., None], 0), is_surface
 
 
 def estimate_normals(

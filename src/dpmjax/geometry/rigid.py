@@ -14,6 +14,9 @@ from jaxtyping import Array, Float
 from dpmjax.checks import as_float
 from dpmjax.types import AnyArray
 
+# Squared angle, in square radians, below which series replace differences that cancel.
+SERIES_BELOW = 0.1
+
 
 def namespace_of(*arrays: Any) -> ModuleType:
     """Returns `jax.numpy` if one array or more is JAX's, else `numpy`."""
@@ -82,6 +85,8 @@ def compose(T_a_b: Float[AnyArray, "*#n d d"], T_b_c: Float[AnyArray, "*#n d d"]
 def exp(tangent: Float[AnyArray, "... k"]) -> Float[Array, "... d1 d1"]:
     """Makes the motion of a twist; the gradient is right at zero too.
 
+    Differences that cancel are computed by series: jaxlie's motion of a small turn is off by half of turn times length.
+
     Args:
         tangent: (..., 3) vx, vy, angle in the plane, or (..., 6) vx, vy, vz, wx, wy, wz in space.
 
@@ -92,12 +97,33 @@ def exp(tangent: Float[AnyArray, "... k"]) -> Float[Array, "... d1 d1"]:
         ValueError: the twist has neither 3 nor 6 numbers.
     """
     tangent = as_float("tangent", tangent)
-    groups: dict[int, Any] = {3: jaxlie.SE2, 6: jaxlie.SE3}
-    if tangent.shape[-1] not in groups:
+    if tangent.shape[-1] not in (3, 6):
         raise ValueError(f"tangent: expected shape (..., 3) or (..., 6), got {tangent.shape}")
-    with jax.default_matmul_precision("highest"):
-        # jaxlie computes in 64 bits wherever JAX has them.
-        return groups[tangent.shape[-1]].exp(tangent).as_matrix().astype(tangent.dtype)
+    if tangent.shape[-1] == 3:  # the same motion in space, without z
+        zero = jnp.zeros_like(tangent)
+        T = exp(jnp.concatenate([tangent[..., :2], zero, tangent[..., 2:]], axis=-1))
+        kept = np.array([0, 1, 3])
+        return T[..., kept[:, None], kept]
+    v, w = tangent[..., :3], tangent[..., 3:]
+    squared = jnp.sum(w**2, axis=-1, keepdims=True)
+    # (1 - cos) / angle^2 and (angle - sin) / angle^3.
+    is_small = squared < SERIES_BELOW
+    safe = jnp.where(is_small, 1, squared)
+    angle = jnp.sqrt(safe)
+    first = jnp.where(
+        is_small, 1 / 2 - squared / 24 + squared**2 / 720 - squared**3 / 40320, 2 * jnp.sin(angle / 2) ** 2 / safe
+    )
+    second = jnp.where(
+        is_small,
+        1 / 6 - squared / 120 + squared**2 / 5040 - squared**3 / 362880,
+        (angle - jnp.sin(angle)) / (safe * angle),
+    )
+    turned = jnp.cross(w, v)
+    translation = v + first * turned + second * jnp.cross(w, turned)
+    R = jaxlie.SO3.exp(w).as_matrix().astype(tangent.dtype)  # jaxlie computes in 64 bits wherever JAX has them
+    top = jnp.concatenate([R, translation[..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.array([0, 0, 0, 1], tangent.dtype), (*tangent.shape[:-1], 1, 4))
+    return jnp.concatenate([top, last], axis=-2)
 
 
 @jax.jit

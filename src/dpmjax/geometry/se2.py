@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jaxlie
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from dpmjax.checks import as_float
-from dpmjax.geometry.rigid import namespace_of
+from dpmjax.geometry.rigid import SERIES_BELOW, matmul, namespace_of
 from dpmjax.types import AnyArray
 
 Poses = NDArray[np.float64]
@@ -236,8 +236,9 @@ def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
         (..., 3), the angle in [-pi, pi].
     """
     pose_a_b = as_float("pose_a_b", pose_a_b)
-    with jax.default_matmul_precision("highest"):
-        return _motion(pose_a_b).log().astype(pose_a_b.dtype)
+    x, y, angle = pose_a_b[..., 0], pose_a_b[..., 1], wrap_angle(pose_a_b[..., 2])
+    share, half = 1 - angle**2 * _missing_cotangent(angle), angle / 2
+    return jnp.stack([share * x + half * y, share * y - half * x, angle], axis=-1)
 
 
 @jax.jit
@@ -250,11 +251,22 @@ def log_jacobian(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
     Returns:
         (..., 3, 3).
     """
-    pose_a_b = as_float("pose_a_b", pose_a_b)
-    with jax.default_matmul_precision("highest"):
-        return _motion(pose_a_b).jlog().astype(pose_a_b.dtype)
+    twist = log(pose_a_b)
+    vx, vy, angle = twist[..., 0], twist[..., 1], twist[..., 2]
+    zero, factor = jnp.zeros_like(angle), _missing_cotangent(angle)[..., None, None]
+    rows = ((zero, -angle, vy), (angle, zero, -vx), (zero, zero, zero))
+    ad = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    # The series of Bernoulli numbers ends here, because ad^3 = -angle^2 ad.
+    return jnp.eye(3, dtype=twist.dtype) + ad / 2 + factor * matmul(ad, ad)
 
 
-def _motion(pose_a_b: Float[Array, "... 3"]) -> jaxlie.SE2:
-    # jaxlie computes in 64 bits wherever JAX has them.
-    return jaxlie.SE2.from_xy_theta(pose_a_b[..., 0], pose_a_b[..., 1], pose_a_b[..., 2])
+def _missing_cotangent(angle: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Returns (1 - h / tan(h)) / angle^2 with h = angle / 2; by a series where the difference would lose digits."""
+    squared = angle**2
+    is_small = squared < SERIES_BELOW
+    half = jnp.where(is_small, 1, angle) / 2
+    return jnp.where(
+        is_small,
+        1 / 12 + squared / 720 + squared**2 / 30240 + squared**3 / 1209600,
+        (1 - half / jnp.tan(half)) / (4 * half**2),
+    )

@@ -39,8 +39,12 @@ def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
         return jaxlie.SE3.from_matrix(T).log().astype(T.dtype)
 
 
+@jax.jit
 def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     """The derivative of log(T @ rigid.exp(step)) by the step, at zero: the inverse right Jacobian.
+
+    With ad, the adjoint of the twist, it is I + ad / 2 + a ad^2 + b ad^4, a closed form of the series of Bernoulli
+    numbers (Barfoot 2017, section 7.1.5).
 
     Args:
         T: (..., 4, 4), of angle below pi.
@@ -49,8 +53,26 @@ def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
         (..., 6, 6) for tangents (translation, rotation).
     """
     T = as_float("T", T)
-    with jax.default_matmul_precision("highest"):
-        return jaxlie.SE3.from_matrix(T).jlog().astype(T.dtype)
+    twist = log(T)
+    squared = jnp.sum(twist[..., 3:] ** 2, axis=-1)[..., None, None]
+    is_small = squared < 5 * rigid.SERIES_BELOW  # where differences of the closed form would lose digits
+    safe = jnp.where(is_small, 1, squared)
+    half = jnp.sqrt(safe) / 2
+    cotangent, cosecant = half / jnp.tan(half), safe / (8 * jnp.sin(half) ** 2)
+    second = (2 - 1.5 * cotangent - cosecant) / safe
+    fourth = (1 - 0.5 * cotangent - cosecant) / safe**2
+    second = jnp.where(is_small, 1 / 12 - squared**2 / 30240 - squared**3 / 604800, second)
+    fourth = jnp.where(is_small, -1 / 720 - squared / 15120 - squared**2 / 403200, fourth)
+    v, w = _cross_matrix(twist[..., :3]), _cross_matrix(twist[..., 3:])
+    ad = jnp.concatenate([jnp.concatenate([w, v], axis=-1), jnp.concatenate([jnp.zeros_like(w), w], axis=-1)], axis=-2)
+    squared_ad = rigid.matmul(ad, ad)
+    return jnp.eye(6, dtype=T.dtype) + ad / 2 + second * squared_ad + fourth * rigid.matmul(squared_ad, squared_ad)
+
+
+def _cross_matrix(vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=-2)
 
 
 def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:

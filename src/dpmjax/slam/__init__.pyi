@@ -26,6 +26,7 @@ from .keyframe_map import Submap as Submap
 from .keyframe_map import as_pose_graph as as_pose_graph
 from .keyframe_map import connected_parts as connected_parts
 from .keyframe_map import keyframe_points as keyframe_points
+from .keyframe_map import measured_parts as measured_parts
 from .keyframe_map import take_keyframes as take_keyframes
 from .keyframe_map import thin_map as thin_map
 from .local_map import LocalMap as LocalMap

@@ -256,7 +256,8 @@ def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
         edges = [edge._replace(source=edge.source + rows, target=edge.target + rows) for edge in other.edges]
         if other.origin is not None:
             joined = joined_maps(joined, replace(other, keyframes=tuple(keyframes), edges=tuple(edges)))
-            joined, rows = with_origin(joined, other.origin), len(joined)
+            origin = joined.origin or other.origin
+            joined, rows = replace(with_origin(joined, other.origin), origin=origin), len(joined)
             scans, segments = (1 + int(joined.column(name).max()) for name in ("scan", "segment"))
     return joined
 

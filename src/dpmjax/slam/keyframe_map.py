@@ -260,8 +260,22 @@ def keyframe_points(slam_map: KeyframeMap, row: int) -> Float[np.ndarray, "n 3"]
     return np.asarray(elements.positions)[np.asarray(elements.mask)]
 
 
+def measured_parts(slam_map: KeyframeMap) -> Int[np.ndarray, " k"]:
+    """Numbers the parts of a map that measured edges join; the first keyframe belongs to part 0.
+
+    Args:
+        slam_map: the map.
+
+    Returns:
+        The number of the part of each keyframe. The relative pose of two parts is a guess.
+    """
+    return connected_parts(len(slam_map), slam_map.edges_of("odometry", "loop"))
+
+
 def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     """Makes the pose graph of a map; the ids of its nodes are numbers of scans.
+
+    A guess stands in it only where no measured edges join its ends.
 
     Args:
         slam_map: map with at least one keyframe.
@@ -269,7 +283,9 @@ def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     Returns:
         The graph.
     """
-    return PoseGraph.create(slam_map.T_world_keyframe, edge_arrays(slam_map.edges), ids=slam_map.column("scan"))
+    part = measured_parts(slam_map)
+    edges = [edge for edge in slam_map.edges if edge.kind != "guess" or part[edge.source] != part[edge.target]]
+    return PoseGraph.create(slam_map.T_world_keyframe, edge_arrays(edges), ids=slam_map.column("scan"))
 
 
 def edge_arrays(edges: Sequence[MapEdge]) -> Edges:

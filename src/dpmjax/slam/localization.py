@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
 from dpmjax.slam.interfaces import Match, SlamMethods
-from dpmjax.slam.keyframe_map import KeyframeMap, Submap, submap_around, with_origin
+from dpmjax.slam.keyframe_map import KeyframeMap, Submap, measured_parts, submap_around, with_origin
 from dpmjax.slam.loop_closure import most_similar
 from dpmjax.slam.model_methods import methods_for
 from dpmjax.slam.system import corrected_points
@@ -95,11 +95,13 @@ class Localization(NamedTuple):
 
     Attributes:
         status: "found", "not in this map", or "empty": the scan has too few points.
-        T_world_scan: pose in the frame of the map; None where it was not found.
+        T_world_scan: pose in the frame of the map, see `part`; None where it was not found.
         probability: P(correct) of the place; 0 where it was not found.
         keyframe: row of the keyframe of the most probable registration; None where it was not found.
         reason: the numbers that decided.
         evidence: all registrations.
+        part: number of the part of the map that holds the pose (`measured_parts`). Only part 0 has the frame of the
+            map: the relative pose of a part that no loop joins is a guess.
     """
 
     status: LocalizationStatus
@@ -108,6 +110,7 @@ class Localization(NamedTuple):
     keyframe: int | None
     reason: str
     evidence: tuple[KeyframeMatch, ...] = ()
+    part: int = 0
 
     @property
     def is_in_map(self) -> bool:
@@ -162,7 +165,7 @@ def localize_each(
     methods = methods_for(model, slam_map)
     if slam_map.origin is None:
         raise ValueError("slam_map: expected keyframes, got an empty map")
-    search = _Search(methods, slam_map, config or LocalizationConfig())
+    search = _Search(methods, slam_map, config or LocalizationConfig(), measured_parts(slam_map))
     with_origin(slam_map, search.methods.origin)
     yield from map(search.localized, scans)
 
@@ -172,10 +175,11 @@ Place = tuple[KeyframeMatch, ...]
 
 
 class _Search(NamedTuple):
-    # The map, and the settings of the search in it.
+    # The map, the settings of the search in it, and the part of each keyframe.
     methods: SlamMethods
     slam_map: KeyframeMap
     config: LocalizationConfig
+    parts: Int[np.ndarray, " k"]
 
     def localized(self, scan: Float[AnyArray, "_n 3"]) -> Localization:
         """Registers the scan with keyframes until the place is clear, or none is left."""
@@ -188,7 +192,7 @@ class _Search(NamedTuple):
             tried += self._registered(rows[start : start + NUM_AT_ONCE], compact, tried)
             places = self._places(tried)
             if places and not self._is_supported(places[0], self.config.min_support):
-                apart_m = self.slam_map.distances_to(places[0][0].T_world_scan[:3, 3])
+                apart_m = self._distances(places[0][0].T_world_scan, places[0][0].keyframe)
                 done = [one.keyframe for one in tried]
                 nearest = [row for row in np.argsort(apart_m, kind="stable").tolist() if apart_m[row] <= extent_m]
                 near = [row for row in nearest if row not in done][:NUM_NEIGHBOURS]
@@ -225,10 +229,18 @@ class _Search(NamedTuple):
         left = [one for one in left if one.match.probability >= MIN_PROBABILITY]
         places = []
         while first := next((one for one in left if one.do_scans_agree), None):
-            others = [one for one in left if one is not first and _agree(first, one)]
+            others = [one for one in left if one is not first and self._agree(first, one)]
             places.append((first, *others))
             left = [one for one in left if not any(one is member for member in places[-1])]
         return sorted(places, key=lambda place: -_total(place))
+
+    def _agree(self, one: KeyframeMatch, other: KeyframeMatch) -> bool:
+        is_one_frame = self.parts[one.keyframe] == self.parts[other.keyframe]
+        return bool(is_one_frame) and are_near(one.T_world_scan, other.T_world_scan, SAME_PLACE_M, SAME_PLACE_RAD)
+
+    def _distances(self, T_world: Pose, keyframe: int) -> Float[np.ndarray, " k"]:
+        """Returns the distances of all keyframes to a pose in the part of a keyframe; infinite in other parts."""
+        return np.where(self.parts == self.parts[keyframe], self.slam_map.distances_to(T_world[:3, 3]), np.inf)
 
     def _is_supported(self, place: Place, min_support: int) -> bool:
         return len(place) >= min_support and place[0].match.probability >= self.config.min_best
@@ -241,11 +253,14 @@ class _Search(NamedTuple):
         best, total, rival = places[0], _total(places[0]), _total(places[1]) if len(places) > 1 else 0.0
         first, probability = best[0], best[0].match.probability
         numbers = f"{len(best)} of {len(tried)} agree, P {probability:.2f}, sum {total:.2f}, next place {rival:.2f}"
-        is_alone = int((self.slam_map.distances_to(first.T_world_scan[:3, 3]) <= extent_m).sum()) <= 1
+        # Measured from the keyframe: a wrong pose beside the map would have no keyframe near it, either.
+        around_m = self._distances(self.slam_map.T_world_keyframe[first.keyframe], first.keyframe)
+        is_alone = int((around_m <= extent_m).sum()) <= 1
         is_supported = self._is_supported(best, 1 if is_alone else self.config.min_support)
         if not is_supported or rival > MAX_RIVAL_SHARE * total:
             return Localization("not in this map", None, 0.0, None, numbers, evidence)
-        return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence)
+        part = int(self.parts[first.keyframe])
+        return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence, part)
 
 
 def _do_scans_agree(match: Match) -> bool:
@@ -253,10 +268,6 @@ def _do_scans_agree(match: Match) -> bool:
     return shares is None or (
         shares.matched_share >= MIN_MATCHED_SHARE and shares.contradicted_share <= MAX_CONTRADICTED_SHARE
     )
-
-
-def _agree(one: KeyframeMatch, other: KeyframeMatch) -> bool:
-    return are_near(one.T_world_scan, other.T_world_scan, SAME_PLACE_M, SAME_PLACE_RAD)
 
 
 def _total(place: Place) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 from dpmjax.deepmapping.mapping import register_clouds
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
-from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, as_pose_graph, connected_parts
+from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, as_pose_graph, measured_parts
 from dpmjax.slam.loops import LoopState
 from dpmjax.types import AnyArray, Pose, Poses
 
@@ -49,11 +50,8 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     measured, guesses = slam_map.edges_of("odometry"), slam_map.edges_of("guess")
     accepted = [number for number, loop in enumerate(state.loops) if loop.status == "accepted"]
     edges = [state.loops[number].edge for number in accepted]
-    parts = connected_parts(len(slam_map), [*measured, *edges])
-    held = [edge for edge in guesses if parts[edge.source] != parts[edge.target]]
-    apart = connected_parts(len(slam_map), [*measured, *slam_map.edges_of("loop")])
-    T_world_keyframe = _joined_poses(slam_map.T_world_keyframe, apart, edges)
-    graph = as_pose_graph(replace(slam_map, T_world_keyframe=T_world_keyframe, edges=(*edges, *measured, *held)))
+    T_world_keyframe = _joined_poses(slam_map.T_world_keyframe, measured_parts(slam_map), edges)
+    graph = as_pose_graph(replace(slam_map, T_world_keyframe=T_world_keyframe, edges=(*edges, *measured, *guesses)))
     trust = np.full(len(graph.edges.source), CERTAIN)
     trust[: len(edges)] = 1.0
     settings = PoseGraphConfig(outlier_chi2=OUTLIER_CHI2, is_chordal_start=False)
@@ -115,7 +113,7 @@ def refine_keyframes(
     Returns:
         The map with refined poses, and the number of windows that became better.
     """
-    parts = windows(len(slam_map))
+    parts = _windows_of_parts(slam_map)
     motions: dict[int, Pose] = {}
     num_improved = 0
     for number, rows in enumerate(parts):
@@ -127,7 +125,14 @@ def refine_keyframes(
             first_new = rows.start + OVERLAP // 2
             motions |= {row: motion for row, motion in found.items() if row not in motions or row >= first_new}
         on_window(number + 1, len(parts))
-    return RefinedKeyframes(_with_motions(slam_map, motions) if motions else slam_map, len(parts), num_improved)
+    return RefinedKeyframes(with_motions(slam_map, motions) if motions else slam_map, len(parts), num_improved)
+
+
+def _windows_of_parts(slam_map: KeyframeMap) -> list[range]:
+    """Divides each run of keyframes whose relative poses are measured; no window has keyframes of two parts."""
+    borders = np.flatnonzero(np.diff(measured_parts(slam_map))) + 1
+    runs = itertools.pairwise([0, *borders.tolist(), len(slam_map)])
+    return [range(start + rows.start, start + rows.stop) for start, end in runs for rows in windows(end - start)]
 
 
 def windows(num_keyframes: int) -> list[range]:
@@ -154,8 +159,16 @@ def _fitted_motions(
     return {row: rigid.inverse(T[place - 1]) @ T[place] for place, row in enumerate(rows) if place}
 
 
-def _with_motions(slam_map: KeyframeMap, motions: dict[int, Pose]) -> KeyframeMap:
-    """Finds the poses that agree best with refined motions between neighbours and with the loops."""
+def with_motions(slam_map: KeyframeMap, motions: dict[int, Pose]) -> KeyframeMap:
+    """Finds the poses that agree best with refined motions between neighbours and with the loops.
+
+    Args:
+        slam_map: the map.
+        motions: `T_before_keyframe` of some rows.
+
+    Returns:
+        The map with new poses; its edges are unchanged.
+    """
     edges = [
         edge._replace(T_target_source=motions[edge.source])
         if edge.kind == "odometry" and edge.target == edge.source - 1 and edge.source in motions
