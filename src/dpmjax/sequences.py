@@ -383,6 +383,10 @@ class LidarSequence:
         except EmptyScanError:
             return np.zeros((0, 3), np.float32)
 
+    def with_reference(self) -> LidarSequence:
+        """Selects the scans that have a reference pose."""
+        return self if self.has_reference.all() else self.take(np.flatnonzero(self.has_reference))
+
     def take(self, selection: Selection) -> LidarSequence:
         """Selects scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(len(self))[selection]]

@@ -21,6 +21,9 @@ from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods
 from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
 
+# T_lidar_camera: the camera looks along its z axis.
+AXES = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
@@ -33,6 +36,7 @@ def case(tmp_path_factory):
     dpmjax.save_map(folder / "map.npz", result.map)
     write_kitti_sequence(folder / "kitti", "00", drive)
     np.save(folder / "poses.npy", drive.T_world_lidar)
+    np.save(folder / "camera.npy", rigid.inverse(AXES) @ drive.T_world_lidar @ AXES)
     return folder
 
 
@@ -109,6 +113,7 @@ def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, wi
         ({"scans": "nowhere"}, "nowhere"),
         ({"weights": "no_such_model"}, "no_such_model"),
         ({"map_poses": "none.npy"}, "none.npy"),
+        ({"map_poses": "camera.npy"}, "motions between keyframes differ by"),
         ({"weights": "other.safetensors"}, "name the weights that made it with --weights"),
         ({"weights": "other.safetensors"}, "/other.safetensors ("),
     ],

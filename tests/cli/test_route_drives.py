@@ -139,3 +139,10 @@ def test_nothing_stands_on_the_route(tmp_path, monkeypatch) -> None:
         assert len(points) > 30_000
         is_car = (np.abs(points[:, 0]) < 2.5) & (np.abs(points[:, 1]) < 1.0) & (np.abs(points[:, 2]) < 1.2)
         assert not is_car.any()
+
+
+def test_scans_are_simulated_where_they_cannot_be_kept(tmp_path) -> None:
+    points = np.ones((3, 3), np.float32)
+    (tmp_path / "file").write_text("")
+    kept = keep_scans(LidarSequence("town", ("a",), lambda _index: points), tmp_path / "file")
+    np.testing.assert_array_equal(kept.read_scan(0), points)

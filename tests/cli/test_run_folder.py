@@ -130,6 +130,15 @@ def test_resume_takes_the_latest_run_and_refuses_other_options():
     assert open_run(seed=1, seconds=60.0, resume=True).is_resumed
 
 
+def test_a_path_through_latest_names_the_run_that_it_was(tmp_path):
+    """The next run moves the link, and a resumed one must find the same file."""
+    first = open_run(seed=1)
+    link = run_folder.RESULTS / "toy" / "latest"
+    config = run_folder.without_latest(Config(data=link / "map.npz"))
+    assert config.data == first.path / "map.npz"
+    assert run_folder.without_latest(Config(data=Path("latest/map.npz"))).data == Path("latest/map.npz")
+
+
 def test_folder_that_cannot_be_made_is_an_input_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"cannot write to .*file"):

@@ -219,6 +219,12 @@ def test_data_that_cannot_be_trained_on_is_named(as_user, tmp_path, capsys) -> N
     assert "all 4 scans are bad" in refused(tmp_path, capsys, "--data", spoiled)
 
 
+def test_a_drive_that_cannot_be_validated_on_is_named_before_scans_are_prepared(as_user, tmp_path, capsys) -> None:
+    good, without = write_drive(tmp_path / "good"), write_drive(tmp_path / "without", has_poses=False)
+    assert "nowhere" in refused(tmp_path, capsys, "--data", good, "--validate", tmp_path / "nowhere")
+    assert "no poses" in refused(tmp_path, capsys, "--data", good, "--validate", without)
+
+
 def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> None:
     good = write_drive(tmp_path / "good")
     (tmp_path / "file").write_text("")

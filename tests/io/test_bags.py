@@ -207,6 +207,25 @@ def test_planar_scans_come_with_the_odometry_of_the_laser(tmp_path: Path, kind: 
     assert_on_walls(points_in_world(scans, scans.odometry_poses))
 
 
+@pytest.mark.parametrize(("topic", "num"), [("/tf_static", 2), ("/tf", NUM)])
+@pytest.mark.parametrize("has_odometry_topic", [False, True])
+def test_a_mounting_that_is_published_again_stays_one(
+    tmp_path: Path, topic: str, num: int, has_odometry_topic: bool
+) -> None:
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        for index in range(num):
+            bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS + index * STEP_NS, topic=topic)
+        for index, pose in enumerate(POSES):
+            stamp = EPOCH_NS + index * STEP_NS
+            if has_odometry_topic:
+                bag.write_odometry(pose, stamp)
+            else:
+                bag.write_transform(("odom", "base_link"), pose, stamp)
+            bag.write_scan(room(se2.compose(pose, T_BASE_LASER)), stamp)
+    scans = read_sequence(bag.path)
+    np.testing.assert_allclose(scans.odometry_poses, se2.compose(POSES, T_BASE_LASER), atol=1e-6)
+
+
 def test_a_laser_upside_down_is_turned(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
         bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS, topic="/tf_static", is_upside_down=True)

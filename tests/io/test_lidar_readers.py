@@ -1,6 +1,7 @@
 """Tiny drives in each layout, and the real ones."""
 
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from dpmjax.io import (
     list_lidar_sequences,
     open_lidar_sequence,
     read_lidar_file,
+    require_whole_files,
+    write_atomically,
     write_ply,
 )
 from dpmjax.io.poses import interpolate_poses
@@ -149,7 +152,10 @@ def test_kitti_360_interpolates_where_the_car_stands(tmp_path, clouds, poses):
     sequence = open_lidar_sequence(tmp_path)
     middle = interpolate_poses(np.array([2.0, 4.0]), in_grid[[2, 4]], np.array([3.0]))
     wanted = np.stack([in_grid[1], in_grid[2], middle[0], in_grid[4]])
-    assert_same(sequence, clouds[1:5], rigid.inverse(wanted[0]) @ wanted)
+    np.testing.assert_array_equal(sequence.has_reference, [False, True, True, True, True])
+    assert any(note.is_doubt and "1 of 5 scans have no reference pose" in note.text for note in sequence.notes)
+    np.testing.assert_array_equal(sequence[0], clouds[0])
+    assert_same(sequence.with_reference(), clouds[1:5], rigid.inverse(wanted[0]) @ wanted)
 
 
 @pytest.mark.parametrize("home", ["Ouster", "sensor_data/Ouster"])
@@ -167,6 +173,35 @@ def test_mulran_poses_are_found_by_time(tmp_path, clouds, poses, home):
     sequence = open_lidar_sequence(tmp_path)
     assert_same(sequence, clouds[:4], poses[:4])
     np.testing.assert_allclose(sequence.times, [0, 0.1, 0.2, 0.3], atol=1e-6)
+
+
+def test_a_linked_sequence_keeps_its_name_and_its_poses(tmp_path, clouds, poses):
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "poses" / "07.txt").write_text(rows(poses[:3]))
+    store = tmp_path / "elsewhere" / "ab"
+    for index in range(3):
+        write_bin(store / "velodyne" / f"{index:06d}.bin", clouds[index])
+    (store / "calib.txt").write_text("Tr: " + rows(np.eye(4)[None]))
+    (tmp_path / "sequences").mkdir()
+    (tmp_path / "sequences" / "07").symlink_to(store, target_is_directory=True)
+    sequence = open_lidar_sequence(tmp_path, sequence="07")
+    assert sequence.name == "07"
+    assert_same(sequence, clouds[:3], poses[:3])
+
+
+def test_a_broken_link_among_scans_is_refused(tmp_path, clouds):
+    for index in range(3):
+        write_bin(tmp_path / "drive" / f"{index:06d}.bin", clouds[index])
+    (tmp_path / "drive" / "000003.bin").symlink_to(tmp_path / "gone.bin")
+    with pytest.raises(InputError, match="000003.bin"):
+        require_whole_files(open_lidar_sequence(tmp_path / "drive"))
+
+
+def test_a_folder_that_cannot_be_read_is_no_drive(tmp_path, clouds, monkeypatch):
+    for name in ("00", "lost+found"):
+        write_bin(tmp_path / name / "000000.bin", clouds[0])
+    monkeypatch.setattr("dpmjax.io.lidar.os.access", lambda path, _mode: path.name != "lost+found")
+    assert list_lidar_sequences(tmp_path) == ["00"]
 
 
 def test_kitti_carla_takes_every_hundredth_pose(tmp_path, clouds, poses):
@@ -387,3 +422,8 @@ def test_a_damaged_npz_is_named(tmp_path, clouds, poses):
         assert list(readable_scans(sequence)) == [0, 2]
         with pytest.raises(InputError, match=r"1\.npz"):
             sequence.read_scan(1)
+
+
+def test_a_name_that_is_no_utf_8_keeps_its_bytes(tmp_path):
+    name = os.fsdecode(b"stra\xdfe_0.npy")
+    assert write_atomically(tmp_path / "list.txt", name).read_bytes() == b"stra\xdfe_0.npy"

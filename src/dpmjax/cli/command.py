@@ -21,7 +21,14 @@ from tqdm import tqdm
 from dpmjax.cli import program
 from dpmjax.cli.info import select_device
 from dpmjax.cli.options import parse_options
-from dpmjax.cli.run_folder import OutputOptions, RunFailedError, check_run_folder, find_run, load_config
+from dpmjax.cli.run_folder import (
+    OutputOptions,
+    RunFailedError,
+    check_run_folder,
+    find_run,
+    load_config,
+    without_latest,
+)
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError
 
@@ -160,7 +167,7 @@ def run_command(
     previous = {number: signal.signal(number, _interrupt) for number in SIGNALS}
     enable_compile_cache()
     try:
-        config = _parse(config_type, name, description, arguments)
+        config = without_latest(_parse(config_type, name, description, arguments))
         # Of several processes that run as one, `main` selects devices and one opens the folder.
         if isinstance(config, OutputOptions) and getattr(config, "coordinator", None) is None:
             check_run_folder(config, name)
@@ -172,6 +179,8 @@ def run_command(
         return _say(f"stopped by {stop}", stop.exit_code)
     except ValueError as error:
         return _say(f"error: {error}", EXIT_BAD_INPUT)
+    except PermissionError as error:
+        return _say(f"error: {error.filename}: {error.strerror}", EXIT_BAD_INPUT)
     except RunFailedError as error:
         # A full disk is no fault of the program; log.txt has the traceback.
         if not isinstance(error.__cause__, InputError | OSError):

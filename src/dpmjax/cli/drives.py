@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from io import BytesIO
@@ -170,11 +171,14 @@ def keep_scans(drive: LidarSequence, folder: Path = RESULTS / "simulated") -> Li
 
 def _read_kept(folder: Path, read_scan: Callable[[int], NDArray[np.float32]], index: int) -> NDArray[np.float32]:
     path = folder / f"{index:06}.npy"
-    if not path.exists():
-        buffer = BytesIO()
-        np.save(buffer, np.rint(read_scan(index) / STEP_M).astype(np.int16))
-        io.write_atomically(path, buffer.getvalue())
-    return np.load(path).astype(np.float32) * np.float32(STEP_M)
+    if path.exists():
+        steps = np.load(path)
+    else:
+        buffer, steps = BytesIO(), np.rint(read_scan(index) / STEP_M).astype(np.int16)
+        np.save(buffer, steps)
+        with suppress(OSError):  # in a folder that cannot be written, scans are simulated again
+            io.write_atomically(path, buffer.getvalue())
+    return steps.astype(np.float32) * np.float32(STEP_M)
 
 
 def _digest(drive: LidarSequence) -> str:
@@ -191,7 +195,7 @@ Source = Callable[[], LidarSequence]
 def open_with_poses(path: Path, name: str | None) -> LidarSequence:
     """Opens a drive, or simulates a town along a file of poses; scans without a pose of its reference are left out."""
     drive = open_path(path, 0, sequence=name)
-    return drive if drive.T_world_lidar is None else drive.take(np.flatnonzero(drive.has_reference))
+    return drive if drive.T_world_lidar is None else drive.with_reference()
 
 
 def find_sources(

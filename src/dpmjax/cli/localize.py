@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, io, slam, viz, weights
+from dpmjax import cli, geometry, io, slam, viz, weights
 from dpmjax.sequences import InputError, LidarSequence
 
 NAME = "localize"
@@ -29,6 +29,8 @@ POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
 COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "part", "seconds", *POSE, "reason"]
 # Largest distance from a keyframe at which a scan is expected in the map.
 REACH_M = 15.0
+# Motions between keyframes differ by less than this share of their length from those of the right reference.
+WRONG_SHARE = 0.5
 NUM_MAP_POINTS = 200_000
 
 
@@ -112,7 +114,23 @@ def reference_of(config: Config, slam_map: slam.KeyframeMap, drive: LidarSequenc
     poses, numbers = io.read_poses(config.map_poses), [keyframe.scan for keyframe in slam_map.keyframes]
     if max(numbers) >= len(poses):
         raise ValueError(f"{config.map_poses}: {len(poses)} poses, the map has a keyframe of scan {max(numbers)}")
+    _check_map_poses(config.map_poses, poses[numbers], slam_map)
     return poses[numbers]
+
+
+def _check_map_poses(path: Path, reference: np.ndarray, slam_map: slam.KeyframeMap) -> None:
+    """Raises a `ValueError` where the motions between keyframes are not those of the map."""
+    edges = slam_map.edges_of("odometry")
+    if not edges:
+        return
+    source, target = [edge.source for edge in edges], [edge.target for edge in edges]
+    moved = geometry.rigid.inverse(reference[target]) @ reference[source]
+    measured = np.array([edge.T_target_source for edge in edges])
+    errors = geometry.rigid.inverse(moved) @ measured
+    errors_m, steps_m = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (errors, measured))
+    if np.median(errors_m) > WRONG_SHARE * np.median(steps_m):
+        found = f"motions between keyframes differ by {np.median(errors_m):.2g} m from those of the map"
+        raise ValueError(f"--map-poses {path}: {found}; give T_world_lidar of each scan that the run has used (--jump)")
 
 
 def as_row(number: int, case: Case, result: slam.Localization, seconds: float) -> dict[str, str]:

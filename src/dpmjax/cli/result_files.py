@@ -129,7 +129,7 @@ class HistoryFile:
     def __init__(self, path: Path, columns: Sequence[str], *, keep_until: int | None = None) -> None:
         earlier = read_history(path) if keep_until is not None and path.exists() else []
         write_table(path, columns, [row for row in earlier if int(row[columns[0]]) <= (keep_until or 0)])
-        self._file = path.open("a", newline="", encoding="utf-8")
+        self._file = path.open("a", newline="", encoding="utf-8", errors="surrogateescape")
         self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
 
     def append(self, **row: object) -> None:
@@ -146,5 +146,5 @@ class HistoryFile:
 
 def read_history(path: Path) -> list[dict[str, str]]:
     """Returns the rows of the table, without a last line that a crash has cut off."""
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8", errors="surrogateescape")
     return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))

@@ -31,7 +31,7 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import cli, deeppointmap, simulation, viz, weights
+from dpmjax import cli, deeppointmap, io, simulation, viz, weights
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
@@ -127,6 +127,9 @@ def main(config: Config) -> None:
         town = partial(simulation.simulate_drive, length_m=config.town_length_m, mixture=simulation.TRAINING_MIXTURE)
         towns = [partial(town, config.seed + number) for number in range(config.num_towns)]
         sources = cli.find_sources(config.data, towns, settings.sampling)
+        for path in config.validate:
+            if (reason := deeppointmap.why_useless(io.open_lidar_sequence(path), settings.sampling)) is not None:
+                raise ValueError(f"--validate {path}: {reason}")
         folder = cli.open_run_folder(config, NAME) if is_first() else None
     with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
         with together():

@@ -102,7 +102,8 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
 
     Args:
         path: where the file goes; an existing file is replaced.
-        content: bytes, or text (written as UTF-8, lines end with a line feed alone).
+        content: bytes, or text (written as UTF-8, lines end with a line feed alone; names of files that are no UTF-8
+            keep their bytes).
 
     Returns:
         The path.
@@ -114,7 +115,7 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(content.encode(errors="surrogateescape") if isinstance(content, str) else content)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -178,10 +179,15 @@ def _drives(path: Path) -> dict[str, Path]:
     for below in ("sequences", "dataset/sequences", "data_3d_raw"):
         if (path / below).is_dir():
             return _drives(path / below)
-    children = [child for child in sorted(path.iterdir()) if child.is_dir()]
+    children = _readable_folders(path)
     found = {child.name: child for child in children if _is_drive(child)}
-    deeper = (folder for child in children for folder in sorted(child.iterdir()) if folder.is_dir())
+    deeper = (folder for child in children for folder in _readable_folders(child))
     return found or {f"{folder.parent.name}/{folder.name}": folder for folder in deeper if _is_drive(folder)}
+
+
+def _readable_folders(path: Path) -> list[Path]:
+    # Others, such as lost+found, are no drives.
+    return [child for child in sorted(path.iterdir()) if child.is_dir() and os.access(child, os.R_OK | os.X_OK)]
 
 
 def _is_drive(path: Path) -> bool:

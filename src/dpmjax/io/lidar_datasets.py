@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
-from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, scan_times
+from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, matching_note, scan_times
 from dpmjax.io.scan_names import POSE_FILES, match_rows, numbers_of, scan_files
 from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
 
@@ -121,8 +122,10 @@ def read_kitti_odometry(folder: Path, scans: Path) -> Drive3D:
         The drive.
     """
     files = scan_files(scans)
-    in_lidar, name = folder / "poses_lidar.txt", folder.resolve().name
-    in_camera = [folder / "poses.txt", folder.resolve().parents[1] / "poses" / f"{name}.txt"]
+    # As it was given: the folder may be a link, and the poses lie beside the link.
+    in_lidar, given = folder / "poses_lidar.txt", Path(os.path.abspath(folder))
+    name = given.name
+    in_camera = [folder / "poses.txt", given.parent.parent / "poses" / f"{name}.txt"]
     drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
     path = next((p for p in (in_lidar, *in_camera) if p.is_file()), find_pose_file(folder))
     if path is None or not files:
@@ -140,8 +143,9 @@ def read_kitti_odometry(folder: Path, scans: Path) -> Drive3D:
 def read_velodyne_points(folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
     files = scan_files(scans)
-    drive = Drive3D(folder.resolve().name, files, times=_read_stamps(scans.parent / "timestamps.txt", files))
-    is_kitti_360 = folder.resolve().parent.name == "data_3d_raw"
+    given = Path(os.path.abspath(folder))
+    drive = Drive3D(given.name, files, times=_read_stamps(scans.parent / "timestamps.txt", files))
+    is_kitti_360 = given.parent.name == "data_3d_raw"
     return _with_kitti_360_poses(drive, folder) if is_kitti_360 else _with_oxts_poses(drive, folder)
 
 
@@ -171,12 +175,12 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
     """Adds the poses of KITTI-360: data_poses/DRIVE/poses.txt and calibration/ beside data_3d_raw/.
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
-    after the last pose are left out.
+    after the last pose have no reference.
 
     Returns:
         The drive.
     """
-    root = folder.resolve().parents[1]
+    root = Path(os.path.abspath(folder)).parent.parent
     path = root / "data_poses" / drive.name / "poses.txt"
     if not path.is_file():
         return drive
@@ -189,7 +193,7 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
     T_lidar_cam0 = from_rows(_first_row(calibration, 12), calibration)
     T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
     frames = np.array(_require_numbers(drive.files), np.float64)
-    return _interpolate(drive, frames, (rows[:, 0], T_world_lidar), path)
+    return _interpolate(drive, frames, (rows[:, 0], T_world_lidar), path, how="the numbers of the frames")
 
 
 def read_kitti_carla(_folder: Path, scans: Path) -> Drive3D:
@@ -216,7 +220,7 @@ def read_kitti_carla(_folder: Path, scans: Path) -> Drive3D:
 def read_mulran(folder: Path, scans: Path) -> Drive3D:
     """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
 
-    The world is the first lidar frame. Scans half a second or more outside of the poses are left out.
+    The world is the first lidar frame with a pose. Scans half a second or more outside of the poses have no reference.
 
     Returns:
         The drive.
@@ -236,20 +240,27 @@ def read_mulran(folder: Path, scans: Path) -> Drive3D:
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
     T_car_lidar = homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
     poses = from_rows(rows[:, 1:], path) @ T_car_lidar
-    return _interpolate(drive, times, (pose_times, poses), path, slack=_MULRAN_SLACK_S)
+    return _interpolate(drive, times, (pose_times, poses), path, how="time", slack=_MULRAN_SLACK_S)
 
 
 def _interpolate(
-    drive: Drive3D, wanted: FloatArray, stamped: tuple[FloatArray, FloatArray], path: Path, *, slack: float = 0.0
+    drive: Drive3D,
+    wanted: FloatArray,
+    stamped: tuple[FloatArray, FloatArray],
+    path: Path,
+    *,
+    how: str,
+    slack: float = 0.0,
 ) -> Drive3D:
-    """Selects the scans within `slack` of the times of the poses, with interpolated poses relative to the first."""
+    """Adds interpolated poses, relative to the first, to the scans within `slack` of the times of the poses."""
     times, first = np.unique(stamped[0], return_index=True)
     kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
     require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
     found = interpolate_poses(times, stamped[1][first], wanted[kept])
-    stamps = None if drive.times is None else drive.times[kept]
+    T_world_lidar = np.full((len(wanted), 4, 4), np.nan)
     # In the frame of the first, without the 1e6 m of national grids.
-    return Drive3D(drive.name, [drive.files[i] for i in kept], rigid.inverse(found[0]) @ found, stamps)
+    T_world_lidar[kept] = rigid.inverse(found[0]) @ found
+    return drive._replace(T_world_lidar=T_world_lidar, notes=(*drive.notes, matching_note(path, how, T_world_lidar)))
 
 
 def _require_numbers(files: list[Path]) -> list[int]:

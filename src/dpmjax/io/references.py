@@ -158,12 +158,12 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
     if stamps is not None and _are_numbers(stamps, times, num_scans):
         T = np.full((num_scans, 4, 4), np.nan)
         T[stamps.astype(np.int64)] = found.poses
-        return Reference(T, _note_of(path, "the numbers that are their stamps", T))
+        return Reference(T, (matching_note(path, "the numbers that are their stamps", T),))
     reason, is_doubt = "the file has no times" if stamps is None else "the scans have no times", False
     if stamps is not None and times is not None:
         T, tolerance_s = _by_time(to_seconds(stamps), found.poses, times)
         if np.isfinite(T[:, 0, 0]).any():
-            return Reference(T, _note_of(path, f"time, tolerance {tolerance_s:.3g} s", T))
+            return Reference(T, (matching_note(path, f"time, tolerance {tolerance_s:.3g} s", T),))
         reason, is_doubt = "no scan has the time of a pose", True
     advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
     require(count == num_scans, path, f"{counted(count, 'pose')} for {num_scans} scans, and {reason}", advice)
@@ -260,11 +260,21 @@ def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[
     return T, tolerance_s
 
 
-def _note_of(path: Path, how: str, T: FloatArray) -> tuple[Note, ...]:
+def matching_note(path: Path, how: str, T: FloatArray) -> Note:
+    """Makes the note on the scans that have a reference pose; those without one make it a doubt.
+
+    Args:
+        path: file of the poses.
+        how: how they were matched.
+        T: (n, 4, 4) poses, NaN for scans without one.
+
+    Returns:
+        The note.
+    """
     num_without = int(np.isnan(T[:, 0, 0]).sum())
     found = f"{num_without} of {len(T)} scans have no reference pose"
     text = f"{path}: poses are matched by {how}; {found if num_without else 'all scans have a reference pose'}"
-    return (Note(text, is_doubt=num_without > 0),)
+    return Note(text, is_doubt=num_without > 0)
 
 
 def read_relations(path: str | Path) -> Relations:

@@ -179,6 +179,11 @@ class _Motions(NamedTuple):
         times, first = np.unique([time for time, _ in rows], return_index=True)
         return cls(times, np.array([rows[i][1] for i in first]))
 
+    def once_if_constant(self) -> _Motions:
+        """Returns a single row where all poses are the same, as of a mounting that is published again and again."""
+        is_constant = float(np.ptp(self.T_parent_child, axis=0).max()) < _SAME_POSE
+        return _Motions(self.times[:1], self.T_parent_child[:1]) if is_constant else self
+
     def at(self, wanted: FloatArray) -> FloatArray:
         return interpolate_poses(self.times, self.T_parent_child, wanted)
 
@@ -186,6 +191,9 @@ class _Motions(NamedTuple):
         is_near = (wanted >= self.times[0] - _SLACK_S) & (wanted <= self.times[-1] + _SLACK_S)
         return len(self.times) > 1 and float(is_near.mean()) >= _LEAST_SHARE
 
+
+# Largest difference of the numbers of poses that count as the same.
+_SAME_POSE = 1e-9
 
 _Edges = dict[str, tuple[str, _Motions]]
 
@@ -284,7 +292,7 @@ def _transforms(bag: _Bag) -> _Edges:
                 rows.setdefault(ends, []).append((_stamp_of(each), T))
     # Of a frame with several parents, the one of the most transforms.
     ordered = sorted(rows.items(), key=lambda entry: len(entry[1]))
-    return {child: (parent, _Motions.of(found)) for (parent, child), found in ordered}
+    return {child: (parent, _Motions.of(found).once_if_constant()) for (parent, child), found in ordered}
 
 
 def _odometry(bag: _Bag, edges: _Edges, frame: str, times: FloatArray) -> tuple[FloatArray | None, Note | None]:

@@ -75,7 +75,7 @@ def _files_of_one_ending(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Returns the files of the most frequent ending, unsorted."""
     if not folder.is_dir():
         return []
-    files = [f for f in folder.iterdir() if f.is_file() and f.name[0] != "." and f.name not in POSE_FILES]
+    files = [f for f in folder.iterdir() if not f.is_dir() and f.name[0] != "." and f.name not in POSE_FILES]
     return max(([f for f in files if f.suffix.lower() == suffix] for suffix in suffixes), key=len)
 
 

@@ -269,7 +269,7 @@ def prepare_drives(
     prepared = []
     for number, drive in enumerate(drives):
         LOGGER.info("prepares %s, %d scans, drive %d of %d", drive.name, len(drive), number + 1, len(drives))
-        prepared.append(prepare_drive(drive, config, folder=folder, seed=seed))
+        prepared.append(prepare_drive(drive.with_reference(), config, folder=folder, seed=seed))
     return ScanStore(prepared)
 
 
@@ -285,7 +285,7 @@ def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> s
     """
     if drive.T_world_lidar is None:
         return "no poses; a pose for each scan is needed, such as a file poses.txt beside the scans (docs/files.md)"
-    positions = drive.T_world_lidar[:, :3, 3]
+    positions = drive.T_world_lidar[drive.has_reference, :3, 3]
     tree = cKDTree(positions)
     limits = MIN_DISTANCE_M, sampling.max_distance_m
     num_too_near, num_near = (tree.count_neighbors(tree, limit) for limit in limits)
