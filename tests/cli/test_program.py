@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -32,7 +31,6 @@ def test_help_lists_every_subcommand_and_loads_nothing() -> None:
 
 @pytest.mark.parametrize("name", sorted(program.COMMANDS))
 def test_help_of_a_subcommand_has_examples_and_loads_nothing_slow(name) -> None:
-    started = time.perf_counter()
     code = (
         f"import sys; from dpmjax.cli.program import main; code = main([{name!r}, '--help']);"
         "assert not {'jax', 'scipy', 'matplotlib'} & sys.modules.keys(); raise SystemExit(code)"
@@ -40,8 +38,6 @@ def test_help_of_a_subcommand_has_examples_and_loads_nothing_slow(name) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f"    dpmjax {name}" in done.stdout
-    # Half a second is promised; a busy machine gets some slack.
-    assert time.perf_counter() - started < 3.0
 
 
 @pytest.mark.parametrize(
