@@ -22,15 +22,10 @@ PACKAGES = [dpmjax, *(getattr(dpmjax, name) for name in FOLDERS)]
 API = Path(__file__).parents[1] / "docs" / "api.md"
 
 
-def test_import_loads_no_jax_and_is_fast() -> None:
-    program = (
-        "import sys, time; start = time.perf_counter(); import dpmjax; seconds = time.perf_counter() - start;"
-        "assert 'jax' not in sys.modules and 'numpy' not in sys.modules, 'import dpmjax imports too much';"
-        "print(seconds)"
-    )
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    # 0.1 s is promised; a busy machine gets some slack.
-    assert float(result.stdout) < 0.5
+def test_import_loads_neither_jax_nor_numpy() -> None:
+    program = "import sys, dpmjax; assert not {'jax', 'numpy'} & sys.modules.keys(), 'import dpmjax imports too much'"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_every_room_is_reached_from_the_package_alone() -> None:
