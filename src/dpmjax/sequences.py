@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 Unit = Literal["px", "m"]
 BoolArray = NDArray[np.bool_]
 # Start, stop and stride in scans, or the rows to keep, in the order wanted.
-Selection = slice | NDArray[np.integer]
+Selection = slice | NDArray[np.integer] | NDArray[np.bool_]
 
 
 class InputError(ValueError):
@@ -382,10 +382,6 @@ class LidarSequence:
             return self.read_scan(index)
         except EmptyScanError:
             return np.zeros((0, 3), np.float32)
-
-    def with_reference(self) -> LidarSequence:
-        """Selects the scans that have a reference pose."""
-        return self if self.has_reference.all() else self.take(np.flatnonzero(self.has_reference))
 
     def take(self, selection: Selection) -> LidarSequence:
         """Selects scans with their poses and times, in the same world; nothing is read."""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from dpmjax.cli import resumable_table, run_folder
+from dpmjax.cli.options import without_latest
 from dpmjax.cli.result_files import HistoryFile, commits_note, read_history, write_json
 from dpmjax.cli.resumable_table import do_row, row_path
 from dpmjax.cli.run_folder import (
@@ -134,9 +135,9 @@ def test_a_path_through_latest_names_the_run_that_it_was(tmp_path):
     """The next run moves the link, and a resumed one must find the same file."""
     first = open_run(seed=1)
     link = run_folder.RESULTS / "toy" / "latest"
-    config = run_folder.without_latest(Config(data=link / "map.npz"))
+    config = without_latest(Config(data=link / "map.npz"))
     assert config.data == first.path / "map.npz"
-    assert run_folder.without_latest(Config(data=Path("latest/map.npz"))).data == Path("latest/map.npz")
+    assert without_latest(Config(data=Path("latest/map.npz"))).data == Path("latest/map.npz")
 
 
 def test_folder_that_cannot_be_made_is_an_input_error(tmp_path):

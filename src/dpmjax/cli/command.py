@@ -20,15 +20,8 @@ from tqdm import tqdm
 
 from dpmjax.cli import program
 from dpmjax.cli.info import select_device
-from dpmjax.cli.options import parse_options
-from dpmjax.cli.run_folder import (
-    OutputOptions,
-    RunFailedError,
-    check_run_folder,
-    find_run,
-    load_config,
-    without_latest,
-)
+from dpmjax.cli.options import parse_options, without_latest
+from dpmjax.cli.run_folder import OutputOptions, RunFailedError, check_run_folder, find_run, load_config
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError
 

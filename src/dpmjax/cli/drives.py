@@ -195,7 +195,7 @@ Source = Callable[[], LidarSequence]
 def open_with_poses(path: Path, name: str | None) -> LidarSequence:
     """Opens a drive, or simulates a town along a file of poses; scans without a pose of its reference are left out."""
     drive = open_path(path, 0, sequence=name)
-    return drive if drive.T_world_lidar is None else drive.with_reference()
+    return drive if drive.T_world_lidar is None else drive.take(drive.has_reference)
 
 
 def find_sources(

@@ -6,9 +6,10 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import replace
+from dataclasses import fields, replace
 from io import StringIO
 from itertools import dropwhile, takewhile
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args
 
@@ -164,3 +165,29 @@ def _tuple_rule(info: PrimitiveTypeInfo) -> Any:
         is_instance=lambda value: isinstance(value, tuple) and all(map(spec.is_instance, value)),
         str_from_instance=lambda value: [word for item in value for word in spec.str_from_instance(item)],
     )
+
+
+def without_latest(config: ConfigT) -> ConfigT:
+    """Replaces the link `latest` in paths by the run that it points to: the next run moves it.
+
+    Args:
+        config: options, a dataclass.
+
+    Returns:
+        The options.
+    """
+    values = {field.name: getattr(config, field.name) for field in fields(config)}  # type: ignore[arg-type]
+    fixed = {name: _pinned(value) for name, value in values.items() if name != "output"}
+    changed = {name: value for name, value in fixed.items() if value != values[name]}
+    return replace(config, **changed) if changed else config  # type: ignore[type-var]
+
+
+def _pinned(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_pinned, value))
+    if not isinstance(value, str | Path) or "latest" not in Path(value).parts:
+        return value
+    parts = Path(value).parts
+    below = parts.index("latest") + 1
+    link = Path(*parts[:below])
+    return type(value)(link.parent / os.readlink(link) / Path(*parts[below:])) if link.is_symlink() else value

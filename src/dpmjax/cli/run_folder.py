@@ -8,7 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import ModuleType
@@ -175,32 +175,6 @@ def _lock(path: Path) -> None:
     except OSError:
         pass  # a network file system without locks
     _LOCKS[path.resolve()] = handle
-
-
-def without_latest(config: ConfigT) -> ConfigT:
-    """Replaces the link `latest` in paths by the run that it points to: the next run moves it.
-
-    Args:
-        config: options, a dataclass.
-
-    Returns:
-        The options.
-    """
-    values = {field.name: getattr(config, field.name) for field in fields(config)}  # type: ignore[arg-type]
-    fixed = {name: _pinned(value) for name, value in values.items() if name != "output"}
-    changed = {name: value for name, value in fixed.items() if value != values[name]}
-    return replace(config, **changed) if changed else config  # type: ignore[type-var]
-
-
-def _pinned(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return tuple(map(_pinned, value))
-    if not isinstance(value, str | Path) or "latest" not in Path(value).parts:
-        return value
-    parts = Path(value).parts
-    below = parts.index("latest") + 1
-    link = Path(*parts[:below])
-    return type(value)(link.parent / os.readlink(link) / Path(*parts[below:])) if link.is_symlink() else value
 
 
 def check_run_folder(config: Any, experiment: str) -> None:

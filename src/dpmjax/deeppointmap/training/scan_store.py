@@ -269,7 +269,7 @@ def prepare_drives(
     prepared = []
     for number, drive in enumerate(drives):
         LOGGER.info("prepares %s, %d scans, drive %d of %d", drive.name, len(drive), number + 1, len(drives))
-        prepared.append(prepare_drive(drive.with_reference(), config, folder=folder, seed=seed))
+        prepared.append(prepare_drive(drive.take(drive.has_reference), config, folder=folder, seed=seed))
     return ScanStore(prepared)
 
 
