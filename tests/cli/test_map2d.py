@@ -241,8 +241,13 @@ def test_help_needs_no_jax_and_shows_examples():
         ({"seconds": -1.0}, "--seconds"),
         ({"steps": 0}, "--steps"),
         ({"ordered": False, "init": "icp-plane"}, "--no-ordered"),
+        ({"topic": "/scan"}, "--topic"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Config(**options)
+
+
+def test_a_resumed_run_has_data_and_start_of_its_own() -> None:
+    assert Config(resume=True, topic="/scan", ordered=False).resume

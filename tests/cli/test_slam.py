@@ -105,9 +105,12 @@ def test_help_shows_examples(capsys) -> None:
         (["-n", 0], "--n-scans"),
         (["-j", 0], "--jump"),
         (["--sequence", "00"], "--sequence"),
+        (["--topic", "/points"], "--topic"),
+        (["--columns", 4], "--columns"),
         (["/no/such/folder"], "no such file or folder"),
         (["--weights", "no_such_model"], "no_such_model"),
         (["--resume", "-o", "/no/such/run"], "it is no run of slam"),
+        (["--resume", "--sequence", "00", "-o", "/no/such/run"], "it is no run of slam"),
     ],
 )
 def test_wrong_usage_is_one_line(options, message, capsys) -> None:

@@ -49,9 +49,15 @@ class DriveOptions(ScanOptions, ModelOptions, RunOptions):
 
     def check_data(self, data: object, sequence: str | None) -> None:
         """Raises a ValueError where options belong to files and no folder is given."""
-        if sequence is not None and not data:
+        if data or self.resume:  # a resumed run has its own
+            return
+        if sequence is not None:
             raise ValueError("--sequence chooses a drive of DATA: give its folder too")
-        if self.kitti_angle_correction and not data:
+        if self.topic is not None:
+            raise ValueError("--topic chooses clouds of a bag: give it too, DATA")
+        if self.columns is not None:
+            raise ValueError("--columns describes .bin files: give their folder too, DATA")
+        if self.kitti_angle_correction:
             raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
 
 

@@ -80,8 +80,10 @@ class Config(cli.ScanOptions, cli.RunOptions):
         cli.check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
         if self.seconds is not None and not self.seconds > 0.0:
             raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
-        if not self.ordered and self.init != "global":
+        if not self.ordered and self.init != "global" and not self.resume:
             raise ValueError(f"--no-ordered: only --init global needs no order, got --init {self.init}")
+        if self.topic is not None and self.data is None and not self.resume:
+            raise ValueError("--topic chooses scans of a bag: give it too, DATA")
         if self.data is not None and (self.world != 0 or self.range_noise_px != 0):
             raise ValueError("--world and --range-noise-px choose simulated scans; leave them out beside DATA")
 
