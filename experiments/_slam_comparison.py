@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from dpmjax import cli, io, load_map, load_model, metrics, save_map, slam, viz
+from dpmjax import cli, io, load_map, metrics, save_map, slam, viz
 from dpmjax.io import LidarSequence
 from dpmjax.saved_maps import Precision
 from dpmjax.simulation import HDL64E, OS1_64, DriveConfig, Scene, TownConfig, simulate_scene
@@ -84,10 +84,13 @@ def town_drive(number: int, length_m: float) -> LidarSequence:
 
 
 def compare(
-    config: cli.DriveOptions, experiment: str, sequences: list[LidarSequence], num_localized: int
+    config: cli.DriveOptions,
+    experiment: str,
+    methods: slam.SlamMethods,
+    sequences: list[LidarSequence],
+    num_localized: int,
 ) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
-    methods = slam.make_methods(load_model(config.weights), weights=config.weights)
     missing = {name: reason for name, (module, _) in PEERS.items() if (reason := cli.why_not_importable(module))}
     by_name = {sequence.name: sequence for sequence in sequences}
 

@@ -39,7 +39,7 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, encode, load_model, register, registration_recall
+from dpmjax import cli, encode, load_model, register, registration_recall, slam
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from dpmjax.metrics import mcnemar_p_value, wilson_interval
@@ -108,9 +108,10 @@ def evaluate_slam(config: Config) -> list[cli.Row]:
     """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
     from experiments import _slam_comparison as comparison
 
+    methods = slam.make_methods(load_model(config.weights), weights=config.weights)
     lengths_m = np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist()
     drives = comparison.open_drives(config.paths, config, lengths_m)
-    return comparison.compare(config, EXPERIMENT, drives, config.localize)
+    return comparison.compare(config, EXPERIMENT, methods, drives, config.localize)
 
 
 def evaluate_pairs(config: Config) -> list[cli.Row]:

@@ -366,6 +366,7 @@ def test_degenerate_trajectories_have_an_error_and_a_gradient() -> None:
         assert np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("metric", "dim"), [("point", 2), ("plane", 3)])
 def test_gradient_of_icp_is_that_of_its_solution(metric: str, dim: int, float64) -> None:
     arrays = {name: jnp.asarray(x, float) for name, x in moved_clouds(dim)(np.random.default_rng(3)).items()}

@@ -15,6 +15,7 @@ def result():
     return slam.drive(TRUTH, 0)
 
 
+@pytest.mark.slow
 def test_gross_errors_of_the_matcher_leave_the_map_whole(result) -> None:
     proof = slam.judged(result, TRUTH)
     assert proof.num_wrong == 0
@@ -23,6 +24,7 @@ def test_gross_errors_of_the_matcher_leave_the_map_whole(result) -> None:
     assert proof.ate_m < proof.ate_odometry_m
 
 
+@pytest.mark.slow
 def test_a_wrong_loop_is_counted(result) -> None:
     loops = list(result.loops)
     first = next(number for number, loop in enumerate(loops) if loop.status == "accepted")

@@ -56,6 +56,7 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_registered", [1, 4])
 def test_ctrl_c_within_a_band_keeps_the_rows_before_it(weights, tmp_path, monkeypatch, num_registered: int) -> None:
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))

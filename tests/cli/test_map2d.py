@@ -119,6 +119,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     ]
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, monkeypatch) -> None:
     def interrupted(*options: object, **hooks: object) -> object:
         os.kill(os.getpid(), signal.SIGINT)

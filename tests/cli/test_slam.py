@@ -225,6 +225,7 @@ def test_a_full_disk_is_one_line(drive, with_truth, tmp_path, monkeypatch, capsy
     assert "Traceback" in (tmp_path / "out" / "log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:
     drive = write_drive(tmp_path / "drive")
     np.save(drive / "030.npy", np.zeros((5, 3), np.float32))
@@ -254,6 +255,7 @@ def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp
     assert_same_results(out, whole)
 
 
+@pytest.mark.slow
 def test_a_run_of_the_first_scans_can_be_continued(whole, drive, with_truth, tmp_path) -> None:
     assert run(drive, "-o", tmp_path / "out", "-n", 40) == EXIT_OK
     assert len(np.load(tmp_path / "out" / "trajectory.npy")) == 40

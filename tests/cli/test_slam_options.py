@@ -47,6 +47,7 @@ def test_a_drive_of_fewer_scans_than_wanted_is_noted(room) -> None:
     assert not notes()
 
 
+@pytest.mark.slow
 def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
     drive, weights = room
     first, second = tmp_path / "first", tmp_path / "second"

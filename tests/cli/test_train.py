@@ -254,11 +254,13 @@ def broken_drive() -> None:
     raise ValueError("no drive")
 
 
+@pytest.mark.slow
 def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
     with pytest.raises(ValueError, match="no drive"):
         train_run.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
 
 
+@pytest.mark.slow
 def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
     def stop() -> None:
         raise KeyboardInterrupt

@@ -105,6 +105,7 @@ def assert_rigid(T: np.ndarray) -> None:
     np.testing.assert_allclose(square, np.tile(np.eye(3), (4, 1, 1)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_sets_of_one_shape_share_their_compilation(scans, assert_compiles_nothing) -> None:
     start, other = np.tile(np.eye(4), (4, 1, 1)), replace(scans, points=0.9 * scans.points)
     dm.fit_deepmapping(scans, small("full"), key=KEY, start=start)

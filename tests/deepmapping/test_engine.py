@@ -252,6 +252,7 @@ def test_planar_fits_under_vmap_are_the_single_fits(tiny_data) -> None:
         assert int(state.step[row]) == int(alone.state.step)
 
 
+@pytest.mark.slow
 def test_same_key_same_numbers_and_another_key_others(tiny_data) -> None:
     one, same, other = (fit(COLD, tiny_data, key=key).state for key in (KEY, KEY, jax.random.key(4)))
     jax.tree.map(np.testing.assert_array_equal, one, same)

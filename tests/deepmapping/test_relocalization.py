@@ -94,6 +94,7 @@ def test_new_scans_of_any_heading_are_found_and_known(trained, queries) -> None:
     np.testing.assert_allclose(found.T_world_scan, se2.to_matrix(found.pose))
 
 
+@pytest.mark.slow
 def test_views_of_another_world_are_not_known(trained) -> None:
     elsewhere = simulate_sequence(1, 20, num_beams=64, seed=3)
     assert dpmjax.relocalize(trained, elsewhere.points).is_known.mean() < 0.2

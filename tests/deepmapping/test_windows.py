@@ -82,6 +82,7 @@ def test_windows_with_different_scans_do_not_learn_from_each_other(tiny_data) ->
         assert not np.allclose(before[2], after[2], rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", ["network", "free"])
 def test_poses_of_windows_start_in_the_world_of_the_given_start(tiny_walk, poses) -> None:
     phase = replace(SMALL.cold_phases[0], poses=poses, scans_per_window=8)

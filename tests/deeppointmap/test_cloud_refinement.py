@@ -40,6 +40,7 @@ def test_elements_make_the_registration_of_clouds_exact(model, clouds) -> None:
     assert fine.num_inliers == coarse.num_inliers
 
 
+@pytest.mark.slow
 def test_the_refined_motion_is_the_aligned_one(model, clouds) -> None:
     coarse, fine = (dpmjax.register(model, *clouds, refine=refine) for refine in (False, True))
     expected = align_elements_on_host(clouds[0].elements, clouds[1].elements, coarse.T_target_source)

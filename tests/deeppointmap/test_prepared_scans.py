@@ -98,6 +98,7 @@ def test_directions_turn_round_without_a_break() -> None:
     assert np.abs(turned).max() < 0.51 * np.pi / 127
 
 
+@pytest.mark.slow
 def test_other_parameters_have_another_fingerprint() -> None:
     config = model_preset("tiny")
     first, other = (init_model(jax.random.key(seed), config) for seed in (0, 1))

@@ -74,6 +74,7 @@ def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: st
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeypatch) -> None:
     kinds = []
 

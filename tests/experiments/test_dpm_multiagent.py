@@ -78,6 +78,7 @@ def test_a_drive_is_cut_and_joined_again(tmp_path, monkeypatch) -> None:
     assert (out / "agents.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_drives_are_cut_one_by_one_and_a_resumed_run_computes_nothing_again(tmp_path, monkeypatch) -> None:
     whole, half = write_drive(tmp_path / "whole", range(len(TRUTH))), write_drive(tmp_path / "half", range(40))
     out = tmp_path / "out"

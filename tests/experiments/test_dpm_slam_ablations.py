@@ -32,6 +32,7 @@ def model() -> dpmjax.Model:
     return dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
 
 
+@pytest.mark.slow
 def test_every_setting_gets_a_row_and_a_resumed_run_computes_nothing_again(model, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(ablations, "SETTINGS", (ablations.WHOLE, ablations.DECODER, "16 elements"))
     dpmjax.save_model(model, tmp_path / "model.safetensors")

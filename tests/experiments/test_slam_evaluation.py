@@ -91,6 +91,7 @@ def empty_scans(T_world_lidar: np.ndarray) -> LidarSequence:
     return LidarSequence("made by hand", sources, lambda index: np.zeros((0, 3), np.float32), T_world_lidar)
 
 
+@pytest.mark.slow
 def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     with_toys, tmp_path, monkeypatch, capsys
 ) -> None:

@@ -188,12 +188,14 @@ def test_scans_are_registered_at_180_degrees_and_with_noise(is_ordered: bool, no
     np.testing.assert_array_equal(found.poses[0], np.zeros(3))
 
 
+@pytest.mark.slow
 def test_scans_beyond_the_keyframes_find_their_poses(sequence) -> None:
     start = register_globally(scans_of(sequence, is_ordered=False), replace(CONFIG, max_keyframes=4))
     assert len(start.keyframes) == 4
     assert ate(start.poses, sequence) < 4.0
 
 
+@pytest.mark.slow
 def test_refinement_without_order_is_exact(truth) -> None:
     sequence = simulate_sequence(0, 49, seed=1, num_beams=128).take(slice(0, None, 8))
     poses = truth + np.random.default_rng(0).normal(size=truth.shape) * [2.0, 2.0, 0.01]
@@ -211,6 +213,7 @@ def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
     assert set(find_unregistered(profiles, poses)) == {9, 10}
 
 
+@pytest.mark.slow
 def test_a_scan_that_sees_no_keyframe_is_found_by_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     there = simulate_sequence(0, 113, seed=2).take(slice(0, None, 16))
     truth, lost, profiles = np.asarray(there.reference_poses), 5, make_profiles(scans_of(there))

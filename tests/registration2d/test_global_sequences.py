@@ -51,6 +51,7 @@ def test_torn_steps_are_healed_from_the_scans_alone(there, monkeypatch: pytest.M
     assert ate(found.poses, truth) < 4.0
 
 
+@pytest.mark.slow
 def test_a_sequence_of_strong_steps_needs_no_other_search(there) -> None:
     found = register_globally(scans_of(there), GlobalConfig(search=COARSE))
     assert len(found.keyframes) == 0

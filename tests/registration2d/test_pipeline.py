@@ -142,6 +142,7 @@ def test_stop_ends_with_what_exists(few) -> None:
     np.testing.assert_array_equal(found.poses, few.reference_poses)
 
 
+@pytest.mark.slow
 def test_a_resumed_fit_that_is_over_is_a_candidate_and_one_without_a_step_is_not(few) -> None:
     start = few.reference_poses
     for num_steps, names in ((0, [GIVEN_POSES]), (20, [GIVEN_POSES, DEEPMAPPING])):
@@ -163,6 +164,7 @@ def test_a_fit_in_another_order_returns_poses_in_that_of_the_scans(few) -> None:
         assert (steps[-2] == 1) == (not is_ordered)
 
 
+@pytest.mark.slow
 def test_stop_ends_the_fit_between_calls_of_its_step(few) -> None:
     shares: list[float] = []
 
@@ -236,6 +238,7 @@ def test_scans_without_an_order_refuse_starts_that_need_one(few, start: str) -> 
         register(few, unordered, odometry=few.reference_poses)
 
 
+@pytest.mark.slow
 def test_the_registration_is_the_same_where_jax_has_64_bits(few, float64) -> None:
     def poses() -> list[np.ndarray]:
         lines = planar_scans(scan_set(few))

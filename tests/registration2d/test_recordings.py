@@ -88,6 +88,7 @@ def test_a_single_scan_is_a_recording() -> None:
     )
 
 
+@pytest.mark.slow
 def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     """A dense walk whose odometry wanders between the chosen scans, which are right."""
     sequence = simulate_sequence(0, 21, seed=5)

@@ -37,6 +37,7 @@ def test_refinement_is_exact_without_noise(walk, walk_scans) -> None:
     np.testing.assert_allclose(refined.poses[0], start[0], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_refinement_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None:
     refined = refine(noisy_walk_scans, shaken(noisy_walk.reference_poses, 5.0))
     assert ate(refined.poses, noisy_walk.reference_poses) < 0.7
@@ -54,6 +55,7 @@ def test_refinement_never_uses_masked_beams(walk) -> None:
     assert ate(results[0], walk.reference_poses) < 0.05
 
 
+@pytest.mark.slow
 def test_two_scans_that_share_nothing_are_refined_without_pairs(walk) -> None:
     """Both stand at one place, where their surroundings contradict each other, by odometry that may be off by far."""
     ends = [0, len(walk.points) // 2]
@@ -70,6 +72,7 @@ def test_refinement_stays_in_the_world_of_the_start(walk, walk_scans) -> None:
     np.testing.assert_allclose(refined.poses, se2.compose(offset, walk.reference_poses), atol=0.05)
 
 
+@pytest.mark.slow
 def test_scans_as_a_user_has_them_are_those_of_the_record(walk) -> None:
     few = walk.take(slice(0, 6))
     arrays = np.where(few.mask[..., None], few.points, np.nan)

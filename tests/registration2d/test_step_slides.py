@@ -111,11 +111,13 @@ def test_faults_of_the_odometry_are_named_and_corrected(scans, odometry, change,
     np.testing.assert_allclose(found.poses, odometry, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_mirrored_map_is_not_trusted(scans, truth, odometry) -> None:
     found = calibrate_odometry(scans, odometry * [1.0, -1.0, -1.0])
     assert not assess_trajectory(scans, truth, prior=found.prior, fault=found.fault).is_trusted
 
 
+@pytest.mark.slow
 def test_a_refinement_takes_a_slid_step_back_to_the_odometry(scans, truth, odometry) -> None:
     prior = calibrate_odometry(scans, odometry).prior
     found = refine(scans, torn_in_the_corridor(truth, 18.0), prior=prior).poses
@@ -123,6 +125,7 @@ def test_a_refinement_takes_a_slid_step_back_to_the_odometry(scans, truth, odome
     assert np.hypot(off[:, 0], off[:, 1]).max() < 6.0
 
 
+@pytest.mark.slow
 def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> None:
     # Nothing but the scans: the second room may lie anywhere along the corridor.
     alone = assess_trajectory(scans, truth)

@@ -118,6 +118,7 @@ def test_a_drive_that_extends_a_map_goes_on_like_an_unbroken_one(truth_run, tmp_
     assert_goes_on_like_the_unbroken_one(whole, tmp_path / "state.npz", [stops[0], stops[len(stops) // 2]])
 
 
+@pytest.mark.slow
 def test_a_run_of_networks_goes_on_like_an_unbroken_one(tmp_path) -> None:
     world = planes(np.random.default_rng(0))
     scans = [seen_from(world, motion(0.5 * step, 0.0, 3.0 * step)) for step in range(20)]

@@ -89,6 +89,7 @@ def test_starts_are_aligned_side_by_side() -> None:
         np.testing.assert_allclose(many.T_target_source[row], expected.T_target_source, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_pairs_are_aligned_side_by_side() -> None:
     sources, targets = (jax.tree.map(lambda *x: jnp.stack(x), *pair) for pair in ((SOURCE, TARGET), (TARGET, SOURCE)))
     starts = jnp.asarray(np.stack([GUESS, np.linalg.inv(GUESS)]), jnp.float32)

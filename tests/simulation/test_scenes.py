@@ -91,6 +91,7 @@ def test_scales_spread_evenly_in_their_logarithm():
     assert scales.mean() == pytest.approx(0.5 * np.log(2.0), abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_nothing_solid_stands_in_the_lane_of_any_kind(kind):
     scene = draw_scene(11, replace(SMALL, kinds=((kind, 1.0),)))
@@ -139,6 +140,7 @@ def test_foliage_lets_through_what_beer_and_lambert_say():
         assert is_met.mean() == pytest.approx(wanted.mean(), abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_moving_lidar_sees_the_same_walls_from_where_its_beam_left():
     rows = [[20.0, 0, 30, 1, 30, 30, 0, 0, 0], [-15.0, 0, 30, 1, 30, 30, 0, 0, 0], [0.0, 12, 30, 30, 1, 30, 0, 0, 0]]
     pose, town = np.eye(4), soft_town(rows)
@@ -166,6 +168,7 @@ def test_a_lidar_that_does_not_move_is_one_with_no_motion():
     np.testing.assert_allclose(first.points, again.points, **ACCUMULATED)
 
 
+@pytest.mark.slow
 def test_scans_of_several_poses_at_once_are_those_of_each():
     town = make_town(3, TownConfig(route_length_m=200)).primitives
     poses = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
@@ -181,6 +184,7 @@ def test_scans_of_several_poses_at_once_are_those_of_each():
         assert same.mean() > 0.999, "only a ray that touches an edge may differ"
 
 
+@pytest.mark.slow
 def test_beams_on_an_edge_may_end_between_foreground_and_background():
     rows = [[10.0, 0, 30, 0.5, 1.0, 30, 0, 0, 0], [12.5, 0, 30, 0.5, 30, 30, 0, 0, 0]]
     town, pose = soft_town(rows), np.eye(4)

@@ -62,7 +62,7 @@ def errors_of_loops(result: SlamResult, T_world_scan: np.ndarray) -> np.ndarray:
     return np.linalg.norm((rigid.inverse(true) @ found)[:, :3, 3], axis=1)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_gross_errors_of_the_matcher_do_no_harm(seed) -> None:
     truth = laps(2, side_m=80.0, step_m=2.0)
     geometry = TruthGeometry(truth, sigma_m=0.04, sigma_rad=0.005, seed=seed)
@@ -77,7 +77,7 @@ def test_gross_errors_of_the_matcher_do_no_harm(seed) -> None:
     assert ate < 0.5 * absolute_trajectory_error(drifted.T_world_scan[:, :3, 3], truth[:, :3, 3])
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_streets_that_are_driven_back_are_recognised(seed) -> None:
     there = laps(1, side_m=80.0, step_m=2.0)
     truth = np.concatenate([there, there[::-1] @ pose(0.0, 3.0, np.pi)])

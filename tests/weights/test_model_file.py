@@ -191,6 +191,7 @@ def test_converter_converts(model: Model, tmp_path: Path) -> None:
     assert read_card(tmp_path / "b.safetensors") == "copy"
 
 
+@pytest.mark.slow
 def test_converter_makes_the_mean_of_two_models(model: Model, tmp_path: Path, capsys) -> None:
     other = model.replace(params=jax.tree.map(lambda x: x + 2.0, model.params))
     one, two, mean = (tmp_path / f"{name}.safetensors" for name in ("one", "two", "mean"))

@@ -6,6 +6,7 @@ import functools
 
 import jax
 import numpy as np
+import pytest
 
 from dpmjax.deeppointmap import PairKind, draw_evaluation_pairs, evaluate_registration, init_model
 from dpmjax.deeppointmap.training.step import encode_sample
@@ -13,6 +14,7 @@ from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
 
+@pytest.mark.slow
 def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
     model = init_model(jax.random.key(0), toy.MODEL)
     pairs = draw_evaluation_pairs(toy.drive(num_scans=4), 2, toy.MODEL)

@@ -73,6 +73,7 @@ def test_the_best_model_is_that_of_the_best_score(whole) -> None:
     toy.assert_trees_equal(trained.model.params, seen[1].params)
 
 
+@pytest.mark.slow
 def test_a_training_that_is_told_to_finish_ends_early_by_a_decay() -> None:
     config = replace(TRAINING, curriculum=(CurriculumStage(2, 60),))
     rates: list[float] = []

@@ -121,6 +121,7 @@ def test_places_without_a_group_change_nothing(maker, start) -> None:
     np.testing.assert_allclose(loss(start.params, masked), expected, **ACCUMULATED)
 
 
+@pytest.mark.slow
 def test_a_map_without_the_rows_that_thinning_removes_has_the_same_loss(maker, start, monkeypatch) -> None:
     """Down to as many rows as there are descriptors."""
     batch = maker(3)
