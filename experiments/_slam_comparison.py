@@ -70,7 +70,7 @@ def open_drives(paths: tuple[str, ...], options: cli.DriveOptions, towns_m: list
             drives += [cli.keep_scans(drive).take(options.selection) for drive in simulated]
         else:
             names: list[str | None] = io.list_lidar_sequences(entry) or [None]
-            drives += [cli.open_drive(Path(entry), options, name) for name in names]
+            drives += [cli.with_reference_only(cli.open_drive(Path(entry), options, name)) for name in names]
     cli.check_names_differ(drives)
     return drives
 

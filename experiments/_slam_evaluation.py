@@ -32,7 +32,7 @@ PRECISIONS: tuple[Precision, ...] = ("float32", "int8")
 NUM_SIZES = 8
 # Stages of a run that no other program's time has.
 _FILE_STAGES = ("write", "viewer")
-_ODOMETRY_STAGES = ("thinning ahead", "odometry")
+_LOOP_STAGES = (*_FILE_STAGES, "loops")
 
 
 class Scale(NamedTuple):
@@ -129,14 +129,15 @@ def map_row(drive: Drive, folder: cli.RunFolder, method: str, methods: SlamMetho
         **common_numbers(drive, method, result.T_world_scan, found),
         "num_keyframes": len(result.keyframes),
         "scan_statuses": dict(collections.Counter(report.status for report in result.reports)),
-        "scan_s": _per_scan(run, run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in _FILE_STAGES)),
-        "scan_odometry_s": _per_scan(run, sum(run.stages_s.get(stage, 0.0) for stage in _ODOMETRY_STAGES)),
+        "scan_s": _per_scan(run, _FILE_STAGES),
+        "scan_odometry_s": _per_scan(run, _LOOP_STAGES),
         "scan_s_tenths": tenths(run.scan_s) if len(run.scan_s) == len(run.reports) else None,
     }
 
 
-def _per_scan(run: cli.SlamRun, seconds: float) -> float | None:
-    """Returns the seconds a scan; None for a run that was resumed at its end."""
+def _per_scan(run: cli.SlamRun, left_out: tuple[str, ...]) -> float | None:
+    """Returns the seconds a scan without those of some stages; None for a run that was resumed at its end."""
+    seconds = run.run_s - sum(run.stages_s.get(stage, 0.0) for stage in left_out)
     return seconds / run.num_done if run.num_done else None
 
 
@@ -146,7 +147,7 @@ def tenths(scan_s: list[float]) -> list[float]:
 
 
 def odometry_row(drive: Drive, ours: cli.Row) -> cli.Row:
-    """Measures our odometry in the same run, before loops: its time is that of its stages."""
+    """Measures our odometry in the same run, before loops: its time is that of the run without loops."""
     return common_numbers(drive, ODOMETRY, drive.trajectory(ODOMETRY), []) | {"scan_s": ours["scan_odometry_s"]}
 
 

@@ -212,8 +212,10 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
         of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
         motions = np.stack([of_clouds, result.verified])
         is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
+        # At run time clouds have the features of their own best motion, whatever the scans say.
+        evidence = result.evidence._replace(of_clouds=result.evidence_of_clouds.of_clouds)
         for name in KINDS:
-            features = getattr(result.evidence, name)
+            features = getattr(evidence, name)
             found[name].append(None if features is None else features.tolist())
         gap = result.evidence.lookalike_gap
         found["lookalike_gap"].append(gap if np.isfinite(gap) else None)

@@ -94,7 +94,7 @@ def map_agents(run: cli.TableRun, config: Config, methods: slam.SlamMethods, seq
 
 def open_runs(config: Config) -> list[list[LidarSequence]]:
     """Opens the scans of the agents of each run; bad input that can be known before a run is a `ValueError`."""
-    drives = [cli.open_drive(data, config) for data in config.data or (None,)]
+    drives = [cli.with_reference_only(cli.open_drive(data, config)) for data in config.data or (None,)]
     if len(drives) > 1 and not config.cut:
         return [drives]
     cli.check_names_differ(drives)
@@ -268,7 +268,7 @@ def _drive_cells(row: cli.Row) -> list[str]:
         errors,
         (", ".join(met) or "none") + wrong,
         "; ".join(together),
-        ", ".join(f"{agent.get('map_bytes_int8', agent['keyframe_bytes']) / 1e6:.2f}" for agent in agents),
+        ", ".join(f"{agent['keyframe_bytes'] / 1e6:.2f}" for agent in agents),
         ", ".join(f"{agent['scan_bytes'] / 1e6:.0f}" for agent in agents),
     ]
 

@@ -75,6 +75,8 @@ def main(config: Config) -> list[cli.Row]:
     """Measures all pairs, trains, fits and compares."""
     model = load_model(config.model)
     drives = cli.open_evaluation_drives(config.paths, [])
+    if len(drives) == 1 and not len(dpm.overlap_candidates(drives[0])[1]):
+        raise ValueError(f"{drives[0].name}: no scans are 40 m apart; give a second drive for pairs without overlap")
 
     def work(run: cli.TableRun) -> cli.Row:
         fitted = measure_towns(model, calibrate.FIRST_OVERLAP_TOWN, NUM_TOWNS, config.seed, run)

@@ -18,7 +18,6 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import Model, cli, load_model, slam
-from dpmjax.scans import surface_at
 from experiments._slam_comparison import open_drives
 from experiments._slam_evaluation import PRECISIONS, Drive, file_name, map_bytes, map_row, open_folder, with_network
 
@@ -114,8 +113,11 @@ def with_fewer_elements(model: Model, num_elements: int) -> slam.SlamMethods:
         scan = whole.geometry.thin(points)
         if scan is None:
             return None
-        points = scan.measured.surface.points
-        few = surface_at(points, np.arange(min(num_elements, len(points))))
+        surface = scan.measured.surface
+        # Normals are those of all points, as in a keyframe.
+        first = {name: getattr(surface, name)[:num_elements] for name in ("points", "normals", "flatness")}
+        samples, tree = surface.samples[surface.samples < num_elements], type(surface.tree)(first["points"])
+        few = surface._replace(**first, samples=samples, tree=tree)
         return scan._replace(measured=scan.measured._replace(surface=few))
 
     matcher, geometry = _Replaced(whole.matcher, encode=encode), _Replaced(whole.geometry, thin=thin)

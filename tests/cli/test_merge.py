@@ -59,7 +59,9 @@ def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> 
     metrics = load_json(out / "metrics.json")
     a, b, both = (dpmjax.load_map(path) for path in (case / "a.npz", case / "b.npz", out / "map.npz"))
     assert len(both) == len(a) + len(b) == metrics["num_keyframes"]
-    assert metrics["parts"] == [{"file": "map.npz", "maps": [1, 2], "num_keyframes": len(both)}]
+    counts = {"num_keyframes": len(both), "num_measured_parts": 1}
+    assert metrics["parts"] == [{"file": "map.npz", "maps": [1, 2], **counts}]
+    assert metrics["status"] == "done"
     assert metrics["loops_between"] == [{"maps": [1, 2], "num_loops": 1}]
     rows = list(csv.DictReader((out / "loops.csv").read_text().splitlines()))
     assert [(row["map"], row["other_map"], row["status"]) for row in rows] == [
@@ -70,6 +72,22 @@ def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> 
     assert [row["scan"] for row in rows] == [str(keyframe.scan) for keyframe in b.keyframes[:2]]
     assert len(dpmjax.read_g2o(out / "graph.g2o").poses) == len(both)
     assert (out / "map.png").stat().st_size > 0
+
+
+def test_guessed_motions_within_a_map_are_told(case, tmp_path, monkeypatch, capsys) -> None:
+    """The second half of the second map has a guessed pose beside the first half, and so beside the first map."""
+    a, b = (dpmjax.load_map(case / f"{name}.npz") for name in "ab")
+    half = len(b) // 2
+    edges = [edge._replace(kind="guess") if edge.target < half <= edge.source else edge for edge in b.edges]
+    dpmjax.save_map(tmp_path / "guessed.npz", replace(b, edges=tuple(edges)))
+    monkeypatch.setattr("dpmjax.slam.merge_maps", joined_by_a_loop)
+    weights = ("--weights", case / "model.safetensors")
+    assert run(case / "a.npz", tmp_path / "guessed.npz", *weights, "-o", tmp_path / "out") == EXIT_OK
+    assert "one map now, in 2 parts whose relative poses are guesses" in capsys.readouterr().out
+    metrics = load_json(tmp_path / "out" / "metrics.json")
+    assert (metrics["status"], metrics["parts"][0]["num_measured_parts"]) == ("uncertain", 2)
+    assert not dpmjax.slam.MergedMaps((dpmjax.load_map(tmp_path / "out" / "map.npz"),), None).is_joined
+    assert dpmjax.slam.MergedMaps((a,), None).is_joined
 
 
 def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None:

@@ -13,10 +13,15 @@ from dpmjax.deeppointmap import (
     draw_scan_pairs,
     evaluate_overlap,
     evaluate_scan_pairs,
+    match_clouds,
+    overlap_candidates,
     read_scan_pairs,
+    register_in_stages,
     scan_evaluation,
 )
+from dpmjax.deeppointmap.confidence import gather_evidence
 from dpmjax.metrics import area_under_curve, brier_score, expected_calibration_error
+from dpmjax.sequences import LidarSequence
 from tests.deeppointmap import toy
 
 
@@ -41,6 +46,30 @@ def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(m
         monkeypatch.setattr(scan_evaluation, "overlap_pairs", probability)
         found = evaluate_overlap(model, drive, 10)
         assert (found.area_under_curve, len(found.is_overlap), known["num"]) == (expected, 20, 20)
+
+
+def test_a_scan_without_a_reference_hides_no_revisit() -> None:
+    there = toy.drive(num_scans=40).T_world_lidar
+    poses = np.concatenate([there, there[::-1]])
+    drive = LidarSequence("back", tuple(map(str, range(80))), lambda index: np.zeros((0, 3), np.float32), poses)
+    near, far, has_revisits = overlap_candidates(drive)
+    poses = poses.copy()
+    poses[5] = np.nan
+    near_known, far_known, has_known = overlap_candidates(replace(drive, T_world_lidar=poses))
+    assert has_revisits
+    assert has_known
+    np.testing.assert_array_equal(near_known, [pair for pair in near.tolist() if 5 not in pair])
+    np.testing.assert_array_equal(far_known, [pair for pair in far.tolist() if 5 not in pair])
+
+
+def test_clouds_have_the_evidence_of_their_own_best_motion(model) -> None:
+    drive = toy.drive()
+    (pair,) = read_scan_pairs(drive, draw_scan_pairs(drive, "near", 1))
+    clouds = [dpmjax.encode(model, points) for points in (pair.source, pair.target)]
+    expected = gather_evidence(match_clouds(model, *clouds, config=model.config.matching), 0, None)
+    found = register_in_stages(model, pair)
+    np.testing.assert_allclose(found.evidence_of_clouds.of_clouds, expected.of_clouds, rtol=1e-5)
+    assert found.evidence_of_clouds.of_scans is None
 
 
 def test_pairs_have_the_motion_of_their_poses() -> None:

@@ -92,11 +92,11 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         T = pair.T_target_source if is_right else np.eye(4)
         of_clouds = rng.normal(size=4) + is_right
         evidence = MatchEvidence(
-            of_clouds,
+            np.full(4, 1e6 * is_right),  # of the motion that the scans chose: no feature of clouds
             np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right]),
             rng.normal(size=len(WEAK_FEATURES)) + 2 * is_right if rng.uniform() < 0.5 else None,
         )
-        return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5))
+        return StagedRegistration(T, T, T, evidence, MatchEvidence(of_clouds, None), StageSeconds(*[0.0] * 5))
 
     motions = []
 

@@ -93,6 +93,7 @@ def test_drives_are_cut_one_by_one_and_a_resumed_run_computes_nothing_again(tmp_
         assert all(agent["keyframe_bytes"] > 0 for agent in row["agents"])
         assert (out / "drives" / row["sequence"] / "agents.png").stat().st_size > 0
     text = (out / "table.md").read_text()
+    assert f"{rows[0]['agents'][0]['keyframe_bytes'] / 1e6:.2f}, " in text
     assert f"1 and 2: {rows[0]['num_loops_between']} (0)" in text
     monkeypatch.setattr(dpm_multiagent, "map_agents", None)
     assert run("--resume", "-o", out) == EXIT_OK

@@ -8,7 +8,7 @@ import pytest
 
 import dpmjax
 from dpmjax import simulation
-from dpmjax.cli.command import EXIT_OK, run_command
+from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import OVERLAP_FEATURES
 from dpmjax.metrics import area_under_curve
@@ -20,6 +20,11 @@ from tests.deeppointmap import toy
 @pytest.fixture(scope="module")
 def model() -> dpmjax.Model:
     return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+def run(*arguments) -> int:
+    names = {"name": dpm_overlap.EXPERIMENT, "description": dpm_overlap.__doc__}
+    return run_command(dpm_overlap.main, dpm_overlap.Config, args=list(map(str, arguments)), **names)
 
 
 def examples(seed: int, num: int) -> Examples:
@@ -52,6 +57,15 @@ def test_a_drive_without_far_pairs_gets_them_from_the_next_one(model, num_scans:
     assert pairs.features.shape[:2] == (6, 2)
 
 
+def test_one_drive_without_far_pairs_is_refused(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("dpmjax.cli.open_evaluation_drives", lambda *_: [toy.drive(0, num_scans=8)])
+    weights = tmp_path / "model.safetensors"
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), weights)
+    assert run(weights, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    assert "give a second drive" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_all_methods_are_compared_on_all_places(tmp_path, monkeypatch) -> None:
     weights = tmp_path / "model.safetensors"
     dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), weights)
@@ -59,9 +73,7 @@ def test_all_methods_are_compared_on_all_places(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
     for name in ("NUM_TOWNS", "NUM_OTHER_TOWNS"):
         monkeypatch.setattr(dpm_overlap, name, 2)
-    arguments = [str(weights), "-o", str(tmp_path / "out")]
-    names = {"name": dpm_overlap.EXPERIMENT, "description": dpm_overlap.__doc__}
-    assert run_command(dpm_overlap.main, dpm_overlap.Config, args=arguments, **names) == EXIT_OK
+    assert run(weights, "-o", tmp_path / "out") == EXIT_OK
     rows = load_json(tmp_path / "out" / "metrics.json")["rows"]
     assert {row["place"]: row["num_pairs"] for row in rows} == {"towns": 32, "towns, hard pairs too": 40}
     assert len(rows) == 10

@@ -63,6 +63,17 @@ def test_a_map_of_fewer_elements_holds_the_first_ones(model, num_elements: int) 
     assert len(fewer.cloud.described.mask) == min(num_elements, len(whole.features))
 
 
+def test_the_first_elements_of_a_scan_keep_their_normals(model) -> None:
+    points = toy.drive(1, num_scans=1)[0]
+    whole, few = (
+        ablations.ablated(model, setting).geometry.thin(points).measured.surface
+        for setting in (ablations.WHOLE, "16 elements")
+    )
+    for name in ("points", "normals", "flatness"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(whole, name)[:16])
+    np.testing.assert_array_equal(few.samples, [row for row in whole.samples if row < 16])
+
+
 def test_without_elements_poses_and_loops_stay_as_they_are_proposed(model) -> None:
     drive, methods = toy.drive(1, num_scans=2), ablations.ablated(model, ablations.DECODER)
     slam_map, scan = step_slam(methods, init_slam(), drive[0])[0].slam_map, methods.geometry.thin(drive[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,8 +12,10 @@ import pytest
 import dpmjax
 from dpmjax.cli import RowStopped, TableRun, why_not_importable
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
+from dpmjax.cli.drives import DriveOptions
 from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run_folder import RunFolder
+from dpmjax.cli.slam_numbers import SlamRun
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.saved_maps import load_state
@@ -141,6 +144,22 @@ def test_sizes_of_maps_are_those_of_the_files(with_toys, tmp_path) -> None:
     assert ours["map_bytes_points"][-1] == 12 * num_points
     assert ours["map_scans"][-1] == NUM_SCANS
     assert (np.diff(ours["map_bytes_float32"]) > 0).all()
+
+
+def test_scans_without_a_reference_are_left_out(tmp_path, monkeypatch) -> None:
+    whole = toy.drive(num_scans=5)
+    poses = whole.T_world_lidar.copy()
+    poses[3] = np.nan
+    monkeypatch.setattr("dpmjax.cli.open_drive", lambda *_: replace(whole, T_world_lidar=poses))
+    (drive,) = _slam_comparison.open_drives((str(tmp_path),), DriveOptions())
+    np.testing.assert_array_equal(drive.T_world_lidar, poses[[0, 1, 2, 4]])
+
+
+def test_the_time_before_loops_is_that_of_the_run_without_them() -> None:
+    stages_s = {"loops": 3.0, "write": 1.0, "decoder": 2.0, "thinning ahead": 9.0}
+    run = SlamRun(None, (), stages_s, compile_s=0.0, run_s=10.0, scan_s=(2.0,) * 4, failure=None)
+    assert _slam_evaluation._per_scan(run, _slam_evaluation._FILE_STAGES) == pytest.approx(9.0 / 4)
+    assert _slam_evaluation._per_scan(run, _slam_evaluation._LOOP_STAGES) == pytest.approx(6.0 / 4)
 
 
 def test_a_stopped_row_is_not_written(tmp_path, monkeypatch) -> None:

@@ -56,6 +56,18 @@ def test_one_cube_alone_is_as_uncertain_as_its_planes() -> None:
     np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-4)
 
 
+def test_few_pairs_have_no_more_information_than_they_have() -> None:
+    """Independent pairs on three walls: the sigma is that of their noise, until pairs are discounted as correlated."""
+    rng = np.random.default_rng(2)
+    for num in (30, 150):
+        points, normals = rng.normal(0, 10.0, (num, 3)), np.eye(3)[np.arange(num) % 3]
+        pairs = PlanePairs(points, np.full(num, 0.05) * rng.choice([-1, 1], num), normals)
+        jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1) / 0.05
+        np.testing.assert_allclose(
+            plane_information(pairs, IDENTITY), jacobian.T @ jacobian + UNKNOWN, rtol=1e-6, atol=1
+        )
+
+
 def test_few_planes_constrain_nothing() -> None:
     pairs = PlanePairs(np.ones((5, 3)), np.zeros(5), np.eye(3)[[0, 1, 2, 0, 1]])
     np.testing.assert_allclose(plane_information(pairs, IDENTITY), UNKNOWN)

@@ -243,6 +243,7 @@ def test_beam_tables_go_down(sensor):
         lambda: DriveConfig(rate_hz=np.nan),
         lambda: make_town(0, trajectory=np.zeros((5, 3))),
         lambda: make_town(0, trajectory=np.tile(np.eye(4), (5, 1, 1))),
+        lambda: make_town(0, trajectory=np.linspace(np.eye(4), np.eye(4) + 458e3 * np.eye(4, k=3), 30)),
     ],
 )
 def test_senseless_wishes_are_refused(make):

@@ -122,10 +122,9 @@ def test_images_from_above_lie_where_their_poses_say_and_the_ceiling_is_left_out
     mask[1, 0] = False
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, :3, 3] = [2.0, 0.0, 1.0]
-    # The whole first panel is moved: it is laid onto the reference by its first pose.
-    moved = np.eye(4)
-    moved[:3, 3] = [7.0, 0.0, -3.0]
-    *panels, _ = from_above_figure([("found", moved @ T), ("reference", T)], points, mask).axes
+    # The world of the reference has its z axis up: each panel is drawn in the frame of its first camera.
+    upright = np.array([[1.0, 0, 0, 7], [0, 0, 1, 30], [0, -1, 0, 2], [0, 0, 0, 1]])
+    *panels, _ = from_above_figure([("found", T), ("reference", upright @ T)], points, mask).axes
     assert [axes.get_title(loc="left") for axes in panels] == ["found", "reference"]
     for axes in panels:
         first, second, path = axes.lines[:3]

@@ -199,6 +199,7 @@ def test_converter_makes_the_mean_of_two_models(model: Model, tmp_path: Path, ca
     save_model(other, two)
     assert main([str(one), str(mean), "--mean-with", str(two)]) == 0
     jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x + 1.0, atol=1e-6), model.params, load_model(mean).params)
+    assert load_model(mean).config.calibration is None
     assert main([str(one), str(mean), "--mean-with", "dpm_small"]) == 2
     assert "expected a network of the same shapes" in capsys.readouterr().err
 

@@ -13,6 +13,7 @@ from .drives import find_sources as find_sources
 from .drives import keep_scans as keep_scans
 from .drives import open_drive as open_drive
 from .drives import report_notes as report_notes
+from .drives import with_reference_only as with_reference_only
 from .evaluate import BAND_NAMES as BAND_NAMES
 from .evaluate import FIRST_TOWN as FIRST_TOWN
 from .evaluate import calibration_numbers as calibration_numbers

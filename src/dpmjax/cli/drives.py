@@ -200,7 +200,11 @@ Source = Callable[[], LidarSequence]
 
 def open_with_poses(path: Path, name: str | None) -> LidarSequence:
     """Opens a drive, or simulates a town along a file of poses; scans without a pose of its reference are left out."""
-    drive = open_path(path, 0, sequence=name)
+    return with_reference_only(open_path(path, 0, sequence=name))
+
+
+def with_reference_only(drive: LidarSequence) -> LidarSequence:
+    """Leaves out the scans without a pose of the reference, where the drive has one."""
     return drive if drive.T_world_lidar is None else drive.take(drive.has_reference)
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
+from dpmjax.cli import slam_numbers
 from dpmjax.sequences import counted
 
 NAME = "merge"
@@ -93,10 +94,13 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
             "file": map_name(part, len(merged.maps)),
             "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
             "num_keyframes": len(slam_map),
+            "num_measured_parts": slam_numbers.count_parts(slam_map),
         }
         for part, slam_map in enumerate(merged.maps, start=1)
     ]
+    is_measured = all(part["num_measured_parts"] < 2 for part in parts)
     return {
+        "status": "done" if is_measured else "uncertain",
         "num_maps": len(maps),
         "num_parts": len(parts),
         "num_loops": len(cli.accepted_ends(merged.loops)),
@@ -138,6 +142,8 @@ def merge_text(metrics: dict[str, Any]) -> str:
     for part in metrics["parts"]:
         members = ", ".join(names[number] for number in part["maps"])
         text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
+        if (num_parts := part["num_measured_parts"]) > 1:
+            text += f", in {num_parts} parts whose relative poses are guesses"
         lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
     loops, candidates = counted(metrics["num_loops"], "loop"), counted(metrics["num_candidates"], "candidate")
     return "\n".join([*lines, f"{loops} between maps, of {candidates}"])

@@ -24,6 +24,7 @@ from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, overlap_pairs
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.geometry import se2
+from dpmjax.metrics.drives import path_lengths
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
@@ -71,7 +72,8 @@ class StagedRegistration(NamedTuple):
         descriptors: `T_target_source` of the best hypothesis of the network alone.
         verified: motion under which the scans agree best.
         refined: verified motion after the final alignment.
-        evidence: features of the confidence.
+        evidence: features of the confidence of the verified motion.
+        evidence_of_clouds: those of `descriptors`, without the scans.
         seconds: seconds of each stage.
     """
 
@@ -79,6 +81,7 @@ class StagedRegistration(NamedTuple):
     verified: Pose
     refined: Pose
     evidence: MatchEvidence
+    evidence_of_clouds: MatchEvidence
     seconds: StageSeconds
 
 
@@ -128,9 +131,14 @@ def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
     times.append(time.perf_counter())
     refined = refine_motion(source, target, verified, settings)
     times.append(time.perf_counter())
-    evidence = gather_evidence(hypotheses, verified.row, verified.verification)
-    found = motions[0], verified.T_target_source, refined.T_target_source
-    return StagedRegistration(*found, evidence, StageSeconds(*np.diff(times).tolist()))
+    return StagedRegistration(
+        descriptors=motions[0],
+        verified=verified.T_target_source,
+        refined=refined.T_target_source,
+        evidence=gather_evidence(hypotheses, verified.row, verified.verification),
+        evidence_of_clouds=gather_evidence(hypotheses, 0, None),
+        seconds=StageSeconds(*np.diff(times).tolist()),
+    )
 
 
 def evaluate_scan_pairs(model: Model, pairs: Iterable[ScanPair]) -> ScanEvaluation:
@@ -275,8 +283,8 @@ def overlap_candidates(drive: LidarSequence) -> tuple[Int[np.ndarray, "k 2"], In
         ValueError: if the drive has no poses.
     """
     distances = scan_distances(drive)
-    steps = np.linalg.norm(np.diff(true_poses(drive)[:, :3, 3], axis=0), axis=1)
-    path = np.concatenate([[0], np.cumsum(steps)])
+    path = np.full(len(drive), np.nan)
+    path[drive.has_reference] = path_lengths(true_poses(drive)[drive.has_reference])
     is_near = (distances < OVERLAP_M) & (distances > 0)
     is_revisit = is_near & (np.abs(path[:, None] - path[None]) > REVISIT_PATH_M)
     has_revisits = bool(is_revisit.any())

@@ -122,7 +122,8 @@ def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
         Inverse covariance in the tangent of the source, translation first.
     """
     jacobian = _plane_system(pairs, T_target_source).jacobian
-    return np.asarray(NUM_INDEPENDENT / max(len(jacobian), 1) * jacobian.T @ jacobian + UNKNOWN)
+    independent_share = min(NUM_INDEPENDENT / max(len(jacobian), 1), 1.0)
+    return np.asarray(independent_share * jacobian.T @ jacobian + UNKNOWN)
 
 
 def scattered_information(pairs: PlanePairs, T_target_source: Pose) -> Information:

@@ -19,7 +19,14 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.interfaces import AnyScan, SlamMethods
-from dpmjax.slam.keyframe_map import KeyframeMap, connected_parts, joined_maps, take_keyframes, with_origin
+from dpmjax.slam.keyframe_map import (
+    KeyframeMap,
+    connected_parts,
+    joined_maps,
+    measured_parts,
+    take_keyframes,
+    with_origin,
+)
 from dpmjax.slam.loop_closure import examine_candidates, is_resting, similar_keyframes
 from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
@@ -45,7 +52,7 @@ class JoinedMaps(NamedTuple):
         slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
         map_of_keyframe: (k,) number of the map that each keyframe comes from.
         component_of_map: number of the component of each map, from 0; joined maps share one. Each component has its own
-            frame, so poses of different components cannot be compared.
+            frame, so poses of different components cannot be compared; nor can those of different `measured_parts`.
         loops: candidates between maps and their outcome; rows are those of `slam_map`.
     """
 
@@ -78,7 +85,7 @@ class AgentsResult(NamedTuple):
         T_world_scan: (n, 4, 4) float64 poses of each agent. The world of a component is the frame of the first scan of
             its first agent.
         component: number of the component of each agent; agents of one component have met, and only their poses can be
-            compared.
+            compared, within `measured_parts`.
         joined: all keyframes in one record, and the loops between agents.
         agents: result of each agent alone.
         traffic: bytes that each agent sends.
@@ -114,8 +121,8 @@ class MergedMaps(NamedTuple):
 
     @property
     def is_joined(self) -> bool:
-        """True where all maps have become one."""
-        return len(self.maps) == 1
+        """True where all maps have become one, in which measured motions join all keyframes."""
+        return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
 def run_agents(

@@ -246,7 +246,7 @@ def from_above_figure(panels: Sequence[tuple[str, NDArray[np.float64]]], points:
     """Draws depth images from above, without the ceiling, one colour for each image, for several sets of poses.
 
     Args:
-        panels: title and (n, 4, 4) T_world_camera in metres; all are aligned with the last.
+        panels: title and (n, 4, 4) T_world_camera in metres; each is drawn in the frame of its first camera.
         points: (n, h, w, 3) in the camera frames (y down).
         mask: (n, h, w).
 
@@ -260,8 +260,8 @@ def from_above_figure(panels: Sequence[tuple[str, NDArray[np.float64]]], points:
         raise ValueError("panels: expected at least one")
     cloud, valid = np.asarray(points, np.float64), np.asarray(mask, bool)
     poses = [T for _, T in panels]
-    # The first camera is level in every panel, so the panels are aligned by the first poses.
-    aligned = [poses[-1][0] @ np.linalg.inv(T[0]) @ T for T in poses]
+    # The axis down is that of the first camera; a world may have another one.
+    aligned = [np.linalg.inv(T[0]) @ T for T in poses]
     clouds = [np.einsum("nij,nhwj->nhwi", T[:, :3, :3], cloud) + T[:, None, None, :3, 3] for T in aligned]
     sensors = [T[:, :3, 3] for T in aligned]
     low, high = np.quantile(clouds[-1][valid][:, [0, 2]], [0.002, 0.998], axis=0)

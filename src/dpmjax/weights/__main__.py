@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +48,9 @@ def _mean(model: Model, other: Model) -> Model:
     """Returns the model with the mean of both parameters."""
     if jax.tree.map(jnp.shape, model.params) != jax.tree.map(jnp.shape, other.params):
         raise ValueError("--mean-with: expected a network of the same shapes")
-    return Model(jax.tree.map(lambda one, two: (one + two) / 2, model.params, other.params), model.config)
+    # Regressions belong to the parameters that they were fitted for.
+    config = replace(model.config, calibration=None, overlap=None)
+    return Model(jax.tree.map(lambda one, two: (one + two) / 2, model.params, other.params), config)
 
 
 if __name__ == "__main__":

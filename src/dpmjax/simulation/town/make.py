@@ -19,6 +19,7 @@ from dpmjax.simulation.town.streets import LANE_M, Streets, arc_lengths, make_st
 from dpmjax.simulation.town.terrain import PAVEMENT_M, Plots, Terrain, make_terrain, with_equal_passes
 
 _SENSOR_HEIGHT_M = 1.73
+_MAX_COORDINATE_M = 1e5  # Beyond, float32 holds no centimetres.
 _WALKERS_PER_KM = 15.0  # For each kilometre of lane.
 _TOWN_STREAM = 8150
 # Least and largest half length, half width and half height.
@@ -86,7 +87,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
         The town.
 
     Raises:
-        ValueError: a negative seed, or a trajectory of another shape or shorter than 20 m.
+        ValueError: a negative seed, or a trajectory of another shape, shorter than 20 m or far from the origin.
     """
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
@@ -99,6 +100,8 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
             raise ValueError(f"trajectory must be finite (n, 4, 4) poses, got {poses.shape}")
         positions = poses[:, :3, 3]
+        if np.abs(positions).max() > _MAX_COORDINATE_M:
+            raise ValueError(f"trajectory must be within {_MAX_COORDINATE_M:g} m: subtract its first position")
         streets = streets_along(positions[:, :2], rng)
         support = with_equal_passes(positions) - [0.0, 0.0, _SENSOR_HEIGHT_M]
     terrain = make_terrain(rng, streets, support, kind)
