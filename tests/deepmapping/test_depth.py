@@ -171,6 +171,7 @@ def test_an_image_matches_itself_and_contradicts_itself_from_elsewhere(walk) -> 
     assert consistency(jnp.eye(4), jnp.zeros_like(mask)) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_every_pair_of_images_counts_once(walk, count: int) -> None:
     scans = as_depth_scans(walk.points[:count], walk.mask[:count])

@@ -143,6 +143,7 @@ def test_the_largest_nearby_is_that_of_a_square(radius: float, reach: int) -> No
     np.testing.assert_array_equal(found, maximum_filter(values, 2 * reach + 1, mode="wrap"))
 
 
+@pytest.mark.slow
 def test_one_scan_is_one_row_of_many(trained, queries) -> None:
     points = queries[0]
     many = dpmjax.relocalize(trained, points)

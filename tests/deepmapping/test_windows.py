@@ -42,6 +42,7 @@ def test_windows_hold_every_motion_between_neighbours(num_scans: int, length: in
     np.testing.assert_array_equal(blocks_of_step(phase, num_scans, jnp.int32(0), key=KEY), rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("num_scans", "length"), SIZES)
 def test_windows_of_a_walk_join_to_the_walk_whatever_their_worlds(num_scans: int, length: int) -> None:
     rng = np.random.default_rng(num_scans)

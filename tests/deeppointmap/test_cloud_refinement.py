@@ -47,6 +47,7 @@ def test_the_refined_motion_is_the_aligned_one(model, clouds) -> None:
     np.testing.assert_allclose(fine.T_target_source, expected.T_target_source, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_scan_is_refined_against_a_cloud(model, clouds) -> None:
     points = seen_from(street(0, 30000), T_WORLD_A)
     match = dpmjax.register(model, points, clouds[1], refine=True)

@@ -76,6 +76,7 @@ def test_the_chosen_seed_is_one_that_tells_the_story() -> None:
     assert toy_1d.choose_seed(network, direct) == 3
 
 
+@pytest.mark.slow
 def test_rgbd_resumes_trajectory_by_trajectory(tmp_path) -> None:
     out = tmp_path / "out"
     assert run(deepmapping_rgbd, "--limit", 1, "--methods", "zero", "-o", out) == 0

@@ -36,6 +36,7 @@ def run(module, arguments) -> int:
     return run_command(module.main, module.Config, name=module.EXPERIMENT, description=module.__doc__, args=arguments)
 
 
+@pytest.mark.slow
 def test_evaluation_measures_every_sequence_and_resumes(weights, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     monkeypatch.setattr("dpmjax.cli.why_not_importable", lambda _: "it is not installed")
@@ -161,6 +162,7 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
     assert len({line.count("|") for line in lines}) == 1
 
 
+@pytest.mark.slow
 def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:
     drives = [toy.drive(1), toy.drive(2)]
     row = dpm_calibrate.measure_town(dpmjax.load_model(weights), drives, 32, 0)

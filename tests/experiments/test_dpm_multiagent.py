@@ -116,6 +116,7 @@ def test_folders_that_never_meet_stay_apart(tmp_path) -> None:
     assert all(agent["ate_m"] < 0.5 for agent in metrics["agents"])
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_not_done_again(tmp_path, monkeypatch) -> None:
     drive, out = write_drive(tmp_path / "drive", range(len(TRUTH))), tmp_path / "out"
     assert run(drive, "-o", out) == EXIT_OK

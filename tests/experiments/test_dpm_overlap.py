@@ -66,6 +66,7 @@ def test_one_drive_without_far_pairs_is_refused(tmp_path, monkeypatch, capsys) -
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_all_methods_are_compared_on_all_places(tmp_path, monkeypatch) -> None:
     weights = tmp_path / "model.safetensors"
     dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), weights)

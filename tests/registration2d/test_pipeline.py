@@ -199,6 +199,7 @@ def test_a_cold_start_has_no_poses_and_is_not_refined(few) -> None:
     assert list(found.candidates) == [START_NAMES["zero"], DEEPMAPPING]
 
 
+@pytest.mark.slow
 def test_matrices_and_poses_are_one_start(few) -> None:
     config = replace(SHORT, refine=False)
     poses = few.reference_poses

@@ -92,16 +92,21 @@ def turned(poses, angle: float):
     return np.column_stack([poses[:, :2], poses[:, 2] + angle])
 
 
+FAULTS = (
+    (lambda poses: poses * [1000.0, 1000.0, 1.0], "millimetres"),
+    (lambda poses: poses * [100.0, 100.0, 1.0], "centimetres"),
+    (lambda poses: turned(poses, -np.pi), "backwards"),
+    (lambda poses: turned(poses, -np.pi / 2), "to the left"),
+    (lambda poses: turned(poses, np.pi / 2), "to the right"),
+)
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [
         (lambda poses: poses * [1.0, -1.0, -1.0], "mirrored"),
         (lambda poses: np.column_stack([poses[:, :2], np.degrees(poses[:, 2])]), "degrees"),
-        (lambda poses: poses * [1000.0, 1000.0, 1.0], "millimetres"),
-        (lambda poses: poses * [100.0, 100.0, 1.0], "centimetres"),
-        (lambda poses: turned(poses, -np.pi), "backwards"),
-        (lambda poses: turned(poses, -np.pi / 2), "to the left"),
-        (lambda poses: turned(poses, np.pi / 2), "to the right"),
+        *(pytest.param(*fault, marks=pytest.mark.slow) for fault in FAULTS),
     ],
 )
 def test_faults_of_the_odometry_are_named_and_corrected(scans, odometry, change, word: str) -> None:

@@ -60,6 +60,7 @@ def moved(T: np.ndarray, spread: float, motion: str, seed: int = 0) -> np.ndarra
     return T @ np.asarray(motion_matrices(jnp.asarray(values, jnp.float32)), np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["planar", "full"])
 def test_adjusted_poses_come_back_to_the_truth(walk, scans, motion: str) -> None:
     truth = walk.T_world_camera

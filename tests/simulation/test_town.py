@@ -79,7 +79,9 @@ def route(kind):
     return drive(make_town(1, TownConfig(route=kind, route_length_m=1200, block_m=90))).T_world_lidar
 
 
-@pytest.mark.parametrize("kind", ["loop", "there_and_back", "wander"])
+@pytest.mark.parametrize(
+    "kind", ["loop", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("there_and_back", "wander"))]
+)
 def test_routes_close_and_have_the_wanted_length(kind):
     poses = route(kind)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)

@@ -259,6 +259,7 @@ def test_windows_lie_behind_their_wall(turn):
     np.testing.assert_allclose((deeper * cosines)[glass], depth, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_foliage_is_met_inside_of_it():
     rng = np.random.default_rng(0)
     rays = directions(rng, 500)

@@ -94,6 +94,7 @@ def test_the_order_of_agents_does_not_matter() -> None:
     assert counts[0] == counts[1]
 
 
+@pytest.mark.slow
 def test_same_agents_give_the_same_result() -> None:
     first, second = run(), run()
     for a, b in zip(first.T_world_scan, second.T_world_scan, strict=True):
@@ -213,6 +214,7 @@ def test_a_lost_agent_is_joined_as_a_whole() -> None:
     assert np.median(apart[36:]) < 1.0
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_a_moved_world() -> None:
     moved = pose(40.0, -20.0, 1.0) @ TRUTH
     a, b = run(PARTS), run(PARTS, truth=moved)

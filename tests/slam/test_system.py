@@ -376,6 +376,7 @@ def test_names_and_paths_in_place_of_models_and_maps_are_refused(as_user, call, 
         call(methods)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_map_is_extended_by_a_later_drive(seed) -> None:
     # The second drive begins elsewhere and meets the first one on its way.
