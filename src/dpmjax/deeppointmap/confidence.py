@@ -17,8 +17,11 @@ from scipy.special import expit
 
 from dpmjax.types import Registration, Verification
 
-CLOUD_FEATURES = ("support", "mean_score", "rmse_m", "support_gap")
-SCAN_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "score", "score_gap")
+CLOUD_FEATURES = ("log_support", "mean_score", "rmse_m", "lead_share")
+SCAN_FEATURES = (
+    *("support", "mean_score", "rmse_m", "support_gap"),
+    *("visible_share", "matched_share", "contradicted_share", "score", "score_gap"),
+)
 WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
 # Where walls constrain one direction only, wrong motions reach higher log odds, too.
@@ -133,16 +136,19 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
     Returns:
         The features.
     """
-    support = np.asarray(hypotheses.support, np.float64)
+    supports = np.asarray(hypotheses.support, np.float64)
     if row is None:
-        of_clouds = np.array([0.0, 0.0, MAX_RMSE_M, -support.max()])
+        support, mean_score, rmse_m, gap = 0.0, 0.0, MAX_RMSE_M, -supports.max()
     else:
-        second = np.delete(support, row).max(initial=0.0)
+        support, mean_score = supports[row], float(hypotheses.mean_score[row])
         rmse_m = min(float(hypotheses.rmse[row]), MAX_RMSE_M)
-        of_clouds = np.array([support[row], float(hypotheses.mean_score[row]), rmse_m, support[row] - second])
+        gap = support - np.delete(supports, row).max(initial=0.0)
+    lead_share = gap / max(supports.max(), 1e-6)
+    of_clouds = np.array([np.log1p(support), mean_score, rmse_m, lead_share])
     if verification is None:
         return MatchEvidence(of_clouds, None)
-    of_scans = np.concatenate([of_clouds, verification[: verification._fields.index("num_tried")]])
+    of_verification = verification[: verification._fields.index("num_tried")]
+    of_scans = np.array([support, mean_score, rmse_m, gap, *of_verification])
     of_weak_scans = weak_features(verification) if verification.num_slid > 0 else None
     return MatchEvidence(of_clouds, of_scans, of_weak_scans, verification.lookalike_gap)
 
