@@ -89,7 +89,7 @@ def short_name(path: Path) -> str:
 
 def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> dict[str, Any]:
     """Returns the content of `metrics.json`: connected maps, and the numbers of loops and keyframes."""
-    parts = [
+    parts: list[dict[str, Any]] = [
         {
             "file": map_name(part, len(merged.maps)),
             "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
