@@ -119,6 +119,20 @@ def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
     assert rows.max() < 1000
 
 
+@pytest.mark.parametrize(("num_scans", "shape"), [(16, (1, 16)), (40, (1, 32)), (100, (3, 32))])
+def test_steps_of_few_scans_have_one_block(num_scans: int, shape: tuple[int, int]) -> None:
+    phase = replace(dm.preset("fast").warm_phases[0], scans_per_step=num_scans)
+    rows = np.asarray(blocks_of_step(phase, 200, jnp.int32(0), key=KEY))
+    assert rows.shape == shape
+    assert (np.diff(rows, axis=1) == 1).all()
+
+
+def test_a_start_far_from_the_origin_is_refused(tiny_walk, as_user) -> None:
+    start = tiny_walk.reference_poses + np.array([4.5e6, 5.4e7, 0.0])
+    with pytest.raises(ValueError, match="start: the positions are too far from the origin"):
+        dm.fit_deepmapping(tiny_walk.points, key=KEY, start=start)
+
+
 def test_masked_beams_never_matter(tiny_data) -> None:
     scans = tiny_data.scans
     mask = scans.mask & (jax.random.uniform(KEY, scans.mask.shape) < 0.8)

@@ -14,12 +14,12 @@ import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping import localization_training
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.localization_training import make_raster, render_scans, shift_scan, turn_scan
+from dpmjax.deepmapping.localization_training import make_raster, nearest_nodes, render_scans, shift_scan, turn_scan
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
-from dpmjax.deepmapping.problem import MapFrame
+from dpmjax.deepmapping.problem import MapFrame, bind_map
 from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
 from dpmjax.geometry import se2
-from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig, init_map_net
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
 from dpmjax.types import ScanSet
 from tests.tolerances import ROUNDING
@@ -111,7 +111,7 @@ def test_without_a_map_no_scan_is_known_and_the_proposal_stays(unmapped, queries
 
 def test_rendered_scans_are_those_of_the_world(fitted, tiny_walk) -> None:
     scans = ScanSet(jnp.asarray(tiny_walk.points) / fitted.unit, jnp.asarray(tiny_walk.mask))
-    raster = make_raster(fitted.params, fitted.config)
+    raster = make_raster(fitted)
     rendered, poses = render_scans(raster, scans, 200, key=KEY)
     assert 100 < len(poses) <= 200
     places = np.asarray(poses, np.float64) * [fitted.unit, fitted.unit, 1.0]
@@ -129,9 +129,20 @@ def test_rendered_scans_are_those_of_the_world(fitted, tiny_walk) -> None:
     assert (error < 3.0 * spacing).mean() > 0.9
 
 
+def test_the_raster_of_an_mlp_covers_the_way(unmapped) -> None:
+    poses = np.array([[-40.0, 0, 0], [60.0, 20.0, 0]]) * unmapped.unit
+    config = replace(unmapped.config, occupancy=dm.preset("paper").occupancy)
+    params = replace(unmapped.params, occupancy=init_map_net(config.occupancy, key=KEY))
+    raster = make_raster(unmapped._replace(poses=poses, params=params, config=config))
+    _, is_inside = nearest_nodes(raster.frame, jnp.asarray(poses[:, :2] / unmapped.unit))
+    assert is_inside.all()
+    node = raster.frame.centre + raster.frame.half_side * jnp.array([[-1.0, 1.0]])
+    np.testing.assert_allclose(raster.logits[0, -1], bind_map(params, config)(node)[0], rtol=1e-5)
+
+
 def test_nothing_is_rendered_from_a_map_that_knows_nothing(unmapped, tiny_walk) -> None:
     scans = ScanSet(jnp.asarray(tiny_walk.points) / unmapped.unit, jnp.asarray(tiny_walk.mask))
-    rendered, poses = render_scans(make_raster(unmapped.params, unmapped.config), scans, 50, key=KEY)
+    rendered, poses = render_scans(make_raster(unmapped), scans, 50, key=KEY)
     assert rendered.points.shape == (0, 64, 2)
     assert poses.shape == (0, 3)
 

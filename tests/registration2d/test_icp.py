@@ -140,3 +140,13 @@ def test_a_single_point_moves_the_translation_only() -> None:
     derivative = jax.jacfwd(lambda source: icp(source, point, "point").T_target_source)(point)[:, :, 0]
     np.testing.assert_allclose(derivative[:2, :2], 0.0, atol=1e-6)
     np.testing.assert_allclose(derivative[:2, 2], -np.eye(2), atol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_clouds_that_float32_cannot_hold_are_refused(dim: int) -> None:
+    points = surface(dim)
+    far = points + np.array([4.5e5, 5.4e6, 100.0])[:dim]
+    with pytest.raises(ValueError, match="subtract their mean"):
+        icp(far, far)
+    near = points + 1e3
+    assert error_of(icp(near, near).T_target_source, np.eye(dim + 1), near) < 1e-2

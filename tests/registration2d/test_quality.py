@@ -97,6 +97,13 @@ def test_misfit_is_the_share_of_the_visible_beams_in_a_square_room() -> None:
     assert view_misfit(scans, poses + np.array([[0.0, 0.0, 0.0], [5000.0, 0.0, 0.0]])) == pytest.approx(1.0)
 
 
+def test_scans_of_single_beams_have_a_code_length(walk) -> None:
+    """Every second beam is missing: no beam lies on a line."""
+    mask = np.array(walk.mask)
+    mask[:, 1::2] = False
+    assert np.isfinite(map_code_length(planar_scans(walk.points, mask), walk.reference_poses))
+
+
 def test_a_choice_needs_a_candidate(walk_scans) -> None:
     with pytest.raises(ValueError, match="at least one trajectory"):
         choose_trajectory(walk_scans, {})

@@ -51,6 +51,16 @@ def test_profile_sees_nothing_in_a_gap_or_without_beams() -> None:
     assert not seen[1].any()
 
 
+@pytest.mark.parametrize("num_padded", [256, 1000])
+def test_padding_hides_nothing(num_padded: int) -> None:
+    scan = square_room(100.0)
+    padded = np.concatenate([scan, np.full((num_padded, 2), np.nan, np.float32)])[None]
+    mask = np.arange(len(padded[0]))[None] < NUM_BEAMS
+    whole, found = make_profiles(planar_scans(scan[None])), make_profiles(planar_scans(padded, mask))
+    np.testing.assert_array_equal(found.is_seen, whole.is_seen)
+    np.testing.assert_allclose(found.surface, whole.surface, rtol=1e-5)
+
+
 def test_bearings_are_those_of_the_exact_arctangent() -> None:
     points = np.concatenate([np.random.default_rng(0).normal(size=(1000, 2)), np.eye(2), -np.eye(2), np.zeros((1, 2))])
     exact = np.mod(np.arctan2(points[:, 1], points[:, 0]), 2 * np.pi)

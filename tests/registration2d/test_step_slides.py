@@ -176,3 +176,12 @@ def test_a_calibrated_prior_does_not_hold_a_clear_step_that_slipped(scans, truth
     found = incremental_icp(scans, odometry=odometry, prior=prior.loosened(scans.typical_range)).steps.poses
     assert abs(found[slipped, 2] - steps_of(truth)[slipped, 2]) < 0.02
     np.testing.assert_array_equal(prior.loosened(scans.typical_range).steps, prior.steps)
+
+
+def test_the_prior_of_steps_that_nothing_is_known_of_is_unknown(odometry) -> None:
+    known = StepPrior.of_poses(odometry, 10.0)
+    rows = np.array([0, 1, 3])
+    summed = [np.sqrt((known.deviations[a:b] ** 2).sum(axis=0)) for a, b in ((0, 1), (1, 3))]
+    np.testing.assert_allclose(known.through(rows).deviations, summed)
+    unknown = known._replace(deviations=np.full_like(known.deviations, np.inf))
+    assert (unknown.through(rows).deviations == np.inf).all()

@@ -62,7 +62,7 @@ class Config(cli.ScanOptions, cli.RunOptions):
     refine: bool = True
     """Also align all scans together, point to line, from the start and from the fit."""
     steps: Annotated[int | None, arg(metavar="N")] = None
-    """Stop after N steps; without it, the preset decides."""
+    """Stop after N steps, rounded up to whole calls of the compiled program; without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S")] = None
     """Stop the fit after S seconds of run time, compile time not counted."""
     relations: Annotated[Path | None, arg(metavar="FILE")] = None

@@ -101,6 +101,7 @@ class PhaseConfig:
         require_fields(self, "occupancy_weight", low=0, high=1)
         require_fields(self, "num_offsets", low=1, high=self.max_offset)
         require_fields(self, "num_steps", low=1)
+        require_fields(self, "scans_per_step", "beams_per_step", low=2)
         if self.scans_per_window is not None:
             require_fields(self, "scans_per_window", low=2)
 

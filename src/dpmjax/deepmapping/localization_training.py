@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import require_count
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.mapping import Fitted
-from dpmjax.deepmapping.problem import MapFrame, Params, bind_map
+from dpmjax.deepmapping.problem import MapFrame, Params, bind_map, choose_frame
 from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
@@ -27,6 +27,8 @@ NUM_NODES = 513
 _SEEN = 0.3
 # Largest share of unobserved nodes along a rendered beam.
 _MAX_UNSEEN = 0.1
+# Distance from a scan that the raster of an MLP covers, in typical ranges.
+_REACH = 1.5
 # Longest rendered beam in nodes.
 _MAX_NODES = 400
 # Least share of the beams of a rendered scan that hit the map.
@@ -50,7 +52,7 @@ class MapRaster(NamedTuple):
 
     Attributes:
         logits: rows along x, columns along y.
-        frame: frame of the map, equal to that of the raster.
+        frame: square that the raster covers.
     """
 
     logits: Float[Array, "r r"]
@@ -62,21 +64,29 @@ class MapRaster(NamedTuple):
         return 2.0 * self.frame.half_side / (NUM_NODES - 1)
 
 
-@partial(jax.jit, static_argnames="config")
-def make_raster(params: Params, config: DeepMappingConfig) -> MapRaster:
+def make_raster(fitted: Fitted) -> MapRaster:
     """Evaluates M-Net at all nodes.
 
     Args:
-        params: parameters of a fit.
-        config: settings of the fit.
+        fitted: a fit of planar scans.
 
     Returns:
-        MapRaster.
+        MapRaster, over the frame of a grid. An MLP is defined everywhere: the raster covers what its scans see.
     """
+    frame = fitted.params.frame
+    if fitted.config.occupancy.kind == "mlp":
+        positions = jnp.asarray(fitted.poses[:, :2] / fitted.unit, jnp.float32)
+        ends = jnp.stack([positions - _REACH, positions + _REACH])
+        frame = choose_frame(ends, jnp.ones(ends.shape[:2], bool), margin=1.0)
+    return _raster(fitted.params, frame, fitted.config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _raster(params: Params, frame: MapFrame, config: DeepMappingConfig) -> MapRaster:
     axis = jnp.linspace(-1.0, 1.0, NUM_NODES)
     local = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    logits = bind_map(params, config)(params.frame.centre + params.frame.half_side * local)
-    return MapRaster(logits.reshape(NUM_NODES, NUM_NODES), params.frame)
+    logits = bind_map(params, config)(frame.centre + frame.half_side * local)
+    return MapRaster(logits.reshape(NUM_NODES, NUM_NODES), frame)
 
 
 def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
@@ -182,7 +192,7 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
     measured = replace(scans, points=scans.points / fitted.unit)
     render_key, train_key = jax.random.split(key)
-    raster = make_raster(fitted.params, fitted.config)
+    raster = make_raster(fitted)
     rendered = render_scans(raster, measured, _NUM_RENDERED, key=render_key)
     begin = fitted.params.localization
     if has_windows(fitted):

@@ -43,8 +43,9 @@ def blocks_of_step(phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, 
         # all have one length and no scan is left out.
         first = step % -(-num_scans // count) * count
         return jnp.minimum(first, num_scans - count) + jnp.arange(count)[None]
-    first = jax.random.randint(key, (count // _BLOCK, 1), 0, num_scans - _BLOCK + 1)
-    return first + jnp.arange(_BLOCK)
+    length = min(_BLOCK, count)
+    first = jax.random.randint(key, (count // length, 1), 0, num_scans - length + 1)
+    return first + jnp.arange(length)
 
 
 def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Array, " o"]:

@@ -198,7 +198,7 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
     scans = as_scan_set(np.asarray(scan)[None] if is_one else scan, min_scans=1)
-    fields = map_fields(make_raster(fitted.params, fitted.config))
+    fields = map_fields(make_raster(fitted))
     parts = []
     for k in range(0, len(scans.points), _CHUNK):
         part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])

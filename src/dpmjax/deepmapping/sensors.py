@@ -43,6 +43,9 @@ _ALL = slice(None)
 # Number of scans near in space but not in time that each cloud is compared to by planes.
 _NUM_REVISITS = 1
 
+# Largest coordinate of an initial pose, in typical ranges of the scans.
+_MAX_COORDINATE = 1e4
+
 
 def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
     """Checks scans; beams with coordinates that are not finite, or both zero, are invalid.
@@ -192,7 +195,15 @@ def _planar_loss(
 
 def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
     """Checks initial poses x, y, heading and scales them from the unit of the points to typical ranges."""
-    return jnp.asarray(se2.as_poses("start", start, num_scans) / [unit, unit, 1.0], jnp.float32)
+    poses = se2.as_poses("start", start, num_scans) / [unit, unit, 1.0]
+    _require_near_origin(poses[:, :2])
+    return jnp.asarray(poses, jnp.float32)
+
+
+def _require_near_origin(positions: NDArray[np.float64]) -> None:
+    """Raises a ValueError for positions, in typical ranges, that float32 holds to less than a thousandth."""
+    if np.abs(positions).max(initial=0.0) > _MAX_COORDINATE:
+        raise ValueError("start: the positions are too far from the origin for float32; subtract the first one")
 
 
 def _planar_unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
@@ -210,6 +221,7 @@ def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array,
     if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
         raise ValueError(f"start: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
     T[:, :3, 3] /= unit
+    _require_near_origin(T[:, :3, 3])
     return jnp.asarray(T, jnp.float32)
 
 

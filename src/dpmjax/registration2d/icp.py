@@ -23,6 +23,8 @@ _NORMAL_NEIGHBOURS = 6
 
 _MAX_ITERATIONS = 100
 _MAX_ROTATION_ERROR = 1e-3
+_MAX_DISTANCE = 1e4
+"""Largest coordinate as a multiple of the extent of a cloud, of which float32 then holds a thousandth."""
 _OPEN_SHARE = 1e-5
 """Share of the largest singular value of the balance's derivative below which a direction counts as unconstrained."""
 
@@ -76,8 +78,8 @@ def icp(
         IcpResult. With too few points to constrain the motion, the result stays near `T_init`, with `converged` True.
 
     Raises:
-        ValueError: wrong shapes, unknown metric, an empty cloud, and where not traced: numbers that are not finite, or
-            a `T_init` that is no rigid motion.
+        ValueError: wrong shapes, unknown metric, an empty cloud, and where not traced: numbers that are not finite,
+            float32 points far from the origin, or a `T_init` that is no rigid motion.
     """
     source = as_points("source", source, dimensions=(2, 3))
     target = as_points("target", target, dimensions=source.shape[1:]).astype(source.dtype)
@@ -127,6 +129,11 @@ def _require_finite_cloud(name: str, cloud: _Cloud) -> None:
     is_known = not any(isinstance(value, jax.core.Tracer) for value in cloud)
     if len(cloud.points) == 0 or (is_known and not np.isfinite(np.asarray(cloud.points)[np.asarray(cloud.mask)]).all()):
         raise ValueError(f"{name}: expected one point or more and finite numbers; leave invalid points out")
+    if is_known and cloud.points.dtype == jnp.float32:
+        points = np.asarray(cloud.points, np.float64)[np.asarray(cloud.mask)]
+        extent = np.ptp(points, axis=0).max(initial=0.0) if len(points) else 0.0
+        if extent > 0 and np.abs(points).max() > _MAX_DISTANCE * extent:
+            raise ValueError(f"{name}: the points are too far from the origin for float32; subtract their mean first")
 
 
 def _require_motion(T_init: np.ndarray) -> None:

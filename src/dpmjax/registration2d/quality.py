@@ -138,7 +138,8 @@ def map_code_length(scans: PlanarScans, poses: Floats) -> float:
     A Krichevsky-Trofimov code encodes the labels of each cell. It is short where all beams agree, and long for cells
     with both labels or with one beam. A doubled wall is coded at two positions and contradicts beams that pass through
     it. The code length equals the occupancy loss of DeepMapping with the best possible M-Net. Only beams on a line are
-    coded. The mean over turned grids reduces the influence of the position of the walls in the cells.
+    coded, where there are some. The mean over turned grids reduces the influence of the position of the walls in the
+    cells.
 
     Args:
         scans: n scans.
@@ -148,6 +149,8 @@ def map_code_length(scans: PlanarScans, poses: Floats) -> float:
         Code length divided by the number of beams; comparable among poses of one set of scans.
     """
     points, mask = np.asarray(scans.points), np.asarray(scans.is_on_line)
+    if not mask.any():
+        mask = np.asarray(scans.mask)
     world = se2.transform_points(poses, points)
     sensors = np.broadcast_to(poses[:, None, :2], world.shape)
     stride = max(1, int(np.ceil(mask.sum() / _MAX_BEAMS)))

@@ -133,7 +133,9 @@ def _profile(scan: PlanarScans, num_bearings: int) -> RangeProfiles:
     ends = jnp.linalg.norm(jnp.stack([one, other]), axis=-1)
     near, far = ends.min(0), ends.max(0)
     surface = jnp.clip(along / jnp.where(jnp.abs(across) > 1e-9, across, 1.0), near, far)
-    is_seen = (gap < _MAX_GAP * 2 * jnp.pi / points.shape[0]) & (count > 1)
+    # Padding behind the last valid beam is no beam.
+    num_beams = jnp.max(jnp.where(valid, jnp.arange(1, len(valid) + 1), 1))
+    is_seen = (gap < _MAX_GAP * 2 * jnp.pi / num_beams) & (count > 1)
     return RangeProfiles(scan, surface, near, far, jnp.minimum(sorted_slant[before], sorted_slant[after]), is_seen)
 
 

@@ -11,6 +11,7 @@ pose graph have the relative pose of the scans where these constrain it, and the
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -94,9 +95,10 @@ class StepPrior(NamedTuple):
     def through(self, rows: Indices) -> StepPrior:
         """Returns the prior of the steps between these rows (m,) of the n scans, in order."""
         poses = se2.chain(self.steps)
-        variances = np.concatenate([np.zeros((1, 3)), np.cumsum(self.deviations**2, axis=0)])
         steps = se2.relative(poses[rows[:-1]], poses[rows[1:]])
-        return StepPrior(np.asarray(steps, np.float64), np.sqrt(np.diff(variances[rows], axis=0)))
+        # A difference of cumulated sums would be NaN where deviations are infinite.
+        variances = [(self.deviations[start:end] ** 2).sum(axis=0) for start, end in itertools.pairwise(rows)]
+        return StepPrior(np.asarray(steps, np.float64), np.sqrt(np.reshape(variances, (-1, 3))))
 
 
 def usual_motion(matches: PairMatches, typical_range: float) -> StepPrior:

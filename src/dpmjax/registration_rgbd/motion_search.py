@@ -98,7 +98,8 @@ class DepthSearchConfig:
     num_varied: int = 20
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_trajectories", "num_candidates", "num_varied", low=1)
+        require_fields(self, "num_trajectories", "num_varied", low=1)
+        require_fields(self, "num_candidates", low=_NUM_KEPT)
         require_one_of("motion", self.motion, get_args(Motion))
 
     @property
