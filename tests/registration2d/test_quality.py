@@ -158,3 +158,19 @@ def test_trust_does_not_depend_on_the_world_frame(sparse) -> None:
     one = assess_trajectory(scans, sequence.reference_poses)
     other = assess_trajectory(scans, sequence.reference_poses + np.array([500.0, -300.0, 0.0]))
     assert one.weakest_connection == pytest.approx(other.weakest_connection, abs=1e-3)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.005])
+def test_round_walls_constrain_no_turn(noise_m: float) -> None:
+    """The truth fits as well as each turn about the middle: only odometry tells them apart."""
+    angle, rng = 2 * np.pi * np.arange(256) / 256, np.random.default_rng(0)
+    beams = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    heading = 0.1 * np.arange(12)
+    poses = np.column_stack([2.5 * np.cos(heading), 2.5 * np.sin(heading), heading])
+    along = beams @ np.array([2.5, 0.0])
+    ranges = -along + np.sqrt(along**2 - 2.5**2 + 5.0**2) + rng.normal(0, noise_m, (12, 256))
+    scans = planar_scans((ranges[..., None] * beams).astype(np.float32))
+    found = assess_trajectory(scans, poses)
+    assert not found.is_trusted
+    assert found.uncertain_scans == tuple(range(12))
+    assert assess_trajectory(scans, poses, prior=StepPrior.of_poses(poses, scans.typical_range)).uncertain_scans == ()
