@@ -300,7 +300,7 @@ def assess_trajectory(
 
 
 def _turns_freely(scans: PlanarScans) -> Bool[np.ndarray, " n"]:
-    """Finds scans between round walls, which look the same after a turn about the middle, wherever the sensor is.
+    """Returns True for scans between round walls, which look the same after a turn about the middle of these.
 
     The information of a turn is that of point-to-line residuals, less what a shift of the position takes away.
     """
