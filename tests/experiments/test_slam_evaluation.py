@@ -159,7 +159,7 @@ def test_the_time_before_loops_is_that_of_the_run_without_them() -> None:
     stages_s = {"loops": 3.0, "write": 1.0, "decoder": 2.0, "thinning ahead": 9.0}
     run = SlamRun(None, (), stages_s, compile_s=0.0, run_s=10.0, scan_s=(2.0,) * 4, failure=None)
     assert _slam_evaluation._per_scan(run, _slam_evaluation._FILE_STAGES) == pytest.approx(9.0 / 4)
-    assert _slam_evaluation._per_scan(run, _slam_evaluation._LOOP_STAGES) == pytest.approx(6.0 / 4)
+    assert _slam_evaluation._per_scan(run, _slam_evaluation._BEYOND_ODOMETRY) == pytest.approx(6.0 / 4)
 
 
 def test_a_stopped_row_is_not_written(tmp_path, monkeypatch) -> None:
