@@ -25,7 +25,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import DescriptorCloud, cli, encode, load_model, metrics, register, save_model, simulation, slam, viz
+from dpmjax import DescriptorCloud, cli, encode, load_model, metrics, save_model, simulation, slam, viz
 from dpmjax import deeppointmap as dpm
 from dpmjax.io import LidarSequence
 from dpmjax.weights import read_card
@@ -39,7 +39,9 @@ EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
 BEAMS = {16: simulation.VLP16, 32: simulation.HDL32E, 64: simulation.OS1_64}
-KINDS = ("of_clouds", "of_scans", "of_weak_scans")
+KINDS = ("of_clouds", "of_elements", "of_scans", "of_weak_scans")
+OF_CLOUDS = ("of_clouds", "of_elements")
+HAVE_LOOKALIKES = ("of_elements", "of_scans")
 # Elements of a scan in the map of SLAM, and in `register(..., refine=True)` with a cloud.
 NUM_ELEMENTS = 1024
 PAIR_STREAM = 4141
@@ -48,8 +50,10 @@ NUM_SCANS, NUM_OTHER_SCANS = 36, 12
 TOWN_STREAM = 4134
 OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
 TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (60.0, np.inf))
-# The two ends of a corridor may look alike: no evidence tells a pair without overlap from a right one.
-AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0))
+# The two ends of a corridor may look alike. Only `register` of clouds has to know: SLAM proposes neighbours, and scans
+# tell the ends apart.
+FAR_M = 60.0
+AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0), (FAR_M, np.inf))
 # Far from the seeds of the towns of training, also of its held-out one.
 FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
 TOWN_LENGTH_M = 400.0
@@ -117,7 +121,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
     title = "places left out of the fit"
     figures = {
         name: viz.reliability_figure(*held_out[kind], title=title)
-        for kind, name in (("of_scans", "reliability.png"), ("of_clouds", "reliability_clouds.png"))
+        for kind, name in (("of_scans", "reliability.png"), ("of_elements", "reliability_clouds.png"))
     }
     figures["reliability_overlap.png"] = viz.reliability_figure(
         *overlap_held_out, title=f"overlap, {title}", labels=OVERLAP_LABELS
@@ -140,17 +144,20 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, HeldOu
     """
     numbers: cli.Row = {"num_pairs": sum(len(row["is_right"]) for row in rows)}
     models, held_out = {}, {}
-    for kind, names in zip(KINDS, (dpm.CLOUD_FEATURES, dpm.SCAN_FEATURES, dpm.WEAK_FEATURES), strict=True):
+    features_of = dpm.CLOUD_FEATURES, dpm.ELEMENT_FEATURES, dpm.SCAN_FEATURES, dpm.WEAK_FEATURES
+    for kind, names in zip(KINDS, features_of, strict=True):
         pairs = [
             (
                 place,
                 row[kind][number],
-                row["is_right_of_clouds" if kind == "of_clouds" else "is_right"][number],
-                lookalike_gap(row, number) if kind == "of_scans" else np.inf,
+                row["is_right_of_clouds" if kind in OF_CLOUDS else "is_right"][number],
+                lookalike_gap(row, number, kind),
             )
             for place, row in enumerate(rows)
             for number, weak in enumerate(row["of_weak_scans"])
-            if row[kind][number] is not None and (kind != "of_scans" or weak is None)
+            if row[kind][number] is not None
+            and (kind != "of_scans" or weak is None)
+            and (kind == "of_elements" or not is_end(row, number))
         ]
         if kind == "of_weak_scans" and len({is_right for _, _, is_right, _ in pairs}) < 2:
             continue
@@ -166,9 +173,14 @@ def fit(rows: list[cli.Row]) -> tuple[dpm.Calibration, cli.Row, dict[str, HeldOu
     return dpm.Calibration(**models), numbers, held_out
 
 
-def lookalike_gap(row: cli.Row, number: int) -> float:
-    """Returns the lead of a pair over the best other place that looks alike; files hold None for infinity."""
-    gap = row["lookalike_gap"][number]
+def is_end(row: cli.Row, number: int) -> bool:
+    """Returns True for a pair without overlap in an ambiguous place, whose ends may look alike."""
+    return "place" in row and bool(row["distance_m"][number] >= FAR_M)
+
+
+def lookalike_gap(row: cli.Row, number: int, kind: str) -> float:
+    """Returns the lead of a pair over other places that look alike; files hold None for infinity."""
+    gap = row["lookalike_gap_" + kind][number] if kind in HAVE_LOOKALIKES else None
     return np.inf if gap is None else float(gap)
 
 
@@ -204,21 +216,22 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
         Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
         true distance, metres.
     """
-    found: cli.Row = {name: [] for name in (*KINDS, "lookalike_gap", "is_right_of_clouds", "is_right", "distance_m")}
+    gaps = [f"lookalike_gap_{kind}" for kind in HAVE_LOOKALIKES]
+    found: cli.Row = {name: [] for name in (*KINDS, *gaps, "is_right_of_clouds", "is_right", "distance_m")}
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
     for pair in pairs:
         result = dpm.register_in_stages(model, pair)
         clouds = [encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
-        of_clouds = np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
-        motions = np.stack([of_clouds, result.verified])
+        T_of_clouds, evidence_of_clouds = dpm.register_clouds(model, *clouds)
+        motions = np.stack([T_of_clouds, result.verified])
         is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
-        # At run time clouds have the features of their own best motion, whatever the scans say.
-        evidence = result.evidence._replace(of_clouds=result.evidence_of_clouds.of_clouds)
         for name in KINDS:
-            features = getattr(evidence, name)
+            # At run time clouds have the features of their own best motion, whatever the scans say.
+            features = getattr(evidence_of_clouds if name in OF_CLOUDS else result.evidence, name)
             found[name].append(None if features is None else features.tolist())
-        gap = result.evidence.lookalike_gap
-        found["lookalike_gap"].append(gap if np.isfinite(gap) else None)
+        for name, evidence in zip(gaps, (evidence_of_clouds, result.evidence), strict=True):
+            gap = float(evidence.lookalike_gap)
+            found[name].append(gap if np.isfinite(gap) else None)
         found["is_right_of_clouds"].append(bool(is_right[0]))
         found["is_right"].append(bool(is_right[1]))
         found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))

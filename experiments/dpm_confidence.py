@@ -91,10 +91,11 @@ def rate(rows: list[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.R
     for row in rows:
         for number, of_clouds in enumerate(row["of_clouds"]):
             evidence = dpm.MatchEvidence(np.asarray(of_clouds), None)
-            if rated == "scans":
-                arrays = {name: row[name][number] for name in ("of_scans", "of_weak_scans")}
-                evidence = evidence._replace(**{name: np.asarray(some) for name, some in arrays.items() if some})
-                evidence = evidence._replace(lookalike_gap=lookalike_gap(row, number))
+            names = ("of_elements",) if rated == "clouds" else ("of_scans", "of_weak_scans")
+            arrays = {name: row[name][number] for name in names}
+            evidence = evidence._replace(**{name: np.asarray(some) for name, some in arrays.items() if some})
+            gap = lookalike_gap(row, number, "of_elements" if rated == "clouds" else "of_scans")
+            evidence = evidence._replace(lookalike_gap=gap)
             confidence.append(dpm.calibrated_probability(calibration, evidence))
         is_right += row[RATED[rated]]
         distance_m += row["distance_m"]

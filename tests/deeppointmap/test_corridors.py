@@ -7,13 +7,27 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy.special import logit
 
 import dpmjax
-from dpmjax.deeppointmap.confidence import logistic_probability, weak_features
-from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
-from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan
+from dpmjax.deeppointmap.confidence import (
+    CLOUD_FEATURES,
+    CORRIDOR_SHARE,
+    ELEMENT_FEATURES,
+    SCAN_FEATURES,
+    Calibration,
+    LogisticModel,
+    MatchEvidence,
+    calibrated_probability,
+    gather_evidence,
+    logistic_probability,
+    weak_features,
+)
+from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, verify_elements
+from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan, measured_elements
 from dpmjax.scans.weak_directions import facing_samples, sliding_motions, wall_axis, weak_share, weakest_direction
-from tests.scans.surface_scenes import corridor, motion, seen_from
+from dpmjax.types import Registration, SurfaceElements, Verification
+from tests.scans.surface_scenes import corridor, motion, seen_from, street
 
 CONFIG = VerificationConfig()
 PILLARS_M = (-13.0, -8.5, -2.0, 4.0, 5.5, 14.0)
@@ -67,6 +81,52 @@ def test_a_bare_corridor_is_never_sure_of_the_shift(bare) -> None:
     assert found.verification.num_slid > 0
     assert confidence(found) < 0.5
     assert confidence(choose_motion(*scans_of(PILLARS_M), T_TRUE[None], CONFIG)) > 0.9
+
+
+def elements_of(scan: MeasuredScan) -> MeasuredScan:
+    """Every 4th point as a surface element, which is what descriptor clouds keep of a scan."""
+    surface = scan.surface
+    points, normals, planarity = (array[::4] for array in (surface.points, surface.normals, surface.flatness))
+    return measured_elements(SurfaceElements(points, normals, planarity, np.ones(len(points), bool)))
+
+
+def test_elements_tell_the_motion_from_shifts_but_are_never_sure(with_pillars) -> None:
+    elements = [elements_of(scan) for scan in with_pillars]
+    T_wrong = along_the_corridor(3.0)
+    right, shifted = (verify_elements(*elements, T, CONFIG) for T in (T_TRUE, T_wrong))
+    assert right.num_slid == shifted.num_slid > 0
+    assert right.facing_gap > 0 > shifted.facing_gap
+    found = evidence_of(right)
+    assert found.lookalike_gap == pytest.approx(logit(CORRIDOR_SHARE))
+    assert found.of_elements is not None
+    sure = LogisticModel(ELEMENT_FEATURES, (0.0,) * 8, 20.0)
+    calibration = Calibration(
+        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, 0.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 0.0), of_elements=sure
+    )
+    assert calibrated_probability(calibration, found) == pytest.approx(CORRIDOR_SHARE)
+    few = evidence_of(right, num_elements=256)
+    assert few.of_elements is None
+    assert calibrated_probability(calibration, few) == pytest.approx(CORRIDOR_SHARE / 2)
+
+
+def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None:
+    points = [seen_from(street(seed), T) for seed, T in enumerate((motion(10, (1, 0, 0)), motion(30, (-2, 1, 0))))]
+    elements = [elements_of(measure_scan(some, CONFIG)) for some in points]
+    T_true = np.linalg.inv(motion(30, (-2, 1, 0))) @ motion(10, (1, 0, 0))
+    right, turned = (verify_elements(*elements, T, CONFIG) for T in (T_true, T_true @ motion(90, (0, 0, 0))))
+    assert right.num_slid == turned.num_slid == 0
+    assert 2 * right.contradicted_share < turned.contradicted_share
+    assert right.matched_share > 2 * turned.matched_share
+    assert evidence_of(right).lookalike_gap == np.inf
+
+
+def evidence_of(elements: Verification, num_elements: int = 1024) -> MatchEvidence:
+    """Evidence of one hypothesis with 100 pairs."""
+    one = np.ones(1)
+    hypotheses = Registration(
+        np.eye(4)[None], one, one, one, 100 * one, one, *(np.zeros((1, 0), dtype) for dtype in (int, int, float, bool))
+    )
+    return gather_evidence(hypotheses, 0, None, elements, num_elements)
 
 
 def test_pillars_at_equal_steps_leave_the_shift_open() -> None:

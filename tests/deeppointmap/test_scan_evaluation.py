@@ -16,7 +16,7 @@ from dpmjax.deeppointmap import (
     match_clouds,
     overlap_candidates,
     read_scan_pairs,
-    register_in_stages,
+    register_clouds,
     scan_evaluation,
 )
 from dpmjax.deeppointmap.confidence import gather_evidence
@@ -67,9 +67,12 @@ def test_clouds_have_the_evidence_of_their_own_best_motion(model) -> None:
     (pair,) = read_scan_pairs(drive, draw_scan_pairs(drive, "near", 1))
     clouds = [dpmjax.encode(model, points) for points in (pair.source, pair.target)]
     expected = gather_evidence(match_clouds(model, *clouds, config=model.config.matching), 0, None)
-    found = register_in_stages(model, pair)
-    np.testing.assert_allclose(found.evidence_of_clouds.of_clouds, expected.of_clouds, rtol=1e-5)
-    assert found.evidence_of_clouds.of_scans is None
+    T_target_source, evidence = register_clouds(model, *clouds)
+    np.testing.assert_allclose(evidence.of_clouds, expected.of_clouds, rtol=1e-5)
+    assert evidence.of_elements is None  # these clouds have less than 512
+    assert evidence.of_scans is None
+    refined = dpmjax.register(model, *clouds, refine=True)
+    np.testing.assert_allclose(T_target_source, refined.T_target_source, atol=1e-5)
 
 
 def test_pairs_have_the_motion_of_their_poses() -> None:

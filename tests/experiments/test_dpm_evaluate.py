@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import (
     CLOUD_FEATURES,
+    ELEMENT_FEATURES,
     OVERLAP_FEATURES,
     SCAN_FEATURES,
     WEAK_FEATURES,
@@ -97,22 +100,22 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
             np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right]),
             rng.normal(size=len(WEAK_FEATURES)) + 2 * is_right if rng.uniform() < 0.5 else None,
         )
-        return StagedRegistration(T, T, T, evidence, MatchEvidence(of_clouds, None), StageSeconds(*[0.0] * 5))
+        of_elements = np.concatenate([of_clouds, rng.normal(size=len(ELEMENT_FEATURES) - 4) + is_right])
+        evidence_of_clouds = MatchEvidence(of_clouds, None, of_elements=of_elements)
+        return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5)), evidence_of_clouds
 
     motions = []
 
     def staged(model, pair):
         motions.append(found(model, pair))
-        return motions[-1]
+        return motions[-1][0]
 
-    class Found:
+    def of_clouds(model, source, target):
         """The match of the same two scans as clouds: right where they are."""
-
-        def __init__(self) -> None:
-            self.T_target_source = motions[-1].descriptors
+        return motions[-1][0].descriptors, motions[-1][1]
 
     monkeypatch.setattr(deeppointmap, "register_in_stages", staged)
-    monkeypatch.setattr(dpm_calibrate, "register", lambda model, *clouds, refine: Found())
+    monkeypatch.setattr(deeppointmap, "register_clouds", of_clouds)
     monkeypatch.setattr(dpm_calibrate, "NUM_PAIRS", 20)
     monkeypatch.setattr(dpm_calibrate, "NUM_OVERLAP_PAIRS", 16)
     for name, number in (("NUM_TOWNS", 3), ("NUM_AMBIGUOUS", 2), ("NUM_OVERLAP_TOWNS", 2)):
@@ -126,13 +129,15 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
     assert max(model.config.calibration.of_scans.weights[4:]) > 0
     assert min(model.config.calibration.of_weak_scans.weights) > 0
     metrics = load_json(tmp_path / "out" / "metrics.json")
+    assert min(model.config.calibration.of_elements.weights) > 0
+    assert metrics["brier_of_elements"] < metrics["brier_of_clouds"]
     assert metrics["brier_of_scans"] < metrics["brier_of_clouds"] < metrics["brier_of_a_constant_of_clouds"]
     assert model.config.overlap is not None
     assert metrics["num_overlap_pairs"] == 32
     assert 0 <= metrics["auc_overlap"] <= 1
     assert (tmp_path / "out" / "reliability_overlap.png").stat().st_size > 0
     assert (
-        "Confidence calibrated on 3 towns and 2 ambiguous places, 260 pairs; overlap fitted on 2 towns, 32 pairs"
+        "Confidence calibrated on 3 towns and 2 ambiguous places, 300 pairs; overlap fitted on 2 towns, 32 pairs"
         in dpmjax.weights.read_card(tmp_path / "out" / "model.safetensors")
     )
 
@@ -144,9 +149,11 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
     scores = [1.0, 1.0, 1.0, -1.0]
     row = {
         "of_clouds": [[0.0] * 4] * 4,
+        "of_elements": [[0.0] * 8] * 3 + [None],
         "of_scans": [[0.0] * 7 + [score, 0.0] for score in scores],
         "of_weak_scans": [None] * 4,
-        "lookalike_gap": [None] * 4,
+        "lookalike_gap_of_elements": [None, None, 0.0, None],
+        "lookalike_gap_of_scans": [None] * 4,
         "is_right": [True, True, False, False],
         "is_right_of_clouds": [False] * 4,
         "distance_m": [2.0, 8.0, 3.0, 4.0],
@@ -156,7 +163,9 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
     assert (numbers["num_near"], numbers["num_near_sure_right"]) == (3, 1)
     assert numbers["calibration_error"] == pytest.approx(0.25, abs=1e-3)
     assert dpm_confidence.rate([row], calibration, "clouds")["num_sure"] == 0
-    shared = dpm_confidence.rate([{**row, "lookalike_gap": [0.0, None, None, None]}], calibration, "scans")
+    sure = replace(calibration, of_elements=LogisticModel(ELEMENT_FEATURES, (0.0,) * 8, 5.0))
+    assert dpm_confidence.rate([row], sure, "clouds")["num_sure"] == 2
+    shared = dpm_confidence.rate([{**row, "lookalike_gap_of_scans": [0.0, None, None, None]}], calibration, "scans")
     assert shared["num_sure"] == 2
     lines = dpm_confidence.table([{"model": "m", "rated": "scans", "kind": "all", **numbers}]).splitlines()
     assert len({line.count("|") for line in lines}) == 1

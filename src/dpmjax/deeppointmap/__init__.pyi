@@ -1,4 +1,5 @@
 from .confidence import CLOUD_FEATURES as CLOUD_FEATURES
+from .confidence import ELEMENT_FEATURES as ELEMENT_FEATURES
 from .confidence import OVERLAP_FEATURES as OVERLAP_FEATURES
 from .confidence import SCAN_FEATURES as SCAN_FEATURES
 from .confidence import WEAK_FEATURES as WEAK_FEATURES
@@ -55,6 +56,7 @@ from .scan_evaluation import register_in_stages as register_in_stages
 from .scan_registration import distinct_motions as distinct_motions
 from .scan_registration import match_clouds as match_clouds
 from .scan_registration import register as register
+from .scan_registration import register_clouds as register_clouds
 from .scan_registration import register_pairs as register_pairs
 from .training.curriculum import DECAY_RATIO as DECAY_RATIO
 from .training.curriculum import CurriculumStage as CurriculumStage

@@ -13,11 +13,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from dpmjax.types import Registration, Verification
 
 CLOUD_FEATURES = ("log_support", "mean_score", "rmse_m", "lead_share")
+ELEMENT_FEATURES = (*CLOUD_FEATURES, "visible_share", "matched_share", "contradicted_share", "facing_gap")
 SCAN_FEATURES = (
     *("support", "mean_score", "rmse_m", "support_gap"),
     *("visible_share", "matched_share", "contradicted_share", "score", "score_gap"),
@@ -26,6 +27,13 @@ WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
 # Where walls constrain one direction only, wrong motions reach higher log odds, too.
 MAX_SCORE = 3.0
+# The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure: the share of
+# best held-out likelihood in `experiments.dpm_calibrate`.
+CORRIDOR_SHARE = 0.88
+# Fewer elements see and meet less of each other than those of the fit.
+MIN_NUM_ELEMENTS = 512
+# Few elements of a cloud face an axis; more of them say no more.
+MAX_FACING_GAP = 5.0
 RIDGE = 1e-3
 
 
@@ -89,7 +97,7 @@ class LogisticModel:
     def __post_init__(self) -> None:
         if len(self.features) != len(self.weights):
             raise ValueError(f"weights: expected {len(self.features)}, one for each feature, got {len(self.weights)}")
-        if self.features not in (CLOUD_FEATURES, SCAN_FEATURES, WEAK_FEATURES, OVERLAP_FEATURES):
+        if self.features not in (CLOUD_FEATURES, ELEMENT_FEATURES, SCAN_FEATURES, WEAK_FEATURES, OVERLAP_FEATURES):
             raise ValueError(f"features: expected those that this version computes, got {', '.join(self.features)}")
 
 
@@ -98,15 +106,17 @@ class Calibration:
     """Logistic models of P(right within 2 m and 5 degrees).
 
     Attributes:
-        of_clouds: model for descriptor clouds.
+        of_clouds: model for descriptor clouds without surface elements, and for maps.
         of_scans: model for motions that the scans have verified.
         of_weak_scans: model for verified scans whose walls constrain one direction only, as in corridors; None uses
             `of_scans`.
+        of_elements: model for descriptor clouds of single scans with surface elements; None uses `of_clouds`.
     """
 
     of_clouds: LogisticModel
     of_scans: LogisticModel
     of_weak_scans: LogisticModel | None = None
+    of_elements: LogisticModel | None = None
 
 
 class MatchEvidence(NamedTuple):
@@ -116,22 +126,33 @@ class MatchEvidence(NamedTuple):
         of_clouds: `CLOUD_FEATURES`.
         of_scans: `SCAN_FEATURES`; None without scans.
         of_weak_scans: `WEAK_FEATURES`; None where the walls constrain all directions, and without scans.
-        lookalike_gap: lead over other places, as log odds; infinite where none looks alike.
+        lookalike_gap: lead over other places, as log odds; infinite where none looks alike. For surface elements it is
+            that of `CORRIDOR_SHARE` in corridors.
+        of_elements: `ELEMENT_FEATURES`; None without 512 surface elements that were compared.
     """
 
     of_clouds: Float[np.ndarray, " f"]
     of_scans: Float[np.ndarray, " g"] | None
     of_weak_scans: Float[np.ndarray, " w"] | None = None
     lookalike_gap: float = np.inf
+    of_elements: Float[np.ndarray, " e"] | None = None
 
 
-def gather_evidence(hypotheses: Registration, row: int | None, verification: Verification | None) -> MatchEvidence:
+def gather_evidence(
+    hypotheses: Registration,
+    row: int | None,
+    verification: Verification | None,
+    elements: Verification | None = None,
+    num_elements: int = 0,
+) -> MatchEvidence:
     """Gathers the features of one hypothesis.
 
     Args:
         hypotheses: all hypotheses of a pair, with a leading axis.
         row: row of the chosen one; None for a motion that no pairs of descriptors support.
         verification: verification of the chosen motion; None without scans.
+        elements: agreement of surface elements under the motion, of clouds without scans.
+        num_elements: number of elements of the cloud that has fewer.
 
     Returns:
         The features.
@@ -145,6 +166,11 @@ def gather_evidence(hypotheses: Registration, row: int | None, verification: Ver
         gap = support - np.delete(supports, row).max(initial=0.0)
     lead_share = gap / max(supports.max(), 1e-6)
     of_clouds = np.array([np.log1p(support), mean_score, rmse_m, lead_share])
+    if elements is not None:
+        facing_gap = np.clip(elements.facing_gap, -MAX_FACING_GAP, MAX_FACING_GAP)
+        is_dense = num_elements >= MIN_NUM_ELEMENTS
+        of_elements = np.array([*of_clouds, *elements[:3], facing_gap]) if is_dense else None
+        return MatchEvidence(of_clouds, None, None, logit(CORRIDOR_SHARE if elements.num_slid else 1.0), of_elements)
     if verification is None:
         return MatchEvidence(of_clouds, None)
     of_verification = verification[: verification._fields.index("num_tried")]
@@ -178,9 +204,12 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
     if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
         return float(logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans))
     if evidence.of_scans is not None:
-        share = lookalike_share(evidence.lookalike_gap)
-        return float(share * logistic_probability(calibration.of_scans, evidence.of_scans))
-    return float(logistic_probability(calibration.of_clouds, evidence.of_clouds))
+        probability = logistic_probability(calibration.of_scans, evidence.of_scans)
+    elif evidence.of_elements is not None and calibration.of_elements is not None:
+        probability = logistic_probability(calibration.of_elements, evidence.of_elements)
+    else:
+        probability = logistic_probability(calibration.of_clouds, evidence.of_clouds)
+    return float(lookalike_share(evidence.lookalike_gap) * probability)
 
 
 def lookalike_share(lookalike_gap: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:

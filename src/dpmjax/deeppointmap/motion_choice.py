@@ -43,6 +43,13 @@ SLIDING_STEP_M = 0.7
 # Number of these motions that are aligned finely.
 NUM_SLID_FINE = 32
 
+# Surface elements of descriptor clouds are metres apart.
+ELEMENT_RADIUS_M = 2.0
+
+# Alignment of elements, and number of sliding motions that are aligned by it.
+OF_ELEMENTS = AlignmentConfig(levels=(AlignmentLevel(3.0, 1024, 5, kernel_m=0.5), AlignmentLevel(2.0, 1024, 4, 0.2)))
+NUM_SLID_ELEMENTS = 16
+
 # Number of elements of each scan that face the axis and are compared.
 NUM_FACING = 4000
 
@@ -213,6 +220,36 @@ def refine_motion(
     found = verify_motions(source, target, T, config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
     return VerifiedMotion(motion.row, T[0], found._replace(**kept))
+
+
+def verify_elements(
+    source: MeasuredScan, target: MeasuredScan, T_target_source: Pose, config: VerificationConfig
+) -> Verification:
+    """Compares the surface elements of two scans under a motion that is kept.
+
+    In corridors motions along the axis are tried as by `choose_motion`. Elements are too few to choose among these, but
+    not to tell that another motion agrees as well.
+
+    Args:
+        source: elements of a scan (`surface_of_elements`) and their range image.
+        target: the same of the second scan.
+        T_target_source: the motion, aligned.
+        config: limit of a weak axis; number of elements that are compared.
+
+    Returns:
+        The agreement. `facing_gap` is negative where a motion along the axis agrees better.
+    """
+    pair, T = _Pair(source, target, replace(config, plane_radius_m=ELEMENT_RADIUS_M)), T_target_source[None]
+    found = verify_motions(source, target, T, pair.config)[0]
+    axes = wall_axis(source.surface), wall_axis(target.surface)
+    if weak_share(*axes) >= config.max_weak_share:
+        return found
+    starts = sliding_motions(*axes, SLIDING_STEP_M)
+    order = np.argsort(-pair.facing_elements(axes, starts), kind="stable")
+    slid = align_surfaces(source.surface, target.surface, starts[order[:NUM_SLID_ELEMENTS]], OF_ELEMENTS)
+    own, *facing = pair.facing_elements(axes, np.concatenate([T, slid]))
+    best = np.array(facing)[_is_apart(slid, T_target_source)].max(initial=0.0)
+    return found._replace(num_slid=len(starts), facing_gap=float(own - best))
 
 
 def _is_apart(T: Poses, T_other: Pose) -> Bool[np.ndarray, " s"]:

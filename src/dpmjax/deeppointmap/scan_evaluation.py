@@ -73,7 +73,6 @@ class StagedRegistration(NamedTuple):
         verified: motion under which the scans agree best.
         refined: verified motion after the final alignment.
         evidence: features of the confidence of the verified motion.
-        evidence_of_clouds: those of `descriptors`, without the scans.
         seconds: seconds of each stage.
     """
 
@@ -81,7 +80,6 @@ class StagedRegistration(NamedTuple):
     verified: Pose
     refined: Pose
     evidence: MatchEvidence
-    evidence_of_clouds: MatchEvidence
     seconds: StageSeconds
 
 
@@ -136,7 +134,6 @@ def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
         verified=verified.T_target_source,
         refined=refined.T_target_source,
         evidence=gather_evidence(hypotheses, verified.row, verified.verification),
-        evidence_of_clouds=gather_evidence(hypotheses, 0, None),
         seconds=StageSeconds(*np.diff(times).tolist()),
     )
 

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array
 
 from dpmjax.checks import require_pairs, require_type
-from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
+from dpmjax.deeppointmap.confidence import MatchEvidence, gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
-from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, verify_elements
 from dpmjax.deeppointmap.prepared_scans import (
     PreparedScan,
     Scale,
@@ -27,7 +27,7 @@ from dpmjax.deeppointmap.prepared_scans import (
     is_verified_pair,
     prepare_each,
 )
-from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, VerificationConfig
+from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, VerificationConfig, measured_elements
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.scans.element_alignment import align_elements_on_host
 from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
@@ -78,8 +78,10 @@ def register(
     Returns:
         `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
         (`model.config.calibration`) is the probability that the motion is right within 2 m and 5 degrees. Without
-        calibration it is the mean score of the pairs, which is no probability. A motion that only the views from above
-        suggested has no inliers, and without calibration the confidence 0. Failure is data: without any pair and
+        calibration it is the mean score of the pairs, which is no probability. Two clouds of single scans that are
+        refined, of 512 elements or more, have the agreement of their elements as evidence, too; in corridors, whose
+        ends may look alike in all elements, the confidence of clouds is at most 0.88. A motion that only the views from
+        above suggested has no inliers, and without calibration the confidence 0. Failure is data: without any pair and
         without a view, or with fewer than 20 descriptors on either side, the motion is the identity and the confidence
         0; with fewer than three distinct pairs `rmse` is infinite.
 
@@ -133,7 +135,7 @@ def register_each(
                 scans = source.measured, target.measured
                 motion = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
             elif refine and all(cloud.normals is not None for cloud in clouds):
-                motion = pool.submit(_refined, *clouds, in_cloud_units, pair_scale)
+                motion = pool.submit(_refined, *clouds, in_cloud_units, pair_scale, model)
             else:
                 motion = pool.submit(_RegisteredMotion, 0, np.asarray(hypotheses.T_target_source[0]))
             started.append((hypotheses, motion))
@@ -191,6 +193,22 @@ def match_clouds(
     return jax.device_get(trace_match(model, source.described, target.described, config=config))
 
 
+def register_clouds(model: Model, source: DescriptorCloud, target: DescriptorCloud) -> tuple[Pose, MatchEvidence]:
+    """Registers two clouds of surface elements as `register` does, and keeps the features of the confidence.
+
+    Args:
+        model: encoder and decoder.
+        source: descriptors of a scan with surface elements.
+        target: the same of the second scan.
+
+    Returns:
+        T_target_source, and the features from which `register` computes the confidence.
+    """
+    hypotheses = match_clouds(model, source, target, config=model.config.matching)
+    motion = _refined(source, target, hypotheses, 1.0, model)
+    return motion.T_target_source, gather_evidence(hypotheses, motion.row, None, motion.elements, motion.num_elements)
+
+
 def distinct_motions(hypotheses: Registration) -> Poses:
     """Returns the motions of the hypotheses that any pair supports; at least one.
 
@@ -212,6 +230,8 @@ class _RegisteredMotion(NamedTuple):
     evidence: Verification | None = None
     verification: Verification | None = None
     weak: WeakDirection | None = None
+    elements: Verification | None = None
+    num_elements: int = 0
 
 
 def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
@@ -262,22 +282,30 @@ def _verified(
 
 
 def _refined(
-    source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float
+    source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, scale: float, model: Model
 ) -> _RegisteredMotion:
-    """Refines the best motion of two descriptor clouds by their surface elements."""
+    """Refines the best motion of two descriptor clouds by their surface elements, and compares these under it."""
     # The elements alone cannot choose among hypotheses: in a corridor, or after a half-turn, wrong ones meet the same
     # number of planes.
-    T_target_source = np.array(hypotheses.T_target_source[0], np.float64)
+    T_target_source, agreement = np.array(hypotheses.T_target_source[0], np.float64), None
+    num_elements = min(int(np.sum(cloud.mask)) for cloud in (source, target))
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
         aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
         T_target_source = np.array(aligned.T_target_source)
+        # A map of several scans was not seen from one place: it has no free space of its own.
+        if max(len(cloud.features) for cloud in (source, target)) <= model.config.num_descriptors:
+            scans = measured_elements(source.elements), measured_elements(target.elements)
+            agreement = verify_elements(*scans, T_target_source, model.config.verification)
     T_target_source[:3, 3] /= scale
-    return _RegisteredMotion(0, T_target_source)
+    return _RegisteredMotion(0, T_target_source, elements=agreement, num_elements=num_elements)
 
 
 def _as_registration(model: Model, hypotheses: Registration, motion: _RegisteredMotion) -> Registration:
     """Joins the hypothesis that was chosen, its motion and its verification, and adds the confidence."""
-    row, evidence = motion.row, gather_evidence(hypotheses, motion.row, motion.evidence)
+    row, evidence = (
+        motion.row,
+        gather_evidence(hypotheses, motion.row, motion.evidence, motion.elements, motion.num_elements),
+    )
     match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row or 0]), hypotheses)
     if row is None:
         none = {name: jnp.zeros_like(getattr(match, name)) for name in OF_THE_INLIERS}

@@ -16,9 +16,17 @@ from jaxtyping import Bool, Float
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.scans.surface_alignment import nearest_planes
-from dpmjax.scans.surfaces import RangeImage, Surface, SurfaceConfig, range_image, scan_surface, view_points
+from dpmjax.scans.surfaces import (
+    RangeImage,
+    Surface,
+    SurfaceConfig,
+    range_image,
+    scan_surface,
+    surface_of_elements,
+    view_points,
+)
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
-from dpmjax.types import Poses, Verification
+from dpmjax.types import Poses, SurfaceElements, Verification
 
 # A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
 # are near those of the source, so its own points are compared with the planes of the source.
@@ -112,6 +120,19 @@ def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -
         Surface and free space.
     """
     surface = scan_surface(points, config.surface)
+    return MeasuredScan(surface, range_image(surface.points))
+
+
+def measured_elements(elements: SurfaceElements) -> MeasuredScan:
+    """Prepares the surface elements of a scan for verification, without the scan.
+
+    Args:
+        elements: metres, in the frame of the lidar.
+
+    Returns:
+        Surface and free space, as far as the elements show it.
+    """
+    surface = surface_of_elements(elements)
     return MeasuredScan(surface, range_image(surface.points))
 
 

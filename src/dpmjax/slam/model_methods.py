@@ -22,7 +22,7 @@ from dpmjax.deeppointmap.encoding import pyramid_of_cloud, thin_scan
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.motion_choice import REFINEMENT
+from dpmjax.deeppointmap.motion_choice import ELEMENT_RADIUS_M, REFINEMENT
 from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
 from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
@@ -219,10 +219,6 @@ def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan:
     points = local_map.surface.points[local_map.surface.samples[:MAX_VIEWED]]
     views = view_points(measured.image, (points - T_map_scan[:3, 3]) @ T_map_scan[:3, :3])
     return float(views.is_contradicted.sum()) / max(int(views.is_visible.sum()), 1)
-
-
-# Radius of `VerificationConfig.plane_radius_m` for surface elements, which are metres apart.
-ELEMENT_RADIUS_M = 2.0
 
 
 class NetworkMatcher:
