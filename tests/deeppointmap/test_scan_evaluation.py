@@ -69,7 +69,7 @@ def test_clouds_have_the_evidence_of_their_own_best_motion(model) -> None:
     expected = gather_evidence(match_clouds(model, *clouds, config=model.config.matching), 0, None)
     T_target_source, evidence = register_clouds(model, *clouds)
     np.testing.assert_allclose(evidence.of_clouds, expected.of_clouds, rtol=1e-5)
-    assert evidence.of_elements is None  # these clouds have less than 512
+    assert evidence.of_elements is None  # these clouds have fewer than 512
     assert evidence.of_scans is None
     refined = dpmjax.register(model, *clouds, refine=True)
     np.testing.assert_allclose(T_target_source, refined.T_target_source, atol=1e-5)

@@ -27,8 +27,8 @@ WEAK_FEATURES = ("score_capped", "facing_gap_root")
 MAX_RMSE_M = 5.0
 # Where walls constrain one direction only, wrong motions reach higher log odds, too.
 MAX_SCORE = 3.0
-# The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure: the share of
-# best held-out likelihood in `experiments.dpm_calibrate`.
+# The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure. The share has the
+# best likelihood on places left out of the fit (by a script, on the pairs of `experiments.dpm_calibrate`).
 CORRIDOR_SHARE = 0.88
 # Fewer elements see and meet less of each other than those of the fit.
 MIN_NUM_ELEMENTS = 512

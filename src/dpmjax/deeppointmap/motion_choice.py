@@ -47,7 +47,9 @@ NUM_SLID_FINE = 32
 ELEMENT_RADIUS_M = 2.0
 
 # Alignment of elements, and number of sliding motions that are aligned by it.
-OF_ELEMENTS = AlignmentConfig(levels=(AlignmentLevel(3.0, 1024, 5, kernel_m=0.5), AlignmentLevel(2.0, 1024, 4, 0.2)))
+OF_ELEMENTS = AlignmentConfig(
+    levels=(AlignmentLevel(3.0, 1024, 5, kernel_m=0.5), AlignmentLevel(2.0, 1024, 4, kernel_m=0.2))
+)
 NUM_SLID_ELEMENTS = 16
 
 # Number of elements of each scan that face the axis and are compared.
