@@ -45,6 +45,7 @@ def test_programs_are_kept_where_the_user_says(variables, expected, monkeypatch)
         assert found == expected or found.startswith(f"{expected}/")
 
 
+@pytest.mark.slow
 def test_a_second_process_loads_what_the_first_has_compiled(tmp_path) -> None:
     folder = tmp_path / "programs"
     variables = {name: value for name, value in os.environ.items() if "CACHE" not in name}

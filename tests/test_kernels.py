@@ -269,7 +269,17 @@ KERNELS = {
     "step": Kernel(step_toy, seeds, ("x",), is_exact=False),
     "solve": Kernel(lambda seed, x: solve_toy(seed), seeds),
 }
-EVERY = pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
+# These compile for seconds.
+SLOW = ("icp to planes", "match_hypotheses", "solve")
+
+
+def each(kernels: dict[str, Kernel]) -> pytest.MarkDecorator:
+    """Runs a test for each of some kernels."""
+    marks = {name: (pytest.mark.slow,) if name in SLOW else () for name in kernels}
+    rows = [pytest.param(kernel, id=name, marks=marks[name]) for name, kernel in kernels.items()]
+    return pytest.mark.parametrize("kernel", rows)
+
+
 WITH_MASKS = {name: kernel for name, kernel in KERNELS.items() if kernel.padding}
 WITH_GRADIENT = {name: kernel for name, kernel in KERNELS.items() if kernel.by}
 
@@ -295,7 +305,7 @@ def assert_close(found: Any, expected: Any) -> None:
         np.testing.assert_allclose(x[tuple(map(slice, y.shape))], y, **CLOSE)
 
 
-@EVERY
+@each(KERNELS)
 def test_jit_and_vmap_are_the_call(kernel: Kernel, assert_compiles_nothing) -> None:
     examples = [example(kernel, seed) for seed in (0, 1)]
     compiled = jax.jit(lambda arrays: kernel.call(**arrays))
@@ -309,7 +319,7 @@ def test_jit_and_vmap_are_the_call(kernel: Kernel, assert_compiles_nothing) -> N
         assert_close(jax.tree.map(lambda leaf, row=row: leaf[row], together), expected[row])
 
 
-@pytest.mark.parametrize("kernel", WITH_MASKS.values(), ids=WITH_MASKS)
+@each(WITH_MASKS)
 def test_padding_changes_nothing(kernel: Kernel) -> None:
     arrays = example(kernel)
     assert_close(jax.jit(lambda arrays: kernel.call(**arrays))(padded(kernel, arrays)), kernel.call(**arrays))
@@ -331,7 +341,7 @@ def total(kernel: Kernel, arrays: Arrays) -> Any:
     return sum(jnp.sum(jnp.cos(jnp.arange(leaf.size)) * leaf) for leaf in leaves)
 
 
-@pytest.mark.parametrize("kernel", WITH_GRADIENT.values(), ids=WITH_GRADIENT)
+@each(WITH_GRADIENT)
 def test_gradients_are_finite_next_to_padding(kernel: Kernel) -> None:
     arrays = padded(kernel, example(kernel))
     gradients = jax.jit(jax.grad(lambda moving: total(kernel, arrays | moving)))({by: arrays[by] for by in kernel.by})
@@ -342,10 +352,7 @@ def test_gradients_are_finite_next_to_padding(kernel: Kernel) -> None:
             np.testing.assert_array_equal(gradient[-EXTRA:], 0)
 
 
-@pytest.mark.parametrize(
-    "kernel", [kernel for kernel in WITH_GRADIENT.values() if kernel.is_exact],
-    ids=[name for name, kernel in WITH_GRADIENT.items() if kernel.is_exact],
-)  # fmt: skip
+@each({name: kernel for name, kernel in WITH_GRADIENT.items() if kernel.is_exact})
 def test_gradients_are_those_of_differences(kernel: Kernel, float64) -> None:
     arrays = example(kernel, dtype=np.float64)
     here = {by: arrays[by] for by in kernel.by}

@@ -48,6 +48,7 @@ def test_scans_come_back_by_name(folder) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_stage_runs_in_its_own_process(tmp_path) -> None:
     speed, memory = run_stage("products", tmp_path, quick=True, platform="cpu")
     assert (speed.metric, speed.unit) == ("speed", "GFLOP/s")

@@ -41,6 +41,7 @@ def test_a_route_is_a_scan_a_metre_along_its_own_direction() -> None:
     assert np.einsum("ni,ni->n", truth[:-1, :2, 0], steps).mean() > 0.98
 
 
+@pytest.mark.slow
 def test_costs_are_counted_at_every_moment() -> None:
     early, late = slam.costs(slam.route(0, 600.0)[:400], (150, 300))
     assert early.cpu_ms > 0

@@ -39,7 +39,7 @@ def write_bag(path: Path, kind: str, scans: list[np.ndarray]) -> Path:
     return bag.path
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind != KINDS[0])) for kind in KINDS])
 def test_slam_maps_a_bag_as_it_maps_files(tmp_path: Path, without_networks, scans, kind: str) -> None:
     (tmp_path / "files").mkdir()
     for index, points in enumerate(scans):

@@ -33,6 +33,7 @@ def weights(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     out = tmp_path / "out"

@@ -74,6 +74,7 @@ def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> 
     assert (out / "map.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_guessed_motions_within_a_map_are_told(case, tmp_path, monkeypatch, capsys) -> None:
     """The second half of the second map has a guessed pose beside the first half, and so beside the first map."""
     a, b = (dpmjax.load_map(case / f"{name}.npz") for name in "ab")
@@ -90,6 +91,7 @@ def test_guessed_motions_within_a_map_are_told(case, tmp_path, monkeypatch, caps
     assert dpmjax.slam.MergedMaps((a,), None).is_joined
 
 
+@pytest.mark.slow
 def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None:
     out, weights = tmp_path / "out", ("--weights", case / "model.safetensors")
     maps = [case / f"{name}.npz" for name in "abc"]

@@ -86,6 +86,7 @@ def test_another_seed_makes_another_town(without_rays) -> None:
     assert np.abs(first.T_world_lidar[:5] - other.T_world_lidar[:5]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_another_seed_makes_another_town_of_the_demonstration(without_rays) -> None:
     first, other = (open_drive(None, DriveOptions(seed=seed)) for seed in (0, 1))
     assert np.abs(first.T_world_lidar[:5] - other.T_world_lidar[:5]).max() > 1e-3

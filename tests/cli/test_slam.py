@@ -196,6 +196,7 @@ def test_plyfile_reads_the_map(whole) -> None:
     assert apart.max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_bad_scan_on_the_way_keeps_what_was_found(whole, drive, with_truth, tmp_path, capsys) -> None:
     out, path = tmp_path / "out", drive / "060.npy"
     good = path.read_bytes()
@@ -273,6 +274,7 @@ def test_a_run_of_fewer_scans_than_are_done_is_refused(whole, with_truth, tmp_pa
     assert files == {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
 
 
+@pytest.mark.slow
 def test_every_nth_scan_keeps_its_reference(drive, with_truth, tmp_path) -> None:
     assert run(drive, "-o", tmp_path / "out", "-j", 2, "-n", 50) == EXIT_OK
     T = np.load(tmp_path / "out" / "trajectory.npy")

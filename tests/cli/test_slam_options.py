@@ -80,6 +80,7 @@ def test_a_saved_map_is_extended(room, tmp_path, capsys) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
     drive, weights = room
     assert run(drive, "--weights", weights, "--deskew", "--no-loop", "-n", 6, "-o", tmp_path / "out") == EXIT_OK

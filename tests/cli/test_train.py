@@ -99,6 +99,7 @@ def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, 
     assert "checkpoint 3 cannot be read" in caplog.text
 
 
+@pytest.mark.slow
 def test_the_best_of_equal_models_is_the_later() -> None:
     state = init_training(jax.random.key(0), TRAINING)
     first = after_evaluation(begin_training(TRAINING), 0.5)
@@ -114,6 +115,7 @@ def test_the_best_of_equal_models_is_the_later() -> None:
     assert worse.best_params is first.best_params
 
 
+@pytest.mark.slow
 def test_batches_made_ahead_are_those_made_alone() -> None:
     with SampleMaker(toy.store(), TRAINING, seed=0) as maker:
         for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
@@ -165,6 +167,7 @@ def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPa
     assert training_settings(Config(scans=96)).scans_at_once == 96
 
 
+@pytest.mark.slow
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
     weights = load_model("dpm_small")
     settings = training_settings(Config(weights="dpm_small"), weights)

@@ -97,6 +97,7 @@ def replace_points(cloud: SurfaceElements, points: list[list[float]]) -> Surface
     return replace(cloud, positions=jnp.asarray(points))
 
 
+@pytest.mark.slow
 def test_the_gradient_vanishes_at_the_true_poses_of_exact_planes(truth, scans) -> None:
     # Only points whose neighbourhood lies on one wall have its exact normal.
     exact = replace(scans, flatness=jnp.where(is_exact(scans, truth), scans.flatness, 0.0)).planes
@@ -116,6 +117,7 @@ def is_exact(scans: dm.CloudScans, truth: np.ndarray) -> jnp.ndarray:
     return jnp.asarray(np.abs(normals).max(-1) > 1.0 - 1e-6)
 
 
+@pytest.mark.slow
 def test_no_plane_is_a_misfit_with_a_finite_gradient(scans) -> None:
     empty = replace(scans, mask=jnp.zeros_like(scans.mask)).planes
     first = jax.tree.map(lambda leaf: leaf[0], empty)
@@ -124,6 +126,7 @@ def test_no_plane_is_a_misfit_with_a_finite_gradient(scans) -> None:
     assert np.isfinite(np.asarray(gradient)).all()
 
 
+@pytest.mark.slow
 def test_rows_that_are_not_there_never_matter(truth, scans) -> None:
     short = replace(scans, mask=scans.mask & (jnp.arange(512) < 300))
     filled = replace(short, points=jnp.where(short.mask[..., None], short.points, jnp.nan))

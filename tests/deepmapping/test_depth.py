@@ -156,6 +156,7 @@ def test_the_surface_between_pixels_of_a_plane_is_the_plane(scans) -> None:
     np.testing.assert_allclose(twist, 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_image_matches_itself_and_contradicts_itself_from_elsewhere(walk) -> None:
     points, mask = jnp.asarray(walk.points[0].reshape(-1, 3)), jnp.asarray(walk.mask[0].reshape(-1))
     surface = as_depth_scans(walk.points, walk.mask).surfaces[0]
@@ -214,6 +215,7 @@ def test_the_truth_is_more_consistent_than_a_walk_with_one_wrong_turn(walk, scan
     assert truth <= 1.0
 
 
+@pytest.mark.slow
 def test_a_point_is_explained_once(walk) -> None:
     def share(rows: list[int], T: np.ndarray) -> float:
         scans = as_depth_scans(walk.points[rows], walk.mask[rows])
@@ -254,6 +256,7 @@ def test_near_points_have_the_leeway_of_farther_ones() -> None:
     assert share(2.0, unit=4.0) > 0.0
 
 
+@pytest.mark.slow
 def test_consistency_has_finite_slopes_where_nothing_overlaps(scans) -> None:
     def slope(turn: float) -> jax.Array:
         def loss(values: jax.Array) -> jax.Array:

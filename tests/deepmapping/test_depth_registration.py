@@ -41,6 +41,7 @@ def returning(T: np.ndarray, scans: DepthScans) -> Callable[..., dm.Fit]:
     return engine
 
 
+@pytest.mark.slow
 def test_of_start_and_fit_the_more_consistent_one_is_kept(walk, scans) -> None:
     right, apart = walk.T_world_camera, np.array(walk.T_world_camera)
     apart[:, 0, 3] += np.arange(4.0)

@@ -259,6 +259,7 @@ def test_same_key_same_numbers_and_another_key_others(tiny_data) -> None:
     assert not np.array_equal(*(jax.tree.leaves(s.params.localization)[-1] for s in (one, other)))
 
 
+@pytest.mark.slow
 def test_restored_from_disk_in_any_phase_equals_unbroken(tiny_data, tmp_path) -> None:
     states = []
     fit(COLD, tiny_data, key=KEY, on_report=lambda progress: states.append(progress.state))

@@ -100,6 +100,7 @@ def test_views_of_another_world_are_not_known(trained) -> None:
     assert dpmjax.relocalize(trained, elsewhere.points).is_known.mean() < 0.2
 
 
+@pytest.mark.slow
 def test_without_a_map_no_scan_is_known_and_the_proposal_stays(unmapped, queries) -> None:
     found = dpmjax.relocalize(unmapped, queries[0])
     np.testing.assert_allclose(found.nats, np.log(4.0), rtol=1e-5)
@@ -109,6 +110,7 @@ def test_without_a_map_no_scan_is_known_and_the_proposal_stays(unmapped, queries
     np.testing.assert_allclose(found.pose[:, :2] / unmapped.unit, proposals[:, 0, :2], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_rendered_scans_are_those_of_the_world(fitted, tiny_walk) -> None:
     scans = ScanSet(jnp.asarray(tiny_walk.points) / fitted.unit, jnp.asarray(tiny_walk.mask))
     raster = make_raster(fitted)
@@ -129,6 +131,7 @@ def test_rendered_scans_are_those_of_the_world(fitted, tiny_walk) -> None:
     assert (error < 3.0 * spacing).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_the_raster_of_an_mlp_covers_the_way(unmapped) -> None:
     poses = np.array([[-40.0, 0, 0], [60.0, 20.0, 0]]) * unmapped.unit
     config = replace(unmapped.config, occupancy=dm.preset("paper").occupancy)
@@ -164,11 +167,13 @@ def test_one_scan_is_one_row_of_many(trained, queries) -> None:
     np.testing.assert_allclose(one.pose, many.pose[3], rtol=1e-4, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_teaching_keeps_poses_and_map(fitted, trained) -> None:
     np.testing.assert_array_equal(fitted.poses, trained.poses)
     jax.tree.map(np.testing.assert_array_equal, fitted.params.occupancy, trained.params.occupancy)
 
 
+@pytest.mark.slow
 def test_a_turned_sensor_sees_points_turned_back() -> None:
     points = np.random.default_rng(0).normal(size=(5, 2))
     world = se2.transform_points(np.array([[0.0, 0.0, 0.7]]), points[None])[0]

@@ -31,6 +31,7 @@ def test_many_scans_are_encoded_as_each_alone(model, scans) -> None:
         np.testing.assert_array_equal(together.positions[number], alone.positions)
 
 
+@pytest.mark.slow
 def test_many_pairs_are_registered_as_each_alone(model, scans) -> None:
     sources, targets = [scans[0], prepare_scan(model, scans[1])], [scans[2], scans[0]]
     together = dpmjax.register_pairs(model, sources, targets, refine=True)

@@ -61,6 +61,7 @@ def test_a_scan_is_refined_against_a_cloud(model, clouds) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_merged_map_is_refined_like_a_scan(model, clouds) -> None:
     """The map holds the target alone, in another frame."""
     T_map_b = motion(70, (3, -4, 0.5))
@@ -71,6 +72,7 @@ def test_a_merged_map_is_refined_like_a_scan(model, clouds) -> None:
     assert np.linalg.norm(difference[:3, 3]) < 0.02
 
 
+@pytest.mark.slow
 def test_offsets_are_compared_with_the_true_ones(model, clouds) -> None:
     quality = offset_quality(model, [(*clouds, T_B_A.astype(np.float32))])
     assert quality.num_pairs > 100

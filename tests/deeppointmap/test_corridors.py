@@ -129,6 +129,7 @@ def evidence_of(elements: Verification, num_elements: int = 1024) -> MatchEviden
     return gather_evidence(hypotheses, 0, None, elements, num_elements)
 
 
+@pytest.mark.slow
 def test_pillars_at_equal_steps_leave_the_shift_open() -> None:
     scans = scans_of(tuple(np.arange(-58.0, 58.0, 4.0)))
     assert confidence(choose_motion(*scans, T_TRUE[None], CONFIG)) < 0.9

@@ -172,6 +172,7 @@ def test_a_cloud_without_elements_is_not_refined(model, scans) -> None:
         jax.tree.map(np.testing.assert_array_equal, refined, coarse)
 
 
+@pytest.mark.slow
 def test_further_elements_follow_the_descriptors_and_change_no_match(scans) -> None:
     stages = (PyramidStage(64, (0.2,), 8), *toy.MODEL.pyramid.stages)
     config = replace(toy.MODEL, pyramid=PyramidConfig(stages, num_interpolations=1))

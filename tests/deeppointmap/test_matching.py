@@ -291,6 +291,7 @@ def test_wrong_arguments_are_named(as_user) -> None:
         merge_clouds(DescriptorCloud(jnp.ones((2, 3, 3)), jnp.ones((2, 3, 5)), jnp.ones((2, 3), bool)), np.eye(4))
 
 
+@pytest.mark.slow
 def test_consensus_finds_the_motion_where_scores_mislead() -> None:
     """A fifth of the pairs is right, and those are not the ones with the best scores."""
     rng = np.random.default_rng(3)

@@ -53,6 +53,7 @@ def test_evidence_has_the_names_that_the_probability_is_fitted_on() -> None:
     assert OverlapEvidence._fields == OVERLAP_FEATURES
 
 
+@pytest.mark.slow
 def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     a, b = cloud(1), cloud(2)
     features = [np.asarray(similarity_features(model, one), float) for one in correlate(model, a, b)]
@@ -93,6 +94,7 @@ def test_a_scan_is_as_similar_to_itself_as_can_be(model) -> None:
     assert found.log_radius_ratio == 0
 
 
+@pytest.mark.slow
 def test_padded_equals_unpadded(model) -> None:
     found, expected = overlap_evidence(model, cloud(1, 3), cloud(2, 5)), overlap_evidence(model, cloud(1), cloud(2))
     np.testing.assert_allclose(found, expected, **ACCUMULATED)

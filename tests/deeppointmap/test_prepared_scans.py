@@ -46,6 +46,7 @@ def scans() -> list[np.ndarray]:
     return [seen_from(street(seed, 24_000), T) for seed, T in enumerate((T_WORLD_A, T_WORLD_B))]
 
 
+@pytest.mark.slow
 def test_compact_scans_find_the_same_motion(scans) -> None:
     images = [measure_scan(scan, CONFIG).image for scan in scans]
     compact = [compact_scan(cloud_of(scan), image) for scan, image in zip(scans, images, strict=True)]

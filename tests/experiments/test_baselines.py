@@ -42,6 +42,7 @@ def with_open3d() -> None:
     import_or_skip("open3d")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("with_swarms")
 def test_swarms_find_a_short_walk(walk) -> None:
     start = ate(np.zeros((len(walk), 3)), walk)

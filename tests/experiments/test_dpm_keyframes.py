@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import numpy as np
+import pytest
 
 import dpmjax
 from experiments import dpm_keyframes
@@ -25,6 +26,7 @@ def test_the_spacing_follows_the_extent_of_the_scan() -> None:
     assert dpm_keyframes.keyframe_spacing_m(5 * points, model) == 5.0
 
 
+@pytest.mark.slow
 def test_a_union_holds_the_descriptors_that_thinning_leaves() -> None:
     model, drive = dpmjax.init_model(jax.random.key(0), toy.MODEL), toy.drive(num_scans=3)
     clouds = jax.device_get(dpmjax.deeppointmap.encode_scans(model, [drive.read_scan(i) for i in range(3)]).described)

@@ -55,6 +55,7 @@ def write_drive(folder: Path, numbers) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_drive_is_cut_and_joined_again(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(dpm_multiagent, "OVERLAP", 0.5)
     drive, out = write_drive(tmp_path / "drive", range(len(TRUTH))), tmp_path / "out"

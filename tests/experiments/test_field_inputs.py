@@ -9,6 +9,7 @@ import pytest
 from experiments.field_inputs import Config, main, table_of
 
 
+@pytest.mark.slow
 def test_a_row_has_the_message_of_a_refused_input(tmp_path) -> None:
     (tmp_path / "field_2d").mkdir()
     (tmp_path / "field_2d" / "landmark_xy.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_XY 1 2 3\n")

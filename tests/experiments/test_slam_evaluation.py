@@ -129,6 +129,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
 
 
+@pytest.mark.slow
 def test_sizes_of_maps_are_those_of_the_files(with_toys, tmp_path) -> None:
     out = tmp_path / "out"
     assert run("--slam", "town", "--weights", with_toys, "--num-towns", 1, "--localize", 3, "-o", out) == EXIT_OK

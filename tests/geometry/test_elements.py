@@ -27,6 +27,7 @@ def elements_of(points: np.ndarray, mask: np.ndarray | None = None, num: int = 9
     return jax.device_get(pyramid_elements(build_pyramid(points, mask, CONFIG), num))
 
 
+@pytest.mark.slow
 def test_elements_of_a_plane_have_its_normal() -> None:
     found = elements_of(plane())
     # The origin is on the positive side.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
@@ -68,6 +69,7 @@ def test_directions_that_no_plane_holds_stay() -> None:
     np.testing.assert_allclose(tangent[[0, 1, 5]], 0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_derivative_is_finite_at_the_zero_step() -> None:
     derivative = jax.jacobian(lambda tangent: motion_about(PlaneStep(tangent, jnp.ones(3))))(jnp.zeros(6))
     assert np.isfinite(derivative).all()

@@ -69,6 +69,7 @@ def test_attention_to_nothing_is_zero() -> None:
     assert not attention.attend(ones, ones[:0], ones[:0], jnp.zeros(0, bool)).any()
 
 
+@pytest.mark.slow
 def test_padded_equals_unpadded(model: Model) -> None:
     a, b = cloud(2, 8), cloud(3, 8)
     expected = correlate(model, a, b)

@@ -66,6 +66,7 @@ def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
     np.testing.assert_allclose(module.apply({"params": params}, *inputs), expected, **ACCUMULATED)
 
 
+@pytest.mark.slow
 def test_padded_equals_unpadded(model: Model) -> None:
     # Five points fewer than the first level has room for.
     cloud = points(1, 19)
@@ -157,6 +158,7 @@ def test_wrong_pyramids_and_widths_are_named(as_user, model: Model) -> None:
         ModelConfig(decoder=DecoderConfig(input_channels=64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["bearing", "local"])
 def test_frames_of_points_do_not_see_a_turn_about_the_vertical(frame) -> None:
     config = replace(CONFIG, encoder=replace(CONFIG.encoder, frame=frame))

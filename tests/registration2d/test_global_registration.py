@@ -87,6 +87,7 @@ def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
     assert (found.scores[:, 0] > found.scores[:, 1] + 20).all()
 
 
+@pytest.mark.slow
 def test_candidates_of_a_pair_are_different_poses(profiles, found) -> None:
     poses = np.where(np.isfinite(found.scores)[..., None], found.poses, np.nan)
     for first, second in ((0, 1), (0, 2), (1, 2)):
@@ -206,6 +207,7 @@ def task_of(profiles: RangeProfiles, keyframes: list[int], config: GlobalConfig 
     return _Task(profiles, WallDirections(profiles.scans), np.array(keyframes), False, config)
 
 
+@pytest.mark.slow
 def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
     profiles, poses = make_profiles(walk_scans), np.array(walk.reference_poses)
     assert len(find_unregistered(profiles, poses)) == 0

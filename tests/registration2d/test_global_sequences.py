@@ -98,6 +98,7 @@ def peak_bytes(run) -> int:
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_memory_of_the_search_grows_with_the_scans_not_with_their_pairs(there, monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module("dpmjax.registration2d.wall_directions")
     monkeypatch.setattr(module, "_BLOCK", 1 << 14)
@@ -113,6 +114,7 @@ def test_memory_of_the_search_grows_with_the_scans_not_with_their_pairs(there, m
     assert large < 4 * 800**2
 
 
+@pytest.mark.slow
 def test_pairs_in_batches_are_those_of_one_search(there, monkeypatch: pytest.MonkeyPatch) -> None:
     profiles, source, target = make_profiles(scans_of(there)), np.array([5, 1, 3, 1, 2]), np.array([4, 0, 2, 3, 1])
     turns = np.zeros((5, COARSE.num_turns), bool)

@@ -135,6 +135,7 @@ def test_float32_stays_float32_where_jax_has_64_bits(metric: str, float64) -> No
     assert np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 def test_a_single_point_moves_the_translation_only() -> None:
     point = jnp.asarray([[0.1257302, -0.13210486]])
     derivative = jax.jacfwd(lambda source: icp(source, point, "point").T_target_source)(point)[:, :, 0]

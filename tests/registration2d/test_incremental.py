@@ -67,6 +67,7 @@ def test_a_scan_that_fits_nowhere_is_bridged(walk, chained) -> None:
     assert ate(poses[others], walk.reference_poses[others]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_step_without_a_match_is_no_standing_robot(walk) -> None:
     points = walk.points[:4].copy()
     points[3] = 0.2 * points[3]

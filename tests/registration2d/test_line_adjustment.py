@@ -31,6 +31,7 @@ def aligned(noisy_walk_scans, start) -> np.ndarray:
     return adjust_to_lines(noisy_walk_scans, start)
 
 
+@pytest.mark.slow
 def test_lines_bring_poses_near_the_bound(noisy_walk, start, aligned) -> None:
     # The bound is for a world that is known; 24 scans make a world that is 1.6 times worse, at most.
     cast = partial(cast_scans, make_world(0).is_obstacle, num_beams=noisy_walk.mask.shape[1])
@@ -56,6 +57,7 @@ def test_lines_do_not_depend_on_the_order_of_scans(noisy_walk_scans, start, alig
     np.testing.assert_allclose(shuffled, aligned[order], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_lines_never_use_masked_beams(noisy_walk, start) -> None:
     mask = noisy_walk.mask & (np.random.default_rng(2).uniform(size=noisy_walk.mask.shape) < 0.9)
     results = []

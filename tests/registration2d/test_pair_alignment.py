@@ -103,6 +103,7 @@ def test_the_best_guess_wins_and_no_pair_is_no_match(walk, walk_scans) -> None:
     assert empty.poses.shape == (0, 3)
 
 
+@pytest.mark.slow
 def test_scans_without_a_beam_stay_at_their_guess(walk_scans) -> None:
     one = walk_scans.replace(is_on_line=jnp.zeros_like(walk_scans.mask)).take([0])
     guess = np.array([[[3.0, -2.0, 0.4]]])

@@ -192,6 +192,7 @@ def test_each_stage_is_told_before_it_begins(few) -> None:
     assert stages[-1] == "choice and assessment"
 
 
+@pytest.mark.slow
 def test_a_cold_start_has_no_poses_and_is_not_refined(few) -> None:
     engine = Untrained()
     found = register(few, replace(SHORT, refine=False), start="zero", hooks=RegistrationHooks(engine=engine))

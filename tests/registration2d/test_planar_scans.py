@@ -91,6 +91,7 @@ def test_masked_beams_never_matter(filling: float) -> None:
     assert (lines.noise, lines.typical_range) == (expected.noise, expected.typical_range)
 
 
+@pytest.mark.slow
 def test_padded_equals_unpadded() -> None:
     scan, _ = scan_of_room((15.0, -20.0), noise=0.5)
     padded = ScanSet(jnp.pad(scan.points, ((0, 0), (0, 40), (0, 0))), jnp.pad(scan.mask, ((0, 0), (0, 40))))
@@ -166,6 +167,7 @@ def test_lengths_grow_with_the_scans() -> None:
     np.testing.assert_allclose(three.tolerances, 3 * np.array(one.tolerances), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_selection_has_no_order() -> None:
     scan, _ = scan_of_room((15.0, -20.0))
     scans = planar_scans(np.repeat(scan.points, 3, axis=0))

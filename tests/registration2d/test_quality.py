@@ -84,6 +84,7 @@ def test_surfaces_decide_only_where_the_noise_lets_them(noise_px: float, expecte
     assert choose_trajectory(scans, candidates)[0] == expected
 
 
+@pytest.mark.slow
 def test_misfit_is_the_share_of_the_visible_beams_in_a_square_room() -> None:
     room = np.ones((202, 202), bool)
     room[1:-1, 1:-1] = False
@@ -160,6 +161,7 @@ def test_trust_does_not_depend_on_the_world_frame(sparse) -> None:
     assert one.weakest_connection == pytest.approx(other.weakest_connection, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [0.0, 0.005])
 def test_round_walls_constrain_no_turn(noise_m: float) -> None:
     """The truth fits as well as each turn about the middle: only odometry tells them apart."""

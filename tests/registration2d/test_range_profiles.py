@@ -51,6 +51,7 @@ def test_profile_sees_nothing_in_a_gap_or_without_beams() -> None:
     assert not seen[1].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_padded", [256, 1000])
 def test_padding_hides_nothing(num_padded: int) -> None:
     scan = square_room(100.0)

@@ -112,6 +112,7 @@ def test_a_scan_whose_wheels_were_read_in_another_moment_of_a_turn_is_turned_bac
     np.testing.assert_allclose(aligned[turned, 2], true[turned, 2], atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_scan_that_does_not_fit_keeps_its_pose() -> None:
     sequence = simulate_sequence(0, 5, seed=5)
     points, true = np.array(sequence.points), np.asarray(sequence.reference_poses)

@@ -29,6 +29,7 @@ def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
     return poses + np.concatenate([np.zeros((1, 3)), rng.normal(size=(len(poses) - 1, 3)) * [px, px, 0.01 * px]])
 
 
+@pytest.mark.slow
 def test_refinement_is_exact_without_noise(walk, walk_scans) -> None:
     start = shaken(walk.reference_poses, 10.0)
     refined = refine(walk_scans, start, WITHOUT_LOOPS)
@@ -43,6 +44,7 @@ def test_refinement_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None
     assert ate(refined.poses, noisy_walk.reference_poses) < 0.7
 
 
+@pytest.mark.slow
 def test_refinement_never_uses_masked_beams(walk) -> None:
     mask = walk.mask & (np.random.default_rng(2).uniform(size=walk.mask.shape) < 0.9)
     start = shaken(walk.reference_poses, 5.0)
@@ -66,6 +68,7 @@ def test_two_scans_that_share_nothing_are_refined_without_pairs(walk) -> None:
     assert np.isfinite(refined.poses).all()
 
 
+@pytest.mark.slow
 def test_refinement_stays_in_the_world_of_the_start(walk, walk_scans) -> None:
     offset = np.array([[1000.0, -500.0, 2.0]])
     refined = refine(walk_scans, se2.compose(offset, walk.reference_poses), WITHOUT_LOOPS)
@@ -192,6 +195,7 @@ def test_of_too_many_candidates_those_are_kept_that_are_near() -> None:
     assert np.median(np.hypot(*(poses[source] - poses[target])[:, :2].T)) < 0.6 * np.median(apart[may])
 
 
+@pytest.mark.slow
 def test_a_wrong_loop_has_no_support() -> None:
     poses = np.zeros((40, 3))
     source, target = np.array([30, 31, 32, 33]), np.array([1, 2, 3, 4])

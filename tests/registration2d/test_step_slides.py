@@ -60,6 +60,7 @@ def steps_of(poses: np.ndarray) -> np.ndarray:
     return np.asarray(se2.relative(poses[:-1], poses[1:]))
 
 
+@pytest.mark.slow
 def test_steps_are_open_in_a_corridor_and_closed_in_rooms(scans, truth) -> None:
     slides = slide_steps(make_profiles(scans), steps_of(truth))
     assert slides.is_open[IN_CORRIDOR].all()
@@ -79,6 +80,7 @@ def test_an_open_step_is_as_uncertain_as_its_odometry_and_moves_to_it(scans, tru
     assert 0.3 * deviation < slides.deviations[10] < 2.0 * deviation
 
 
+@pytest.mark.slow
 def test_odometry_is_calibrated_by_the_clear_steps(scans, truth, odometry) -> None:
     found = calibrate_odometry(scans, odometry * [1.1, 1.1, 1.0])
     assert found.fault is None

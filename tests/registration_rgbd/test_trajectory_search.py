@@ -80,6 +80,7 @@ def test_adjusted_poses_come_back_to_the_truth(walk, scans, motion: str) -> None
     np.testing.assert_allclose(T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
     unit = typical_range(scans.points, scans.mask)
     for seed in range(5):

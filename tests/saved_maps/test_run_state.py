@@ -110,6 +110,7 @@ def test_a_run_that_is_cut_off_anywhere_goes_on_like_an_unbroken_one(truth_run, 
     assert_goes_on_like_the_unbroken_one(truth_run, tmp_path / "state.npz", chosen)
 
 
+@pytest.mark.slow
 def test_a_drive_that_extends_a_map_goes_on_like_an_unbroken_one(truth_run, tmp_path) -> None:
     start = init_slam(truth_run.states[80].slam_map)
     scans = scans_of(range(120, 160))

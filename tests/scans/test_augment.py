@@ -211,6 +211,7 @@ def test_a_power_lets_most_scans_stand_upright() -> None:
     assert np.median(tilt) == pytest.approx(0.26 / 8, rel=0.1)
 
 
+@pytest.mark.slow
 def test_one_scan_in_ten_is_occluded_as_the_paper_says() -> None:
     angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     ring = jnp.asarray(np.stack([40 * np.cos(angles), 40 * np.sin(angles), np.full(720, -1.0)], 1), jnp.float32)

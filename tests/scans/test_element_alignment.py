@@ -34,6 +34,7 @@ def error_m_deg(T: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(difference[:3, 3])), float(np.degrees(np.linalg.norm(se3.log(difference)[3:])))
 
 
+@pytest.mark.slow
 def test_two_views_of_one_surface_are_aligned() -> None:
     """The views share no point; the oracle is the motion with which they were made."""
     found = align_elements(SOURCE, TARGET, GUESS)
@@ -69,6 +70,7 @@ def test_the_symmetric_motion_back_is_the_inverse() -> None:
     np.testing.assert_allclose(there.T_target_source @ back.T_target_source, np.eye(4), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_masked_and_uneven_elements_count_for_nothing() -> None:
     junk = SurfaceElements(
         jnp.full((40, 3), jnp.nan), jnp.full((40, 3), jnp.nan), jnp.full(40, jnp.nan), jnp.zeros(40, bool)
@@ -81,6 +83,7 @@ def test_masked_and_uneven_elements_count_for_nothing() -> None:
         assert found.num_pairs == expected.num_pairs
 
 
+@pytest.mark.slow
 def test_starts_are_aligned_side_by_side() -> None:
     starts = jnp.asarray(np.stack([GUESS, T_B_A @ motion(-3, (-0.6, 0.3, 0))]), jnp.float32)
     many = jax.vmap(align_elements, (None, None, 0))(SOURCE, TARGET, starts)
@@ -122,6 +125,7 @@ def test_what_no_plane_holds_stays() -> None:
     np.testing.assert_allclose(found[2, 3], 0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_derivative_is_that_of_the_solution() -> None:
     """If the target moves, the motion moves with it: the derivative by a translation of the target is one."""
 
@@ -132,6 +136,7 @@ def test_the_derivative_is_that_of_the_solution() -> None:
     np.testing.assert_allclose(derivative, np.eye(3), atol=2e-2)
 
 
+@pytest.mark.slow
 def test_the_derivative_is_finite_where_nothing_is_there() -> None:
     def loss(positions: jax.Array, target: SurfaceElements) -> jax.Array:
         found = align_elements(SOURCE.replace(positions=positions), target, GUESS)

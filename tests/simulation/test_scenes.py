@@ -49,6 +49,7 @@ def test_a_scene_gives_scans_with_poses(kind):
     assert kind in sequence.name
 
 
+@pytest.mark.slow
 def test_two_lidars_take_turns_along_one_way():
     other = replace(SENSOR, name="other", view_deg=90.0)
     mixture = replace(SMALL, kinds=(("suburb", 1.0),), sensors=((SENSOR, 1.0),))

@@ -52,6 +52,7 @@ def test_a_seed_makes_one_town(town):
     assert not np.array_equal(town.primitives.boxes.centres[:50], other.primitives.boxes.centres[:50])
 
 
+@pytest.mark.slow
 def test_a_key_makes_one_scan(town, way, assert_compiles_nothing):
     first = scan(town, way, 10)
     with assert_compiles_nothing():
@@ -103,6 +104,7 @@ def test_poses_of_a_route_look_along_it_at_equal_steps():
     np.testing.assert_allclose(T[:, 2, 2], np.linalg.det(R), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_there_and_back_sees_a_street_from_both_sides():
     poses = route("there_and_back")
     apart = np.linalg.norm(poses[:, None, :2, 3] - poses[None, :, :2, 3], axis=-1)

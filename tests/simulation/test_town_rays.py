@@ -190,6 +190,7 @@ def turn(land):
     return look, town, tables, np.asarray(rays.directions, np.float64)
 
 
+@pytest.mark.slow
 def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     look, town, (boxes, poles, tufts), rays = turn
     pose = tilted_pose()

@@ -36,6 +36,7 @@ def test_worlds_differ():
     assert all((a != b).mean() > 0.02 for i, a in enumerate(grids) for b in grids[:i])
 
 
+@pytest.mark.slow
 def test_a_name_is_a_kind_with_a_seed():
     for name, index in (("office-3", 3), ("yard-1", 1), ("office", 0)):
         np.testing.assert_array_equal(make_world(name).is_obstacle, make_world(index).is_obstacle)

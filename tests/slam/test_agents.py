@@ -83,6 +83,7 @@ def test_agents_that_never_meet_stay_apart() -> None:
     assert len(take_component(result.joined, 1)) == len(result.agents[1].keyframes)
 
 
+@pytest.mark.slow
 def test_the_order_of_agents_does_not_matter() -> None:
     first, second = run(PARTS), run(PARTS[::-1])
     for agent in range(3):
@@ -138,6 +139,7 @@ def test_bytes_are_counted() -> None:
         assert traffic.keyframe_bytes > 0
 
 
+@pytest.mark.slow
 def test_maps_of_different_days_are_merged() -> None:
     methods = methods_of(TRUTH)
     a, b = (dpmjax.run_slam(methods, scans_of(part)).map for part in PARTS[:2])

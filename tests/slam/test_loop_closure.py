@@ -113,6 +113,7 @@ def test_nearest_pairs_are_those_of_a_search_by_hand() -> None:
     assert nearest_pairs(map_of(truth[:1])) == []
 
 
+@pytest.mark.slow
 def test_keyframes_that_an_optimisation_brings_together_are_compared_then() -> None:
     truth = laps(2, side_m=40.0, step_m=2.0)
     slam_map, half = map_of(truth), len(truth) // 2

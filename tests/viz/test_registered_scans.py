@@ -141,6 +141,7 @@ def test_panels_of_other_scans_are_refused():
         Panel("a", ScanSet(points, mask), poses[:, :2])
 
 
+@pytest.mark.slow
 def test_drawing_leaves_no_global_state_and_no_early_matplotlib():
     code = (
         "import sys, numpy as np, dpmjax.viz as viz; assert not {'jax', 'matplotlib'} & set(sys.modules);"

@@ -87,6 +87,7 @@ def test_a_training_that_is_told_to_finish_ends_early_by_a_decay() -> None:
     assert rates[5] > rates[6] > config.final_learning_rate
 
 
+@pytest.mark.slow
 def test_a_training_from_a_model_begins_with_its_parameters() -> None:
     model = dpmjax.init_model(jax.random.key(5), toy.MODEL)
     trained = dpmjax.train(toy.store(), TRAINING, start=model, hooks=TrainingHooks(stop=lambda: 1))

@@ -56,6 +56,7 @@ def info_nce_in_numpy(queries, keys, distances, *, is_coarse: bool) -> tuple[flo
     return float(np.mean(losses)), float(np.mean(hits))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0])
 def test_terms_are_those_of_numpy(seed: int) -> None:
     a, b = sides(seed)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+import pytest
 
 from dpmjax.deeppointmap import ScanStore, init_model, prepare_drive
 from dpmjax.deeppointmap.training.step import encode_sample
@@ -62,6 +63,7 @@ def test_poses_follow_the_motions_of_the_scans() -> None:
     np.testing.assert_allclose(found, short().T_world_lidar, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
     store, model = ScanStore([prepare_drive(short(), toy.TRAINING)]), init_model(jax.random.key(0), toy.TRAINING.model)
     scans, placed = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(1))
