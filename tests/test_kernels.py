@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -125,12 +125,18 @@ def descriptors(rng: np.random.Generator) -> Arrays:
     return arrays | {name: np.ones(16, bool) for name in ("is_a", "is_b")}
 
 
-MODEL = dpmjax.init_model(jax.random.key(0), toy.MODEL)
-TOY = deepmapping.toy_problem(deepmapping.ToyConfig("direct", num_steps=5))
+@cache
+def model() -> dpmjax.Model:
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+@cache
+def toy_1d() -> deepmapping.Problem:
+    return deepmapping.toy_problem(deepmapping.ToyConfig("direct", num_steps=5))
 
 
 def encode(points: Any, mask: Any) -> Any:
-    return dpmjax.encode_pyramid(MODEL, geometry.build_pyramid(points, mask, toy.MODEL.pyramid))
+    return dpmjax.encode_pyramid(model(), geometry.build_pyramid(points, mask, toy.MODEL.pyramid))
 
 
 def clouds_of(a: Any, b: Any, at_a: Any, at_b: Any, is_a: Any, is_b: Any) -> Any:
@@ -138,7 +144,7 @@ def clouds_of(a: Any, b: Any, at_a: Any, at_b: Any, is_a: Any, is_b: Any) -> Any
 
 
 def correlate(**arrays: Any) -> Any:
-    return dpmjax.correlate(MODEL, *clouds_of(**arrays))
+    return dpmjax.correlate(model(), *clouds_of(**arrays))
 
 
 def match(**arrays: Any) -> Any:
@@ -152,14 +158,14 @@ def match(**arrays: Any) -> Any:
 
 
 def solve_toy(seed: Any) -> Any:
-    state, report = deepmapping.solve(TOY, None, key=jax.random.key(seed))
+    state, report = deepmapping.solve(toy_1d(), None, key=jax.random.key(seed))
     return state.params.x, report.losses
 
 
 def step_toy(seed: Any, x: Any) -> Any:
-    state = deepmapping.init(TOY, None, key=jax.random.key(seed))
+    state = deepmapping.init(toy_1d(), None, key=jax.random.key(seed))
     state = state.replace(params=state.params.replace(x=x))
-    state, report = deepmapping.step(TOY, state, None, phase=0)
+    state, report = deepmapping.step(toy_1d(), state, None, phase=0)
     return state.params.x, report.losses
 
 

@@ -78,6 +78,7 @@ def test_figures_have_a_case(folder) -> None:
             assert toy_case.replace("16 scans", "4 scans") in cases
 
 
+@pytest.mark.slow
 def test_compile_time_is_told_of_what_is_compiled(folder) -> None:
     rows = time_jax_builders(folder, quick=True, preset="tiny")
     assert [row.case.split(": ")[1] for row in rows if row.metric == "compile"] == [

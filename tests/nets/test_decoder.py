@@ -148,6 +148,7 @@ def test_gradient_of_attention_in_chunks_is_that_of_the_whole(monkeypatch: pytes
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), parts, whole)
 
 
+@pytest.mark.slow
 def test_shared_layers_are_one_layer_applied_again(model: Model) -> None:
     shared_config = replace(CONFIG, decoder=replace(CONFIG.decoder, shares_layers=True))
     decoder = {name: value for name, value in model.params["decoder"].items() if name != "layer_1"}
@@ -159,6 +160,7 @@ def test_shared_layers_are_one_layer_applied_again(model: Model) -> None:
         np.testing.assert_allclose(found.features, expected.features, **ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_crossed", [True, False])
 def test_features_depend_on_the_other_cloud_and_on_positions_only_if_crossed(is_crossed: bool) -> None:
     config = replace(CONFIG, decoder=replace(CONFIG.decoder, is_crossed=is_crossed))

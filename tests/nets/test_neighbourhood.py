@@ -68,6 +68,7 @@ def test_neighbours_that_repeat_share_the_gradient_of_one() -> None:
     np.testing.assert_allclose(gradient([0, 1, 2, 3, 4, 0, 0]), gradient([0, 1, 2, 3, 4]), **ACCUMULATED)
 
 
+@pytest.mark.slow
 def test_gradient_is_finite_where_all_is_zero() -> None:
     arrays = [jnp.zeros((3, 4)), jnp.zeros((2, 2, 3)), jnp.ones((3, 4)), jnp.ones(4)]
     gradients = jax.grad(lambda arrays: jnp.sum(in_jax(arrays, np.zeros((2, 2), int))))(arrays)

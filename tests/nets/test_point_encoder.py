@@ -53,6 +53,7 @@ def poisoned(pyramid: PointPyramid) -> PointPyramid:
     return pyramid.replace(levels=levels)
 
 
+@pytest.mark.slow
 def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
     rng = np.random.default_rng(0)
     features, offsets, neighbours = rng.normal(size=(9, 5)), rng.normal(size=(6, 4, 3)), rng.integers(0, 9, (6, 4))
@@ -107,6 +108,7 @@ def test_empty_cloud_has_no_descriptors(model: Model) -> None:
     assert not cloud.positions.any()
 
 
+@pytest.mark.slow
 def test_gradient_is_finite_in_degenerate_clouds_too(model: Model) -> None:
     gradient_of = jax.jit(jax.grad(lambda model, pyramid: jnp.sum(encode_pyramid(model, pyramid).features ** 2)))
     for cloud in (np.zeros((19, 3), np.float32), points(5, 19)):
@@ -136,6 +138,7 @@ def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
     assert jnp.linalg.norm(low.features - high.features) < 0.03 * jnp.linalg.norm(high.features)
 
 
+@pytest.mark.slow
 def test_paper_size_is_the_published_one() -> None:
     shapes = model_shapes(ModelConfig())
     counts = {part: sum(leaf.size for leaf in jax.tree.leaves(params)) for part, params in shapes.items()}

@@ -74,6 +74,7 @@ def test_support_counts_by_rank_and_contradictions_in_full() -> None:
     np.testing.assert_allclose(add_up(scores), [3.0, 0.0, -7.0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
     # Scan 0, and scan 1 turned by each yaw: all are searched at once.
     yaws = np.array([0.0, 1.3, 3.1, -2.0])
@@ -113,6 +114,7 @@ def test_a_program_has_one_fourier_transform(profiles, monkeypatch: pytest.Monke
     assert transform.call_count == 1
 
 
+@pytest.mark.slow
 def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
     wrong = int(np.flatnonzero((found.source == 6) & (found.target == 0))[0])
     poses, scores = found.poses.copy(), found.scores.copy()
