@@ -10,8 +10,8 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # The tests run each program for a moment and compile hundreds: quick compilation is worth more than quick programs. The
-# fusion emitters double the time of compilation and the memory; JAX 0.11 has no choice of them any more. LLVM compiles a
-# program as a whole: parts for several threads take 14 % longer where each core has a worker.
+# fusion emitters double the time of compilation and the memory; JAX 0.11 has no choice of them any more. Programs that
+# are compiled in parts, by several threads, take 14 % longer, because each core has a worker.
 os.environ["XLA_FLAGS"] = " ".join(
     [
         os.environ.get("XLA_FLAGS", ""),

@@ -276,7 +276,7 @@ KERNELS = {
     "solve": Kernel(lambda seed, x: solve_toy(seed), seeds),
 }
 # These compile for seconds.
-SLOW = ("icp to planes", "match_hypotheses", "solve")
+SLOW = ("encode_pyramid", "find_consensus", "icp to planes", "icp to points", "match_hypotheses", "solve")
 
 
 def each(kernels: dict[str, Kernel]) -> pytest.MarkDecorator:

@@ -197,6 +197,7 @@ def test_resumed_run_keeps_the_options_that_are_not_given(toy):
     assert "--seed was 5" in errors
 
 
+@pytest.mark.slow
 def test_resumed_command_may_repeat_its_flags(toy):
     assert finish(toy("-o", "out", "--no-loop"))[0] == 0
     assert finish(toy("-o", "out", "--no-loop", "--resume"))[0] == 0

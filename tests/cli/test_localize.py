@@ -158,6 +158,7 @@ def test_errors_are_those_of_the_keyframes_frames(case) -> None:
     np.testing.assert_allclose(again.translation_m, errors.translation_m, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_interrupted(case, tmp_path, monkeypatch) -> None:
     def stopped(*arguments):
         for result in localize_each(*arguments):

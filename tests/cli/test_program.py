@@ -40,6 +40,7 @@ def test_help_of_a_subcommand_has_examples_and_loads_nothing_slow(name) -> None:
     assert f"    dpmjax {name}" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "name"), [("deepmapping_2d", "map2d"), ("dpm_train", "train"), ("dpm_slam", "slam")]
 )

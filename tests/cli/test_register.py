@@ -86,6 +86,7 @@ def test_an_earlier_run_is_replaced_only_on_demand(files, tmp_path, capsys) -> N
     assert command(files, *arguments, "--force") == EXIT_OK
 
 
+@pytest.mark.slow
 def test_columns_of_raw_files_are_judged_said_and_noted(files, tmp_path, capsys) -> None:
     paths = [tmp_path / "a.pcd.bin", tmp_path / "b.pcd.bin"]
     rng = np.random.default_rng(0)

@@ -238,6 +238,7 @@ def test_a_point_is_explained_once(walk) -> None:
     assert 0.0 < share([0, 0], off) < share([0, 0], same[:2])
 
 
+@pytest.mark.slow
 def test_near_points_have_the_leeway_of_farther_ones() -> None:
     rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
     moved = np.tile(np.eye(4), (2, 1, 1))

@@ -114,6 +114,7 @@ def loss_of(world: WorldBatch, phase: PhaseConfig, occupancy, config: DeepMappin
     return mapping_loss(config, phase, params, world, jnp.asarray(pair), key=KEY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [0.0, 0.1, 1.0])
 def test_loss_is_convex_in_its_terms_and_an_untrained_grid_is_undecided(gamma: float) -> None:
     config = DeepMappingConfig(occupancy=OccupancyConfig(kind="grid", resolutions=(4,)))

@@ -86,6 +86,7 @@ def test_initialisations_have_their_spread(name: str) -> None:
     assert bool(jnp.any(layer["bias"] != 0)) == (name == "pytorch")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["gradient-descent", "lbfgs", "bfgs"])
 def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
     x_best, _ = global_minimum()

@@ -22,6 +22,7 @@ def scans() -> list[np.ndarray]:
     return [drive.read_scan(index) for index in range(CHUNK + 1)]
 
 
+@pytest.mark.slow
 def test_many_scans_are_encoded_as_each_alone(model, scans) -> None:
     together = dpmjax.encode_scans(model, scans)
     assert together.mask.shape == (len(scans), model.config.num_descriptors)

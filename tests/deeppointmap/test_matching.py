@@ -308,6 +308,7 @@ def test_consensus_finds_the_motion_where_scores_mislead() -> None:
     assert np.abs(by_score.T_target_source - T).max() > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.29, 0.35, 0.58, 0.7, 1.16])
 def test_padding_changes_no_number_of_pairs(ratio: float) -> None:
     config = MatchConfig(pair_ratio=ratio)

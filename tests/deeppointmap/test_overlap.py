@@ -87,6 +87,7 @@ def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     assert 0 <= found.near_support <= found.support
 
 
+@pytest.mark.slow
 def test_a_scan_is_as_similar_to_itself_as_can_be(model) -> None:
     found = overlap_evidence(model, cloud(1), cloud(1))
     same = (found.scan_similarity, found.similarity_median, found.mutual_share)

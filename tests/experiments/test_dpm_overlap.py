@@ -49,6 +49,7 @@ def test_hard_pairs_are_far_apart(model) -> None:
     assert not pairs.is_overlap[pairs.is_hard].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_scans", [8, 24])
 def test_a_drive_without_far_pairs_gets_them_from_the_next_one(model, num_scans: int, monkeypatch) -> None:
     monkeypatch.setattr(dpm_overlap, "NUM_PAIRS", 3)

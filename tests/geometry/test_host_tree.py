@@ -47,6 +47,7 @@ def test_a_pickled_tree_finds_the_same(num_points: int) -> None:
     np.testing.assert_array_equal(again.nearest(points, k), tree.nearest(points, k))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", [None, "ACTIVE"])
 def test_other_libraries_keep_their_policy_of_waiting(policy: str | None) -> None:
     variables = {name: value for name, value in os.environ.items() if name != WAIT_POLICY}

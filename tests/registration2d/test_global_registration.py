@@ -97,6 +97,7 @@ def test_candidates_of_a_pair_are_different_poses(profiles, found) -> None:
         assert not (is_near & (np.abs(se2.wrap_angle(off[:, 2])) < APART)).any()
 
 
+@pytest.mark.slow
 def test_only_the_given_turns_are_searched(profiles) -> None:
     turns = np.zeros((1, COARSE.num_turns), bool)
     turns[0, 18] = True
@@ -143,6 +144,7 @@ def test_a_pair_agrees_with_the_map_by_its_nearest_candidate(truth, profiles) ->
     np.testing.assert_allclose(edges.information, [np.diag(expected)] * 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_block_at_a_wrong_pose_moves_back_as_a_whole(sequence, truth, found, scorer) -> None:
     torn = truth.copy()
     torn[4:] = se2.compose(np.array([300.0, 150.0, 0.4]), torn[4:])

@@ -74,6 +74,7 @@ def test_a_robot_may_go_out_and_back_between_two_keyframes(there, monkeypatch: p
     assert ate(register_as_set(scans, config, monkeypatch), poses) < 4.0
 
 
+@pytest.mark.slow
 def test_half_circles_that_look_to_different_sides_have_a_likely_turn(there) -> None:
     """Two views of 180 degrees from one place, 60 to 90 degrees apart: half or less of each is seen by the other."""
     turns = np.radians([-90.0, -60.0, 60.0, 90.0])

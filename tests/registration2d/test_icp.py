@@ -75,6 +75,7 @@ def test_what_only_the_source_has_seen_does_not_pull(metric: str) -> None:
     assert error_of(result.T_target_source, true, source) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["point", "plane"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_degenerate_clouds_stay_finite(dim: int, metric: str) -> None:
@@ -124,7 +125,8 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
         icp(source + np.float32(0.1), source, "plane", np.eye(3, dtype=np.float32))
 
 
-@pytest.mark.parametrize("metric", [pytest.param("point", marks=pytest.mark.slow), "plane"])
+@pytest.mark.slow
+@pytest.mark.parametrize("metric", ["point", "plane"])
 def test_float32_stays_float32_where_jax_has_64_bits(metric: str, float64) -> None:
     source, true = surface(2).astype(np.float32), motion(2, 3.0, 0.2)
     target = apply(true, source).astype(np.float32)

@@ -103,6 +103,7 @@ def test_padded_equals_unpadded() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_beams", [3, 5, 16])
 def test_scans_of_few_beams_are_prepared(num_beams: int) -> None:
     angle = 2 * np.pi * np.arange(num_beams) / num_beams

@@ -70,6 +70,7 @@ def test_steps_are_open_in_a_corridor_and_closed_in_rooms(scans, truth) -> None:
     assert (np.abs(slides.directions[IN_CORRIDOR, 0]) > 0.9).all()
 
 
+@pytest.mark.slow
 def test_an_open_step_is_as_uncertain_as_its_odometry_and_moves_to_it(scans, truth) -> None:
     deviation = 2.0
     prior = StepPrior(steps_of(truth), np.full((NUM_SCANS - 1, 3), [deviation, deviation, 0.01]))
@@ -95,6 +96,8 @@ def turned(poses, angle: float):
 
 
 FAULTS = (
+    (lambda poses: poses * [1.0, -1.0, -1.0], "mirrored"),
+    (lambda poses: np.column_stack([poses[:, :2], np.degrees(poses[:, 2])]), "degrees"),
     (lambda poses: poses * [1000.0, 1000.0, 1.0], "millimetres"),
     (lambda poses: poses * [100.0, 100.0, 1.0], "centimetres"),
     (lambda poses: turned(poses, -np.pi), "backwards"),
@@ -103,14 +106,8 @@ FAULTS = (
 )
 
 
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        (lambda poses: poses * [1.0, -1.0, -1.0], "mirrored"),
-        (lambda poses: np.column_stack([poses[:, :2], np.degrees(poses[:, 2])]), "degrees"),
-        *(pytest.param(*fault, marks=pytest.mark.slow) for fault in FAULTS),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("change", "word"), FAULTS)
 def test_faults_of_the_odometry_are_named_and_corrected(scans, odometry, change, word: str) -> None:
     found = calibrate_odometry(scans, change(odometry))
     assert word in str(found.fault)
@@ -169,6 +166,7 @@ def test_a_lost_step_is_put_back_and_not_slid(scans, truth) -> None:
     np.testing.assert_allclose(steps_of(found)[10], steps[10], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_calibrated_prior_does_not_hold_a_clear_step_that_slipped(scans, truth) -> None:
     """Most steps of the odometry are exact, so their deviations are small; one step in a room has a wrong turn."""
     slipped, expected = 3, steps_of(truth)

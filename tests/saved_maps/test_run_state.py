@@ -132,6 +132,7 @@ def test_a_run_of_networks_goes_on_like_an_unbroken_one(tmp_path) -> None:
     assert_goes_on_like_the_unbroken_one(whole, tmp_path / "state.npz", [stops[0], stops[len(stops) // 2], stops[-1]])
 
 
+@pytest.mark.slow
 def test_a_state_between_keyframes_is_refused(as_user, truth_run, tmp_path) -> None:
     between = next(scan for scan in range(30, 60) if not truth_run.reports[scan].is_keyframe)
     with pytest.raises(ValueError, match="state: expected the state after a keyframe"):

@@ -45,6 +45,7 @@ def test_two_views_of_one_surface_are_aligned() -> None:
     assert 100 < found.num_pairs <= 600
 
 
+@pytest.mark.slow
 def test_the_same_elements_are_aligned_to_rounding() -> None:
     T_b_a = motion(3, (0.3, -0.2, 0.1))
     moved = SurfaceElements(

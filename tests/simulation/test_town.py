@@ -46,6 +46,7 @@ def scan(town, way, index, seed=0):
     return scan_town(town.primitives, pose, time, key=jax.random.key(seed), sensor=SENSOR)
 
 
+@pytest.mark.slow
 def test_a_seed_makes_one_town(town):
     again, other = make_town(3, SHORT), make_town(4, SHORT)
     jax.tree.map(np.testing.assert_array_equal, town.primitives, again.primitives)
@@ -128,6 +129,7 @@ def test_poses_are_rigid_and_stand_on_the_ground(town, way):
     assert (np.diff(way.times) > 0).all()
 
 
+@pytest.mark.slow
 def test_a_car_that_turns_slowly_takes_longer_on_the_same_way():
     town = make_town(3, TownConfig(route="there_and_back", route_length_m=300.0))
     fast, slow = (drive(town, DriveConfig(max_turn_deg_s=limit)) for limit in (np.inf, 30.0))

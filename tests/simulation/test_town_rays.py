@@ -217,6 +217,7 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     assert {SOLID, POLE, SOFT, GROUND} <= set(surfaces.tolist())
 
 
+@pytest.mark.slow
 def test_padding_takes_no_part(turn):
     look, town, _, _ = turn
     pose = jnp.asarray(tilted_pose(), jnp.float32)
