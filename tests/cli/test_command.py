@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import gc
+import importlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from dpmjax.cli import program
-from dpmjax.cli.command import EXIT_BAD_INPUT, STOPPING
+from dpmjax.cli.command import EXIT_BAD_INPUT, STOPPING, run_command
+
+
+@dataclass(frozen=True)
+class Options:
+    """A command without options."""
+
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -187,6 +196,34 @@ def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expec
 def test_second_signal_ends_at_once(toy):
     code, _, errors = stop_after_first_step(toy("--seed", "99"), signal.SIGINT, signal.SIGINT)
     assert (code, errors) == (130, f"{STOPPING}dpmjax: stopped by SIGINT\n")
+
+
+def test_a_signal_while_a_module_is_imported_waits_for_its_end(tmp_path, monkeypatch, capsys) -> None:
+    module = tmp_path / "compiled.py"
+    module.write_text("import signal, time\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(0.2)\ndone = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def main(config: Options) -> None:
+        importlib.import_module("compiled")
+        time.sleep(10)
+
+    assert run_command(main, Options, name="toy", description=None, args=[]) == 143
+    assert sys.modules.pop("compiled").done
+    assert capsys.readouterr().err == "dpmjax: stopped by SIGTERM\n"
+
+
+def test_a_signal_during_a_collection_of_garbage_is_not_lost(capsys) -> None:
+    def signal_once(phase: str, info: dict[str, int]) -> None:
+        gc.callbacks.remove(signal_once)
+        signal.raise_signal(signal.SIGINT)
+
+    def main(config: Options) -> None:
+        gc.callbacks.append(signal_once)
+        gc.collect()
+        time.sleep(10)
+
+    assert run_command(main, Options, name="toy", description=None, args=[]) == 130
+    assert capsys.readouterr().err == "dpmjax: stopped by SIGINT\n"
 
 
 def test_resumed_run_keeps_the_options_that_are_not_given(toy):

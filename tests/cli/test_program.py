@@ -50,6 +50,15 @@ def test_an_experiment_of_another_name_is_the_subcommand(module: str, name: str)
     assert (done.returncode, done.stdout) == (0, start(name, "--help").stdout), done.stderr
 
 
+def test_a_stop_during_the_imports_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("importlib.import_module", interrupted)
+    assert program.main(["slam"]) == 130
+    assert capsys.readouterr().err == "dpmjax: stopped by SIGINT\n"
+
+
 @pytest.mark.parametrize("arguments", [(), ("mapp2d",), ("--nope",)])
 def test_wrong_usage_is_one_line(arguments) -> None:
     done = start(*arguments)

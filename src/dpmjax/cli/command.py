@@ -29,6 +29,8 @@ EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPU
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
+# A signal at a moment at which nothing can be raised is sent again after this time.
+_LATER_S = 0.05
 ConfigT = TypeVar("ConfigT")
 
 
@@ -158,8 +160,9 @@ def run_command(
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     previous = {number: signal.signal(number, _interrupt) for number in SIGNALS}
-    enable_compile_cache()
+    previous_hook, sys.unraisablehook = sys.unraisablehook, _send_lost
     try:
+        enable_compile_cache()
         config = without_latest(_parse(config_type, name, description, arguments))
         # Of several processes that run as one, `main` selects devices and one opens the folder.
         if isinstance(config, OutputOptions) and getattr(config, "coordinator", None) is None:
@@ -183,6 +186,7 @@ def run_command(
         traceback.print_exception(error)
         return _say(f"error: {type(error).__name__}: {error}", EXIT_FAILED)
     finally:
+        sys.unraisablehook = previous_hook
         for number, handler in previous.items():
             signal.signal(number, handler)
     return EXIT_OK
@@ -202,7 +206,25 @@ def _parse(config_type: type[ConfigT], name: str, description: str | None, argum
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise Interrupted(number)
+    # Compiled modules crash where their import is stopped.
+    if any(getattr(getattr(module, "__spec__", None), "_initializing", False) for module in list(sys.modules.values())):
+        _send_later(number)
+    else:
+        raise Interrupted(number)
+
+
+def _send_lost(lost: sys.UnraisableHookArgs) -> None:
+    """Sends a signal again whose `Interrupted` was lost: Python drops errors in callbacks of the garbage collector."""
+    if isinstance(lost.exc_value, Interrupted):
+        _send_later(lost.exc_value.exit_code - 128)
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _send_later(number: int) -> None:
+    timer = threading.Timer(_LATER_S, signal.raise_signal, [number])
+    timer.daemon = True
+    timer.start()
 
 
 def _say(message: str, exit_code: int) -> int:

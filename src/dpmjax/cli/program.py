@@ -29,7 +29,7 @@ EXAMPLES = """examples:
   dpmjax localize out/map.npz scans     find scans in the map of an earlier run
   dpmjax COMMAND --help                 the options of a subcommand"""
 
-EXIT_OK, EXIT_BAD_INPUT = 0, 2
+EXIT_OK, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,8 +43,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in COMMANDS:
-        module = importlib.import_module(f"dpmjax.cli.{given[0]}")
-        run = importlib.import_module("dpmjax.cli.command").run_command
+        try:  # the imports take a second or two
+            module = importlib.import_module(f"dpmjax.cli.{given[0]}")
+            run = importlib.import_module("dpmjax.cli.command").run_command
+        except KeyboardInterrupt:
+            print("dpmjax: stopped by SIGINT", file=sys.stderr)
+            return EXIT_INTERRUPTED
         return int(run(module.main, module.Config, name=given[0], description=module.__doc__, args=given[1:]))
     if given and given[0] == "--version":
         print(f"dpmjax {importlib.metadata.version('dpmjax')}")
