@@ -221,19 +221,6 @@ def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys
     assert found in refused(tmp_path, capsys, scans_npz, "--init", init)
 
 
-def test_help_needs_no_jax_and_shows_examples():
-    code = (
-        "import sys; from dpmjax.cli.command import run_command; from dpmjax.cli import map2d as m;"
-        "code = run_command(m.main, m.Config, name=m.NAME, description=m.__doc__, args=['--help']);"
-        "assert not {'jax', 'matplotlib', 'scipy'} & set(sys.modules), 'slow imports'; sys.exit(code)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "    dpmjax map2d --resume " in done.stdout
-    for option in ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-refine", "--seed", "--resume"):
-        assert option in done.stdout
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

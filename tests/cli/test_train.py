@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +32,6 @@ from dpmjax.deeppointmap.training.loop import after_evaluation
 from dpmjax.weights import load_model
 from tests.deeppointmap import toy
 
-REPOSITORY = Path(__file__).parents[2]
 TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
 
@@ -120,18 +117,6 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
     with SampleMaker(toy.store(), TRAINING, seed=0) as maker:
         for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
             toy.assert_trees_equal(batch, maker(step))
-
-
-def test_help_needs_no_jax_and_shows_examples() -> None:
-    code = (
-        "import sys; from dpmjax.cli.command import run_command; from dpmjax.cli import train as m;"
-        "code = run_command(m.main, m.Config, name=m.NAME, description=m.__doc__, args=['--help']);"
-        "assert not {'jax', 'matplotlib', 'scipy'} & set(sys.modules), 'slow imports'; sys.exit(code)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    for part in ("dpmjax train --resume", "--preset {tiny,small,paper}", "--data", "-o OUT"):
-        assert part in done.stdout
 
 
 @pytest.mark.parametrize(
