@@ -149,4 +149,4 @@ def report(config: Config, rows: list[cli.Row], not_run: dict[str, str]) -> cli.
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

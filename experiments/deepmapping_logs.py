@@ -211,4 +211,4 @@ def _drive(rng: np.random.Generator) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

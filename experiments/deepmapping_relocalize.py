@@ -190,4 +190,4 @@ def lines_of(report: cli.Row) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

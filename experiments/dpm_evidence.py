@@ -158,4 +158,4 @@ def _turn(rng: np.random.Generator) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -274,4 +274,4 @@ def _drive_cells(row: cli.Row) -> list[str]:
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

@@ -167,4 +167,4 @@ class _Replaced:
 
 
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))

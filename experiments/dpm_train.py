@@ -2,7 +2,7 @@
 
 import sys
 
-from dpmjax.cli import main
+from dpmjax.cli import end_process, main
 
 if __name__ == "__main__":
-    raise SystemExit(main(["train", *sys.argv[1:]]))
+    end_process(main(["train", *sys.argv[1:]]))

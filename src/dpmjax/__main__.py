@@ -1,6 +1,6 @@
 """`python -m dpmjax` is the command `dpmjax`."""
 
-from dpmjax.cli.program import main
+from dpmjax.cli.program import run
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    run()

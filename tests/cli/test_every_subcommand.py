@@ -46,13 +46,6 @@ MISSING = {
 }
 
 
-HELP = {
-    "map2d": ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-refine", "--seed", "--resume"),
-    "train": ("--preset {tiny,small,paper}", "--data", "-o OUT", "--resume"),
-}
-"""Options that the help of a subcommand must name."""
-
-
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
     """A folder with the files of the package that setuptools installs."""
@@ -76,22 +69,6 @@ def start(installed: Path, folder: Path, *arguments: str) -> subprocess.Complete
     command = [sys.executable, *(arguments if arguments[0] == "-c" else ("-m", "dpmjax", *arguments))]
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-
-
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_help_needs_no_jax_and_shows_an_example(installed, name, tmp_path) -> None:
-    code = f"""
-import sys
-from dpmjax.cli.program import main
-try:
-    main([{name!r}, "--help"])
-finally:
-    assert not {{"jax", "matplotlib", "scipy"}} & set(sys.modules), "slow imports"
-"""
-    done = start(installed, tmp_path, "-c", code)
-    assert done.returncode == EXIT_OK, done.stderr
-    for part in (f"    dpmjax {name}", *HELP.get(name, ())):
-        assert part in done.stdout
 
 
 @pytest.mark.slow

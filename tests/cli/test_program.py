@@ -13,6 +13,12 @@ from dpmjax.cli import program
 
 REPOSITORY = Path(__file__).parents[2]
 
+HELP = {
+    "map2d": ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-refine", "--seed", "--resume"),
+    "train": ("--preset {tiny,small,paper}", "--data", "-o OUT", "--resume"),
+}
+"""Options that the help of a subcommand must name."""
+
 
 def start(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "dpmjax", *arguments], capture_output=True, text=True)
@@ -37,7 +43,8 @@ def test_help_of_a_subcommand_has_examples_and_loads_nothing_slow(name) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert f"    dpmjax {name}" in done.stdout
+    for part in (f"    dpmjax {name}", *HELP.get(name, ())):
+        assert part in done.stdout
 
 
 @pytest.mark.slow
@@ -57,6 +64,28 @@ def test_a_stop_during_the_imports_is_one_line(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr("importlib.import_module", interrupted)
     assert program.main(["slam"]) == 130
     assert capsys.readouterr().err == "dpmjax: stopped by SIGINT\n"
+
+
+def test_a_stop_during_a_compilation_ends_the_process_at_once() -> None:
+    code = """
+import signal, jax, jax.numpy as jnp
+from dpmjax.cli import program
+
+def unrolled(x):
+    for _ in range(300):
+        x = jnp.sort(jnp.sin(x) @ x, axis=0)
+    return x
+
+lowered = jax.jit(unrolled).lower(jnp.ones((8, 8)))
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+signal.setitimer(signal.ITIMER_REAL, 0.3)
+try:
+    lowered.compile()
+except KeyboardInterrupt:
+    program.end_process(program.EXIT_INTERRUPTED)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (program.EXIT_INTERRUPTED, "")
 
 
 @pytest.mark.parametrize("arguments", [(), ("mapp2d",), ("--nope",)])

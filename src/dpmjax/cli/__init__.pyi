@@ -33,6 +33,7 @@ from .info import why_not_importable as why_not_importable
 from .map2d import read_map2d_run as read_map2d_run
 from .map2d_results import planar_errors as planar_errors
 from .map2d_results import spans_of as spans_of
+from .program import end_process as end_process
 from .program import main as main
 from .recorded_fit import FitRecorder as FitRecorder
 from .recorded_fit import draw_loss as draw_loss

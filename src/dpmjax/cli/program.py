@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from typing import NoReturn
 
 COMMANDS = {
     "register": "two 3-D scans: their relative pose, its confidence, a picture",
@@ -30,6 +33,29 @@ EXAMPLES = """examples:
   dpmjax COMMAND --help                 the options of a subcommand"""
 
 EXIT_OK, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
+_EXIT_BY_SIGNAL = 128
+
+
+def run() -> NoReturn:
+    """Runs the subcommand of the command line and ends the process."""
+    end_process(main())
+
+
+def end_process(exit_code: int) -> NoReturn:
+    """Ends the process; after a signal at once.
+
+    A stopped process may leave a compilation in a thread of XLA, which Python's orderly end waits for and crashes.
+
+    Args:
+        exit_code: exit code; 128 and the number of the signal after a stop.
+    """
+    if exit_code > _EXIT_BY_SIGNAL:
+        if "jax.distributed" in sys.modules:  # other processes of one training wait for this
+            sys.modules["jax.distributed"].shutdown()
+        with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
+            sys.stdout.flush()
+        os._exit(exit_code)
+    raise SystemExit(exit_code)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
