@@ -18,6 +18,7 @@ from dpmjax.cli.options import without_latest
 from dpmjax.cli.result_files import HistoryFile, commits_note, read_history, write_json
 from dpmjax.cli.resumable_table import do_row, row_path
 from dpmjax.cli.run_folder import (
+    OutputOptions,
     RunFailedError,
     RunOptions,
     check_run_folder,
@@ -144,6 +145,12 @@ def test_folder_that_cannot_be_made_is_an_input_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"cannot write to .*file"):
         open_run(output=tmp_path / "file" / "out")
+
+
+def test_resume_is_named_only_to_a_command_that_has_it(tmp_path):
+    open_run(output=tmp_path / "out")
+    with pytest.raises(ValueError, match="holds an earlier run: --force replaces it"):
+        open_run_folder(OutputOptions(output=tmp_path / "out"), "toy")
 
 
 def test_check_refuses_without_touching_anything(tmp_path):

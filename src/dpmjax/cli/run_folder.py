@@ -194,7 +194,7 @@ def check_run_folder(config: Any, experiment: str) -> None:
             raise ValueError("--resume continues a run and --force starts it over: give one of them")
         _check_same_options(config, find_run(experiment, config.output))
     elif config.output is not None:
-        _check_replaceable(config.output, config.force)
+        _check_replaceable(config)
         _check_inputs_stay(config)
 
 
@@ -344,8 +344,9 @@ def _make_timestamped(parent: Path) -> Path:
     return path
 
 
-def _check_replaceable(path: Path, force: bool) -> None:
-    """Raises a ValueError where `path` is no folder, cannot be written, or has files that must not be replaced."""
+def _check_replaceable(config: Any) -> None:
+    """Raises a ValueError where `output` is no folder, cannot be written, or has files that must not be replaced."""
+    path = config.output
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise ValueError(_cannot_write(path, f"{existing} is a file"))
@@ -356,8 +357,9 @@ def _check_replaceable(path: Path, force: bool) -> None:
         return
     if not (path / CONFIG).is_file():
         raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")
-    if not force:
-        raise ValueError(f"{path} holds an earlier run: --resume continues it, --force replaces it, -o names another")
+    if not config.force:
+        resume = "--resume continues it, " if hasattr(config, "resume") else ""
+        raise ValueError(f"{path} holds an earlier run: {resume}--force replaces it, -o names another")
 
 
 def _cannot_write(path: Path, reason: str) -> str:
