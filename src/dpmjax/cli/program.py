@@ -48,6 +48,9 @@ def end_process(exit_code: int) -> NoReturn:
 
     Args:
         exit_code: exit code; 128 and the number of the signal after a stop.
+
+    Raises:
+        SystemExit: no signal has stopped the process.
     """
     if exit_code > _EXIT_BY_SIGNAL:
         if "jax.distributed" in sys.modules:  # other processes of one training wait for this
