@@ -124,12 +124,7 @@ def main(config: Config) -> None:
     with together():
         first = None if config.weights is None else weights.load_model(config.weights)
         settings = training_settings(config, first)
-        town = partial(simulation.simulate_drive, length_m=config.town_length_m, mixture=simulation.TRAINING_MIXTURE)
-        towns = [partial(town, config.seed + number) for number in range(config.num_towns)]
-        sources = cli.find_sources(config.data, towns, settings.sampling)
-        for path in config.validate:
-            if (reason := deeppointmap.why_useless(io.open_lidar_sequence(path), settings.sampling)) is not None:
-                raise ValueError(f"--validate {path}: {reason}")
+        sources = training_sources(config, settings.sampling)
         folder = cli.open_run_folder(config, NAME) if is_first() else None
     with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
         with together():
@@ -169,6 +164,17 @@ def main(config: Config) -> None:
         if evaluation is not None:
             draw_matches(folder, evaluation.trained, records.sets.held_out)
         print_summary(folder, metrics)
+
+
+def training_sources(config: Config, sampling: deeppointmap.SamplingConfig) -> list[cli.Source]:
+    """Returns the drives of --data; a drive of --validate or --data that has no pairs of scans raises a ValueError."""
+    town = partial(simulation.simulate_drive, length_m=config.town_length_m, mixture=simulation.TRAINING_MIXTURE)
+    towns = [partial(town, config.seed + number) for number in range(config.num_towns)]
+    sources = cli.find_sources(config.data, towns, sampling)
+    for path in config.validate:
+        if (reason := deeppointmap.why_useless(io.open_lidar_sequence(path), sampling)) is not None:
+            raise ValueError(f"--validate {path}: {reason}")
+    return sources
 
 
 def plateau_seconds(config: Config) -> float:
