@@ -135,6 +135,13 @@ def toy_1d() -> deepmapping.Problem:
     return deepmapping.toy_problem(deepmapping.ToyConfig("direct", num_steps=5))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _made_outside_of_programs() -> None:
+    """What is made once must hold no tracers of the program that asks for it first."""
+    model()
+    toy_1d()
+
+
 def encode(points: Any, mask: Any) -> Any:
     return dpmjax.encode_pyramid(model(), geometry.build_pyramid(points, mask, toy.MODEL.pyramid))
 
