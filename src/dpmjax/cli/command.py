@@ -43,7 +43,7 @@ class Interrupted(KeyboardInterrupt):
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal.Signals(signal_number).name)
-        self.exit_code = 128 + signal_number
+        self.exit_code = program.EXIT_BY_SIGNAL + signal_number
 
 
 class StopFlag:
@@ -216,7 +216,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _send_lost(lost: sys.UnraisableHookArgs) -> None:
     """Sends a signal again whose `Interrupted` was lost: Python drops errors in callbacks of the garbage collector."""
     if isinstance(lost.exc_value, Interrupted):
-        _send_later(lost.exc_value.exit_code - 128)
+        _send_later(lost.exc_value.exit_code - program.EXIT_BY_SIGNAL)
     else:
         sys.__unraisablehook__(lost)
 

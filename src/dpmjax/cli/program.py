@@ -33,7 +33,8 @@ EXAMPLES = """examples:
   dpmjax COMMAND --help                 the options of a subcommand"""
 
 EXIT_OK, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
-_EXIT_BY_SIGNAL = 128
+EXIT_BY_SIGNAL = 128
+"""Added to the number of the signal."""
 
 
 def run() -> NoReturn:
@@ -47,12 +48,12 @@ def end_process(exit_code: int) -> NoReturn:
     A stopped process may leave a compilation in a thread of XLA, which Python's orderly end waits for and crashes.
 
     Args:
-        exit_code: exit code; 128 and the number of the signal after a stop.
+        exit_code: exit code; after a stop, `EXIT_BY_SIGNAL` and the number of the signal.
 
     Raises:
         SystemExit: no signal has stopped the process.
     """
-    if exit_code > _EXIT_BY_SIGNAL:
+    if exit_code > EXIT_BY_SIGNAL:
         if "jax.distributed" in sys.modules:  # other processes of one training wait for this
             sys.modules["jax.distributed"].shutdown()
         with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
