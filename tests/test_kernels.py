@@ -1,289 +1,51 @@
-"""One table of all kernels: jit and vmap give the numbers of the call, padding changes nothing, gradients are right."""
+"""Laws of all kernels, for each row of `tests.kernel_table`."""
 
 from __future__ import annotations
 
+import operator
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AbstractMesh
+from jax.sharding import PartitionSpec as P
 
 import dpmjax
-from dpmjax import deepmapping, deeppointmap, geometry, losses
-from dpmjax.geometry import rigid
-from tests.deeppointmap import toy
+from tests import kernel_table
+from tests.kernel_table import EXTRA, KERNELS, Arrays, Kernel, example, floats, moved_clouds, padded, total
 
-Arrays = dict[str, Any]
-NUM, EXTRA = 24, 3
 # Float32 sums and solutions of small systems; a loop that ends at a millionth of the cloud.
 CLOSE: Arrays = {"rtol": 1e-3, "atol": 2e-4}
-
-
-@dataclass(frozen=True)
-class Kernel:
-    """A kernel and the arguments of its tests.
-
-    Attributes:
-        call: of arrays by name.
-        make: example arrays of a random generator.
-        by: the arrays that it has a derivative by; empty for choices of indices.
-        padding: numbers in the rows that are not there, by array; empty where nothing is masked.
-        is_exact: False where the derivative is not compared with differences (a network, or a long fit).
-    """
-
-    call: Callable[..., Any]
-    make: Callable[[np.random.Generator], Arrays]
-    by: tuple[str, ...] = ()
-    padding: Arrays = field(default_factory=dict)
-    is_exact: bool = True
-
-
-def points(*names: str, dim: int = 3) -> Callable[[np.random.Generator], Arrays]:
-    return lambda rng: {name: rng.normal(size=(NUM, dim)).astype(np.float32) for name in names}
-
-
-def with_masks(*names: str, dim: int = 3, **masks: str) -> Callable[[np.random.Generator], Arrays]:
-    """Points, and masks that are True everywhere."""
-    return lambda rng: points(*names, dim=dim)(rng) | {mask: np.ones(NUM, bool) for mask in masks.values()}
-
-
-def masked(*names: str, **masks: str) -> Arrays:
-    return dict.fromkeys(names, np.nan) | dict.fromkeys(masks.values(), False)
-
-
-def moved_clouds(dim: int) -> Callable[[np.random.Generator], Arrays]:
-    """The sides of a box, and the same a little turned, shifted and noisy."""
-
-    def make(rng: np.random.Generator) -> Arrays:
-        source = rng.uniform(-1.0, 1.0, (120, dim))
-        side = rng.integers(0, dim, 120)
-        source[np.arange(120), side] = np.sign(source[np.arange(120), side])
-        source *= np.array([5.0, 3.0, 2.0])[:dim]
-        step = np.full(3 if dim == 2 else 6, 0.03)
-        T = np.asarray(rigid.exp(step), np.float64)
-        target = source @ T[:dim, :dim].T + T[:dim, dim] + 0.01 * rng.normal(size=source.shape)
-        arrays = {"source": source.astype(np.float32), "target": target.astype(np.float32)}
-        return arrays | {"source_mask": np.ones(120, bool), "target_mask": np.ones(120, bool)}
-
-    return make
-
-
-def trajectories(rng: np.random.Generator) -> Arrays:
-    poses = {name: np.asarray(rigid.exp(0.5 * rng.normal(size=(NUM, 6)))) for name in ("estimated", "reference")}
-    return {name: T.astype(np.float32) for name, T in poses.items()}
-
-
-def mapped_points(rng: np.random.Generator) -> Arrays:
-    """Beams of all scans; the beams come first, so that they can be padded."""
-    T = trajectories(rng)
-    beams = rng.normal(size=(5, NUM, 3)).astype(np.float32)
-    return {"points": beams, "mask": np.ones((5, NUM), bool)} | {f"T_{name}": poses for name, poses in T.items()}
-
-
-def distance_of_beams(points: Any, mask: Any, **T: Any) -> Any:
-    return dpmjax.point_distance(jnp.swapaxes(points, 0, 1), mask.T, **T)
-
-
-def contrast(rng: np.random.Generator) -> Arrays:
-    """Descriptors, of which some queries and some keys do not count."""
-    masks = {name: rng.uniform(size=NUM) < 0.8 for name in ("is_query", "is_key")}
-    return points("queries", "keys")(rng) | {"positives": rng.permutation(NUM)} | masks
-
-
-def contrast_of(queries: Any, keys: Any, positives: Any, is_query: Any, is_key: Any) -> Any:
-    ignore = jnp.broadcast_to(~is_key, (len(queries), len(keys)))
-    return dpmjax.info_nce(queries, keys, positives, ignore=ignore, mask=is_query)
-
-
-def beams(rng: np.random.Generator) -> Arrays:
-    return points("points")(rng) | {
-        "origin": rng.normal(size=3).astype(np.float32),
-        "factors": rng.uniform(size=(NUM, 4)).astype(np.float32),
-    }
-
-
-def samples(rng: np.random.Generator) -> Arrays:
-    numbers = {name: rng.uniform(0.1, 0.9, NUM).astype(np.float32) for name in ("logits", "labels", "weights")}
-    return numbers | {"logits": 4.0 * numbers["logits"] - 2.0}
-
-
-def weighted(rng: np.random.Generator) -> Arrays:
-    return points("source", "target")(rng) | {"weights": rng.uniform(0.1, 1.0, NUM).astype(np.float32)}
-
-
-def scan(rng: np.random.Generator) -> Arrays:
-    return {"points": rng.uniform(-0.5, 0.5, (64, 3)).astype(np.float32), "mask": np.ones(64, bool)}
-
-
-def descriptors(rng: np.random.Generator) -> Arrays:
-    arrays = {name: rng.normal(size=(16, 8)).astype(np.float32) for name in ("a", "b")}
-    arrays |= {name: 9.0 * rng.normal(size=(16, 3)).astype(np.float32) for name in ("at_a", "at_b")}
-    return arrays | {name: np.ones(16, bool) for name in ("is_a", "is_b")}
-
-
-@cache
-def model() -> dpmjax.Model:
-    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
-
-
-@cache
-def toy_1d() -> deepmapping.Problem:
-    return deepmapping.toy_problem(deepmapping.ToyConfig("direct", num_steps=5))
+REPOSITORY = Path(__file__).parents[1]
+# These compile for seconds.
+SLOW = (
+    "correlate",
+    "deepmapping.solve",
+    "deepmapping.step",
+    "encode_pyramid",
+    "geometry.build_pyramid",
+    "geometry.find_consensus",
+    "icp",
+    "icp to points",
+    "match_hypotheses",
+)
+WITH_MASKS = {name: kernel for name, kernel in KERNELS.items() if kernel.padding}
+WITH_GRADIENT = {name: kernel for name, kernel in KERNELS.items() if kernel.by}
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _made_outside_of_programs() -> None:
     """What is made once must hold no tracers of the program that asks for it first."""
-    model()
-    toy_1d()
-
-
-def encode(points: Any, mask: Any) -> Any:
-    return dpmjax.encode_pyramid(model(), geometry.build_pyramid(points, mask, toy.MODEL.pyramid))
-
-
-def clouds_of(a: Any, b: Any, at_a: Any, at_b: Any, is_a: Any, is_b: Any) -> Any:
-    return dpmjax.DescriptorCloud(at_a, a, is_a), dpmjax.DescriptorCloud(at_b, b, is_b)
-
-
-def correlate(**arrays: Any) -> Any:
-    return dpmjax.correlate(model(), *clouds_of(**arrays))
-
-
-def match(**arrays: Any) -> Any:
-    a, b = clouds_of(**arrays)
-    left, right = (jnp.where(cloud.mask[:, None], cloud.features, 0.0) for cloud in (a, b))
-    # Numbers of pairs that are not there may be anything.
-    cosines = jnp.where(a.mask[:, None] & b.mask, jnp.tanh(left @ right.T / 9.0), jnp.nan)
-    offsets = lambda rows, others: (jnp.zeros((*rows.shape, 3)),) * 2  # noqa: E731
-    found = toy.best_match(a, b, cosines, offsets, config=deeppointmap.MatchConfig(num_rounds=1))
-    return found.T_target_source, found.mean_score, found.num_inliers
-
-
-def solve_toy(seed: Any) -> Any:
-    state, report = deepmapping.solve(toy_1d(), None, key=jax.random.key(seed))
-    return state.params.x, report.losses
-
-
-def step_toy(seed: Any, x: Any) -> Any:
-    state = deepmapping.init(toy_1d(), None, key=jax.random.key(seed))
-    state = state.replace(params=state.params.replace(x=x))
-    state, report = deepmapping.step(toy_1d(), state, None, phase=0)
-    return state.params.x, report.losses
-
-
-def seeds(rng: np.random.Generator) -> Arrays:
-    return {"seed": rng.integers(0, 99, dtype=np.int32), "x": np.float32(rng.normal())}
-
-
-BOTH = {"source_mask": "source_mask", "target_mask": "target_mask"}
-CLOUDS = masked("a", "b", "at_a", "at_b", is_a="is_a", is_b="is_b")
-KERNELS = {
-    "weighted_svd": Kernel(
-        dpmjax.weighted_svd, weighted, ("source", "target", "weights"), masked("source", "target") | {"weights": 0.0}
-    ),
-    "align_rigid": Kernel(
-        dpmjax.align_rigid,
-        with_masks("estimated", "reference", mask="mask"),
-        ("estimated", "reference"),
-        masked("estimated", "reference", mask="mask"),
-    ),
-    "absolute_trajectory_error": Kernel(
-        dpmjax.absolute_trajectory_error,
-        with_masks("estimated", "reference", dim=2, mask="mask"),
-        ("estimated", "reference"),
-        masked("estimated", "reference", mask="mask"),
-    ),
-    "relative_pose_error": Kernel(dpmjax.relative_pose_error, trajectories, ("estimated", "reference")),
-    "point_distance": Kernel(
-        distance_of_beams, mapped_points, ("points", "T_estimated"), masked("points", mask="mask")
-    ),
-    "k_nearest": Kernel(
-        lambda queries, points, mask: dpmjax.k_nearest(queries, points, 3, mask),
-        with_masks("queries", "points", mask="mask"),
-        ("queries", "points"),
-        masked("points", mask="mask"),
-    ),
-    "radius_search": Kernel(
-        lambda queries, points, mask: dpmjax.radius_search(queries, points, 0.8, 3, mask),
-        with_masks("queries", "points", mask="mask"),
-        ("queries", "points"),
-        masked("points", mask="mask"),
-    ),
-    "farthest_point_sample": Kernel(
-        lambda points, mask: dpmjax.farthest_point_sample(points, 6, mask),
-        with_masks("points", mask="mask"),
-        padding=masked("points", mask="mask"),
-    ),
-    "voxel_sample": Kernel(
-        lambda points, mask: dpmjax.voxel_sample(points, 0.7, mask),
-        with_masks("points", mask="mask"),
-        padding=masked("points", mask="mask"),
-    ),
-    "estimate_normals": Kernel(
-        lambda points, mask: dpmjax.estimate_normals(points, 5, mask),
-        with_masks("points", mask="mask"),
-        padding=masked("points", mask="mask"),
-    ),
-    "sample_free_space": Kernel(dpmjax.sample_free_space, beams, ("origin", "points", "factors")),
-    "build_pyramid": Kernel(
-        lambda points, mask: geometry.build_pyramid(points, mask, toy.MODEL.pyramid).levels[1:],
-        scan,
-        padding=masked("points", mask="mask"),
-    ),
-    "find_consensus": Kernel(
-        geometry.find_consensus,
-        with_masks("source", "target", mask="mask"),
-        padding=masked("source", "target", mask="mask"),
-    ),
-    "info_nce": Kernel(
-        contrast_of,
-        contrast,
-        ("queries", "keys"),
-        {"positives": 0} | masked("queries", "keys", query="is_query", key="is_key"),
-    ),
-    "chamfer_distance": Kernel(
-        dpmjax.chamfer_distance,
-        with_masks("a", "b", mask_a="mask_a", mask_b="mask_b"),
-        ("a", "b"),
-        masked("a", "b", mask_a="mask_a", mask_b="mask_b"),
-    ),
-    "occupancy_loss": Kernel(
-        dpmjax.occupancy_loss, samples, ("logits", "labels"), masked("logits", "labels") | {"weights": 0.0}
-    ),
-    "offset_loss": Kernel(
-        losses.offset_loss,
-        with_masks("predicted", "true", mask="mask"),
-        padding=masked("predicted", "true", mask="mask"),
-        by=("predicted",),
-        is_exact=False,  # the covariance is held constant
-    ),
-    "icp to points": Kernel(
-        partial(dpmjax.icp, metric="point"),
-        moved_clouds(2),
-        ("source", "target"),
-        masked("source", "target", **BOTH),
-        is_exact=False,  # a test of its own
-    ),
-    "icp to planes": Kernel(
-        partial(dpmjax.icp, metric="plane"),
-        moved_clouds(3),
-        ("source",),
-        masked("source", "target", **BOTH),
-        is_exact=False,
-    ),
-    "encode_pyramid": Kernel(encode, scan, ("points",), masked("points", mask="mask"), is_exact=False),
-    "correlate": Kernel(correlate, descriptors, ("a", "b"), CLOUDS, is_exact=False),
-    "match_hypotheses": Kernel(match, descriptors, ("a", "b", "at_a", "at_b"), CLOUDS),
-    "step": Kernel(step_toy, seeds, ("x",), is_exact=False),
-    "solve": Kernel(lambda seed, x: solve_toy(seed), seeds),
-}
-# These compile for seconds.
-SLOW = ("encode_pyramid", "find_consensus", "icp to planes", "icp to points", "match_hypotheses", "solve")
+    kernel_table.model()
+    kernel_table.toy_1d()
 
 
 def each(kernels: dict[str, Kernel]) -> pytest.MarkDecorator:
@@ -293,24 +55,6 @@ def each(kernels: dict[str, Kernel]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("kernel", rows)
 
 
-WITH_MASKS = {name: kernel for name, kernel in KERNELS.items() if kernel.padding}
-WITH_GRADIENT = {name: kernel for name, kernel in KERNELS.items() if kernel.by}
-
-
-def example(kernel: Kernel, seed: int = 0, dtype: Any = None) -> Arrays:
-    arrays = kernel.make(np.random.default_rng(seed))
-    return {name: jnp.asarray(value, dtype if value.dtype.kind == "f" else None) for name, value in arrays.items()}
-
-
-def padded(kernel: Kernel, arrays: Arrays) -> Arrays:
-    def pad(value: Any, filler: Any) -> Any:
-        return jnp.concatenate([value, jnp.full((EXTRA, *value.shape[1:]), filler, value.dtype)])
-
-    return {
-        name: pad(value, kernel.padding[name]) if name in kernel.padding else value for name, value in arrays.items()
-    }
-
-
 def assert_close(found: Any, expected: Any) -> None:
     """The same leaves; rows of padding are left out."""
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
@@ -318,14 +62,23 @@ def assert_close(found: Any, expected: Any) -> None:
         np.testing.assert_allclose(x[tuple(map(slice, y.shape))], y, **CLOSE)
 
 
+def compiled(kernel: Kernel) -> Callable[[Arrays], Any]:
+    return jax.jit(lambda arrays: kernel.call(**arrays))
+
+
+def gradient_of(kernel: Kernel, arrays: Arrays) -> Callable[[Arrays], Any]:
+    """The derivative by some of the arrays, with inner values that are computed again (`jax.checkpoint`)."""
+    return jax.grad(jax.checkpoint(lambda moving: total(kernel, arrays | moving)))
+
+
 @each(KERNELS)
 def test_jit_and_vmap_are_the_call(kernel: Kernel, assert_compiles_nothing) -> None:
     examples = [example(kernel, seed) for seed in (0, 1)]
-    compiled = jax.jit(lambda arrays: kernel.call(**arrays))
+    program = compiled(kernel)
     expected = [kernel.call(**arrays) for arrays in examples]
-    assert_close(compiled(examples[0]), expected[0])
+    assert_close(program(examples[0]), expected[0])
     with assert_compiles_nothing():
-        second = compiled(examples[1])
+        second = program(examples[1])
     assert_close(second, expected[1])
     together = jax.jit(jax.vmap(lambda arrays: kernel.call(**arrays)))(jax.tree.map(lambda *x: jnp.stack(x), *examples))
     for row in (0, 1):
@@ -333,36 +86,25 @@ def test_jit_and_vmap_are_the_call(kernel: Kernel, assert_compiles_nothing) -> N
 
 
 @each(WITH_MASKS)
-def test_padding_changes_nothing(kernel: Kernel) -> None:
-    arrays = example(kernel)
-    assert_close(jax.jit(lambda arrays: kernel.call(**arrays))(padded(kernel, arrays)), kernel.call(**arrays))
-
-
-@pytest.mark.parametrize("name", ["weighted_svd", "estimate_normals", "info_nce", "icp to planes"])
-def test_half_precision_is_computed_in_float32(name: str) -> None:
-    kernel = KERNELS[name]
-    half = example(kernel, dtype=jnp.bfloat16)
-    rounded = {name: jnp.asarray(value, example(kernel)[name].dtype) for name, value in half.items()}
-    assert_close(kernel.call(**half), kernel.call(**rounded))
-
-
-def total(kernel: Kernel, arrays: Arrays) -> Any:
-    """A weighted sum of all numbers that a kernel returns."""
-    leaves = map(jnp.asarray, jax.tree.leaves(kernel.call(**arrays)))
-    leaves = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    leaves = [jnp.where(jnp.isfinite(leaf), leaf, 0.0).ravel() for leaf in leaves]
-    return sum(jnp.sum(jnp.cos(jnp.arange(leaf.size)) * leaf) for leaf in leaves)
+def test_padding_and_points_without_a_place_change_nothing(kernel: Kernel) -> None:
+    arrays, program = example(kernel), compiled(kernel)
+    expected = kernel.call(**arrays)
+    assert_close(program(padded(kernel, arrays)), expected)
+    for point in (np.nan, np.inf, -np.inf, 1e19) if kernel.points else ():
+        assert_close(program(padded(kernel, arrays, point)), expected)
 
 
 @each(WITH_GRADIENT)
-def test_gradients_are_finite_next_to_padding(kernel: Kernel) -> None:
+def test_gradients_are_finite_next_to_padding_and_points_without_a_place(kernel: Kernel) -> None:
     arrays = padded(kernel, example(kernel))
-    gradients = jax.jit(jax.grad(lambda moving: total(kernel, arrays | moving)))({by: arrays[by] for by in kernel.by})
-    for name, gradient in gradients.items():
-        assert np.isfinite(gradient).all(), name
-        assert np.any(np.asarray(gradient) != 0), name
-        if name in kernel.padding:
-            np.testing.assert_array_equal(gradient[-EXTRA:], 0)
+    gradient = jax.jit(lambda arrays: gradient_of(kernel, arrays)({by: arrays[by] for by in kernel.by}))
+    others = [padded(kernel, example(kernel), point) for point in (np.nan, np.inf, 1e19) if kernel.points]
+    for gradients in map(gradient, [arrays, *others]):
+        for name, slope in gradients.items():
+            assert np.isfinite(slope).all(), name
+            assert np.any(np.asarray(slope) != 0), name
+            if name in kernel.padding and name != "weights":
+                np.testing.assert_array_equal(slope[-EXTRA:], 0)
 
 
 @each({name: kernel for name, kernel in WITH_GRADIENT.items() if kernel.is_exact})
@@ -375,6 +117,138 @@ def test_gradients_are_those_of_differences(kernel: Kernel, float64) -> None:
     _, slope = jax.jvp(function, (here,), (along,))
     ends = [function(jax.tree.map(lambda x, d, t=t: x + t * d, here, along)) for t in (width, -width)]
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * width), rtol=2e-3, atol=2e-3)
+
+
+@each({name: kernel for name, kernel in WITH_GRADIENT.items() if not kernel.is_exact})
+def test_forward_and_backward_derivatives_agree(kernel: Kernel, float64) -> None:
+    arrays = example(kernel, dtype=np.float64)
+    here = {by: arrays[by] for by in kernel.by}
+    along = {name: jnp.asarray(np.random.default_rng(2).normal(size=value.shape)) for name, value in here.items()}
+    slope = jax.jit(lambda along: jax.jvp(lambda moving: total(kernel, arrays | moving), (here,), (along,))[1])(along)
+    backward = jax.jit(gradient_of(kernel, arrays))(here)
+    np.testing.assert_allclose(slope, sum(jnp.vdot(along[name], backward[name]) for name in here), rtol=1e-3)
+    assert abs(slope) > 0
+
+
+@each({name: kernel for name, kernel in KERNELS.items() if kernel.dtypes is not None})
+def test_float32_and_float64_are_kept_and_half_precision_is_computed_in_float32(kernel: Kernel, float64) -> None:
+    for dtype, expected in ((np.float64, "float64"), (np.float32, "float32"), (jnp.bfloat16, "float32")):
+        arrays = example(kernel, dtype=dtype)
+        found = {leaf.dtype.name for leaf in floats_of_shape(kernel.call, **arrays)}
+        kept = {arrays[name].dtype.name for name in arrays} if kernel.dtypes else set()  # positions, which are kept
+        assert found <= {expected, *kernel.dtypes, *kept}
+        if kernel.by and dtype is np.float64:
+            slopes = jax.eval_shape(gradient_of(kernel, arrays), {by: arrays[by] for by in kernel.by})
+            assert {slope.dtype.name for slope in slopes.values()} == {"float64"}
+
+
+def floats_of_shape(function: Callable[..., Any], **arrays: Any) -> list[Any]:
+    return jax.eval_shape(lambda arrays: floats(function(**arrays)), arrays)
+
+
+@each(KERNELS)
+def test_half_precision_gives_the_numbers_of_float32(kernel: Kernel) -> None:
+    half = example(kernel, dtype=jnp.bfloat16)
+    rounded = {name: jnp.asarray(value, example(kernel)[name].dtype) for name, value in half.items()}
+    found, expected = kernel.call(**half), kernel.call(**rounded)
+    if kernel.dtypes == ():
+        assert_close(found, expected)
+    else:  # positions and parameters keep eight bits
+        for x, y in zip(floats(found), floats(expected), strict=True):
+            np.testing.assert_allclose(x.astype(jnp.float32), y, rtol=0.02, atol=0.02)
+
+
+@each(KERNELS)
+def test_kernels_are_split_over_devices(kernel: Kernel) -> None:
+    """`jax.shard_map` with its default checks, where the first array is split alone; nothing is compiled."""
+    mesh, arrays = AbstractMesh((8,), ("scans",)), example(kernel)
+    first, *others = arrays
+    many = arrays | {first: jnp.stack([arrays[first]] * 8)}
+    axes, specs = {first: 0} | dict.fromkeys(others), {first: P("scans")} | dict.fromkeys(others, P())
+    of_each = jax.vmap(lambda arrays: value_and_gradient(kernel, arrays), in_axes=(axes,))
+    found = jax.eval_shape(jax.shard_map(of_each, mesh=mesh, in_specs=(specs,), out_specs=P("scans")), many)
+    assert all(leaf.shape[0] == 8 for leaf in jax.tree.leaves(found))
+
+
+def value_and_gradient(kernel: Kernel, arrays: Arrays) -> Any:
+    value = jax.tree.map(jnp.asarray, kernel.call(**arrays))
+    return value, gradient_of(kernel, arrays)({by: arrays[by] for by in kernel.by}) if kernel.by else ()
+
+
+ON_EIGHT_DEVICES = """
+import jax, jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
+from tests.test_kernels import KERNELS, assert_close, example, floats, kernel_table, value_and_gradient
+
+assert jax.device_count() == 8 and jnp.ones(1).dtype == jnp.float64
+kernel_table.model(), kernel_table.toy_1d()
+mesh = jax.make_mesh((8,), ("scans",), axis_types=(jax.sharding.AxisType.Auto,))
+for name, kernel in KERNELS.items():
+    examples = [example(kernel, seed, "float64") for seed in range(8)]
+    many = jax.tree.map(lambda *arrays: jnp.stack(arrays), *examples)
+    of_each = jax.vmap(lambda arrays: value_and_gradient(kernel, arrays))
+    split = jax.jit(jax.shard_map(of_each, mesh=mesh, in_specs=P("scans"), out_specs=P("scans")))(many)
+    assert all(len(leaf.sharding.device_set) == 8 for leaf in jax.tree.leaves(split)), name
+    assert_close(split, jax.jit(of_each)(many))
+    narrow = jax.jit(lambda arrays: kernel.call(**arrays))(example(kernel, 0, "float32"))
+    assert_close(jax.tree.map(lambda leaf: leaf[0], split[0]), narrow)
+    print(name)
+"""
+
+
+@pytest.mark.slow
+def test_eight_devices_and_64_bits_give_the_numbers_of_one_and_of_32() -> None:
+    flags = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
+    done = subprocess.run(
+        [sys.executable, "-c", ON_EIGHT_DEVICES], cwd=REPOSITORY, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.splitlines() == [*KERNELS]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KERNELS)
+def test_nothing_needs_jit(name: str) -> None:
+    kernel = KERNELS[name]
+    expected = kernel.call(**example(kernel))
+    with jax.disable_jit():
+        assert_close(kernel.call(**example(kernel)), expected)
+
+
+@pytest.mark.parametrize("name", ["weighted_svd", "occupancy_loss"])
+def test_only_ratios_of_weights_count(name: str) -> None:
+    kernel, program = KERNELS[name], compiled(KERNELS[name])
+    arrays = example(kernel)
+    expected = kernel.call(**arrays)
+    for factor in (2e-37, 1e37):
+        assert_close(program(arrays | {"weights": arrays["weights"] * jnp.float32(factor)}), expected)
+    without = program(arrays | {"weights": arrays["weights"].at[:3].set(0)})
+    assert not np.allclose(without, expected, **CLOSE)
+    for weight in (np.nan, np.inf, -np.inf, -1.0, 1e-39):
+        assert_close(program(arrays | {"weights": arrays["weights"].at[:3].set(weight)}), without)
+
+
+@pytest.mark.parametrize("name", ["occupancy_loss", "info_nce", "absolute_trajectory_error"])
+def test_a_prediction_that_is_not_finite_is_never_left_out(name: str) -> None:
+    arrays = example(KERNELS[name])
+    by = KERNELS[name].by[0]
+    masks = {mask: jnp.ones_like(value) for mask, value in arrays.items() if value.dtype == bool}
+    assert np.isnan(compiled(KERNELS[name])(arrays | masks | {by: arrays[by].at[2].set(jnp.nan)}))
+
+
+def test_the_guide_lists_every_public_kernel() -> None:
+    text = (REPOSITORY / "docs" / "guides" / "pure_functions.md").read_text()
+    found = re.findall(r"^\| `([\w.]+)` \| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
+    expected: dict[str, tuple[str, str]] = {}
+    for name, kernel in KERNELS.items():
+        if " " not in name and name != "match_hypotheses":
+            masks = [mask for mask, filler in kernel.padding.items() if filler is False]
+            missing = "weights" if "weights" in kernel.padding else "masks" if masks else "none"
+            expected[name] = ("yes" if kernel.by else "none", missing)
+            assert callable(operator.attrgetter(name)(dpmjax))
+    assert {name: (derivative, missing) for name, derivative, missing in found} == expected
 
 
 def test_degenerate_trajectories_have_an_error_and_a_gradient() -> None:

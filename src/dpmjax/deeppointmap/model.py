@@ -52,7 +52,7 @@ def init_model(key: PRNGKeyArray, config: ModelConfig) -> Model:
     shapes = model_shapes(config)
     # One long draw is cut up on the host; a draw for each of the 200 arrays would take ten seconds to compile.
     num_numbers = sum(leaf.size for leaf in jax.tree.leaves(shapes))
-    draw = np.asarray(jax.random.normal(key, (num_numbers,)))
+    draw = np.asarray(jax.random.normal(key, (num_numbers,), jnp.float32))
     ends = iter(np.cumsum([leaf.size for leaf in jax.tree.leaves(shapes)]))
 
     def start(path: tuple[Any, ...], leaf: jax.ShapeDtypeStruct) -> jax.Array:

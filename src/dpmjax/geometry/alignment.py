@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from dpmjax.checks import as_float, as_points, require_shape
 from dpmjax.geometry.rigid import matmul, namespace_of
+from dpmjax.geometry.traced import is_usable, usable_weights
 from dpmjax.types import AnyArray
 
 # Largest singular value that counts as zero, relative to the largest one, in epsilons of the dtype.
@@ -38,8 +39,9 @@ def weighted_svd(
     Args:
         source: (n, 2) or (n, 3), in the source frame.
         target: the same number of points, in the target frame and the same unit.
-        weights: weight of each pair; zero, negative and NaN weights leave it out, and its points may then hold
-            anything. Only ratios count.
+        weights: weight of each pair; only ratios count. A weight that is not finite or not above 0 leaves the pair
+            out, and so does one below the smallest normal number (1.2e-38 in float32). The points of a pair that is
+            left out may hold anything. A pair with a coordinate that is not a number from -1e15 to 1e15 is left out.
 
     Returns:
         Homogeneous matrix (d+1, d+1), dtype of the inputs.
@@ -51,16 +53,24 @@ def weighted_svd(
     target, weights = as_points("target", target), as_float("weights", weights)
     require_shape("target", target, source.shape)
     require_shape("weights", weights, source.shape[:1])
-    return best_motion(source, target, weights)
+    return _weighted_svd(source, target, weights)
+
+
+@jax.jit
+def _weighted_svd(source: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
+    motion: jax.Array = _motion(
+        source, target, usable_weights(jnp.where(is_usable(source) & is_usable(target), weights, 0))
+    )
+    return motion
 
 
 def best_motion(source: Any, target: Any, weights: Any) -> Any:
-    """Computes `weighted_svd` for unchecked arrays of NumPy or JAX.
+    """Computes `weighted_svd` for finite points that are not checked, of NumPy or JAX.
 
     Args:
         source: (n, 2) or (n, 3), in the source frame.
         target: the same number of points, in the target frame.
-        weights: (n,) of each pair.
+        weights: (n,) of each pair, from 0 to 1.
 
     Returns:
         `T_target_source`, (d+1, d+1): of NumPy in the dtype of the points if all arrays are NumPy's, else of JAX.
@@ -74,9 +84,7 @@ def _motion(source: Any, target: Any, weights: Any) -> Any:
     if source.shape[0] == 0:
         return xp.eye(dim + 1, dtype=source.dtype)
     is_used = weights > 0
-    # Only ratios count: scaled by the largest, weights of any size are safe to square.
-    heaviest = _constant(xp.max(xp.where(is_used, weights, 0)))
-    weights = xp.where(is_used, weights, 0) / xp.where(heaviest > 0, heaviest, 1)
+    weights = xp.where(is_used, weights, 0)
     source, target = (xp.where(is_used[:, None], points, 0) for points in (source, target))
     mean_source, mean_target = (_weighted_mean(points, weights, xp) for points in (source, target))
     centred_source = xp.where(is_used[:, None], source - mean_source, 0)

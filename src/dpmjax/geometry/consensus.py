@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import motions_of_weights
+from dpmjax.geometry.traced import is_usable
 from dpmjax.types import AnyArray
 
 # Two pairs agree if the distances between their points differ by less than this on the two sides, metres. Points nearer
@@ -106,6 +107,7 @@ def find_consensus(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, config: ConsensusConfig) -> Consensus:
+    mask = mask & is_usable(source) & is_usable(target)
     source, target = (as_float("points", jnp.where(mask[:, None], points, 0)) for points in (source, target))
     agreement, worth = _second_order(source, target, mask)
     _, seeds = lax.top_k(jnp.sum(agreement, axis=1), min(config.num_seeds, len(source)))

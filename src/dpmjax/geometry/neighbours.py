@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_mask, as_points, require_count, require_positive
+from dpmjax.geometry.traced import is_usable, with_axes_of
 from dpmjax.types import AnyArray, Neighbours
 
 # How many distances are held at once: 64 MB in float32.
@@ -44,7 +45,7 @@ def k_nearest(
 
     Returns:
         Neighbours (m, k). With fewer than k valid points, the remaining columns are masked: index 0, distance infinite.
-        A query that is not finite has no neighbours. `squared_distances` is differentiable in both clouds.
+        A query with a coordinate that is not a number from -1e15 to 1e15 has no neighbours. `squared_distances` is differentiable in both clouds.
 
     Raises:
         ValueError: the shapes do not match, or k is below 1.
@@ -96,12 +97,14 @@ def _checked_pair(queries: AnyArray, points: AnyArray) -> tuple[jax.Array, jax.A
 def _k_nearest(queries: jax.Array, points: jax.Array, mask: jax.Array, *, k: int) -> Neighbours:
     if points.shape[0] == 0:
         points, mask = jnp.zeros((1, points.shape[1]), points.dtype), jnp.zeros(1, bool)
+    mask = mask & is_usable(points)
     num_found = min(k, points.shape[0])
     arguments, search = (*lax.stop_gradient((queries, points)), mask), functools.partial(_search_top_k, k=num_found)
     # A reduction over pairs does not vectorise on a CPU; a loop over points, all queries at once, is six times faster,
     # and another three times where the best ones stay in registers for some points.
     one = functools.partial(lax.platform_dependent, cpu=_loop_over_points, default=search)
     indices, is_found = one(*arguments) if num_found == 1 else search(*arguments)
+    is_found = is_found & is_usable(queries)[:, None]
     indices = jnp.where(is_found, indices, 0)
     # Distances once more, from the few points that were found: so their gradient costs (m, k) and not (m, n).
     difference = jnp.where(is_found[..., None], queries[:, None] - points[indices], 0)
@@ -130,7 +133,8 @@ def _loop_over_points(
         is_nearer = mask[index] & (squared < best_squared)
         return jnp.where(is_nearer, squared, best_squared), jnp.where(is_nearer, index, best_index)
 
-    start = (jnp.full_like(columns[0], jnp.inf), jnp.zeros(queries.shape[:1], jnp.int32))
+    begin = with_axes_of((queries, points, mask), jnp.zeros(queries.shape[:1], jnp.int32))
+    start = (jnp.inf + begin.astype(queries.dtype), begin)
     best_squared, best_index = lax.fori_loop(0, points.shape[0], keep_nearer, start, unroll=_POINTS_A_PASS)
     return best_index[:, None], jnp.isfinite(best_squared)[:, None]
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from dpmjax.checks import as_mask, as_points, require_count, require_positive
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.planes import fit_planes
+from dpmjax.geometry.traced import is_usable
 from dpmjax.types import AnyArray, Neighbours, PointPyramid, SurfaceElements
 
 # Neighbouring pixels whose depths differ by more than this share lie on different surfaces.
@@ -90,6 +91,7 @@ def estimate_normals(
 
 @functools.partial(jax.jit, static_argnames="k")
 def _estimate_normals(points: jax.Array, mask: jax.Array, radius: jax.Array, *, k: int) -> Normals:
+    mask = mask & is_usable(points)
     points = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
     near = k_nearest(points, points, k, mask)
     weights = (near.mask & (near.squared_distances <= radius**2)).astype(points.dtype)

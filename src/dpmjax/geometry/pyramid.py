@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_mask, as_points, require_count, require_positive
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
+from dpmjax.geometry.traced import LARGEST_COORDINATE, is_usable
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
 # Relative slack of the radius: quantised points often lie exactly on it, and rounding must not decide.
@@ -106,6 +107,7 @@ def build_pyramid(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _build_pyramid(points: jax.Array, mask: jax.Array, *, config: PyramidConfig) -> PointPyramid:
+    mask = mask & is_usable(points)
     points = jnp.where(mask[:, None], points, 0)
     levels = [PyramidLevel(points, mask, jnp.zeros(0, jnp.int32), ())]
     num_valid = jnp.sum(mask)
@@ -188,8 +190,8 @@ def build_pyramid_on_host(
     points = np.asarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"points: expected shape (n, 3) with n >= 1, got {points.shape}")
-    mask = as_mask("mask", mask, points.shape[:1], np)
     require_count("num_threads", num_threads)
+    mask = as_mask("mask", mask, points.shape[:1], np) & (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)
     points = np.where(mask[:, None], points, np.float32(0))
     order = farthest_points_on_host(points, mask, config.stages[0].num_points).astype(np.int32)
     # Valid points stand in front on every level but the first, where `rows` says which they are.

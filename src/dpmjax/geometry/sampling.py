@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import as_float, as_mask, as_points, require_count, require_positive, require_shape
+from dpmjax.geometry.traced import is_usable, with_axes_of
 from dpmjax.types import AnyArray
 
 
@@ -71,6 +72,7 @@ def _farthest_point_sample(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], *, num_samples: int
 ) -> Int[Array, " s"]:
     num_points, dim = points.shape
+    mask = mask & is_usable(points)
     cleared = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
     columns = [cleared[:, axis] for axis in range(dim)]
     rows = jnp.arange(num_points, dtype=jnp.int32)
@@ -87,8 +89,8 @@ def _farthest_point_sample(
         farthest = jnp.min(jnp.where(distance_bits == largest, rows, num_points))
         return distance_bits, chosen.at[step].set(jnp.where(largest >= 0, farthest, first))
 
-    unseen = _as_bits(jnp.full(num_points, jnp.inf, points.dtype))
-    chosen = jnp.full(num_samples, first, jnp.int32)
+    unseen = with_axes_of(points, _as_bits(jnp.full(num_points, jnp.inf, points.dtype)))
+    chosen = with_axes_of(points, jnp.full(num_samples, first, jnp.int32))
     return lax.fori_loop(1, num_samples, choose, (jnp.where(mask, unseen, -1), chosen))[1]
 
 
@@ -102,6 +104,7 @@ def _voxel_sample(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], voxel_size: Float[Array, ""]
 ) -> Bool[Array, " n"]:
     num_points, dim = points.shape
+    mask = mask & is_usable(points)
     voxels = jnp.floor(lax.stop_gradient(points) / voxel_size).astype(jnp.int32)
     # One sort by (valid first, voxel, place in the array): equal voxels stand together, the first one in front.
     columns = [~mask, *(voxels[:, axis] for axis in range(dim)), jnp.arange(num_points, dtype=jnp.int32)]

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from dpmjax.checks import as_float, as_mask, as_points, require_positive
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.rigid import safe_sqrt
+from dpmjax.geometry.traced import usable_weights
 from dpmjax.types import AnyArray
 
 
@@ -79,7 +80,8 @@ def occupancy_loss(
         logits: log odds of being occupied, any shape.
         labels: 1 occupied, 0 free; broadcasts against `logits`.
         weights: weight of each sample, 0 for samples of invalid beams, which may hold anything; broadcasts against
-            `logits`.
+            `logits`. Only ratios count. A weight that is not finite or not above 0 counts as 0, and so does one below
+            the smallest normal number (1.2e-38 in float32).
 
     Returns:
         sum(weights * cross entropy) / sum(weights), in nats; 0, with zero gradient, when all weights are zero.
@@ -98,9 +100,9 @@ def occupancy_loss(
 
 @jax.jit
 def _occupancy_loss(logits: jax.Array, labels: jax.Array, weights: jax.Array) -> jax.Array:
-    weights = jnp.broadcast_to(weights, logits.shape)
+    weights = jnp.broadcast_to(usable_weights(weights), logits.shape)
     labels = jnp.broadcast_to(labels, logits.shape)
-    is_counted = weights != 0
+    is_counted = weights > 0
     logits = jnp.where(is_counted, logits, 0)
     labels = jnp.where(is_counted, labels, 0)
     total = jnp.sum(weights)

@@ -18,6 +18,7 @@ from dpmjax.checks import as_float, as_mask
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
 from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
+from dpmjax.geometry.traced import is_usable
 from dpmjax.types import AnyArray
 
 
@@ -96,9 +97,11 @@ def align_poses(
     """
     xp = namespace_of(T_estimated, T_reference)
     poses = checked_pose_pair(xp, T_estimated=T_estimated, T_reference=T_reference)
-    arms = lever * xp.concatenate([-xp.eye(3), xp.eye(3)])
-    ends = [_transform(T, xp.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses]
-    return align_rigid(*ends)
+    first_estimated, first_reference = (T[:1, :3, 3] for T in poses)
+    arms = (lever * xp.concatenate([-xp.eye(3), xp.eye(3)])).astype(poses[0].dtype)
+    ends = [_transform(_moved(T, -T[:1, :3, 3]), xp.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses]
+    aligned = align_rigid(*ends)
+    return _moved(aligned, (first_reference - matmul(first_estimated, aligned[:3, :3].T))[0])
 
 
 def absolute_trajectory_error(
@@ -121,6 +124,9 @@ def absolute_trajectory_error(
             there.
     """
     estimated, reference, weights = checked_positions(estimated, reference, mask)
+    # Near the origin: float32 at map coordinates of 5e6 m would lose half a metre at every operation.
+    first = namespace_of(weights).argmax(weights)
+    estimated, reference = estimated - estimated[first], reference - reference[first]
     difference = _transform(best_motion(estimated, reference, weights), estimated) - reference
     return _number(safe_sqrt(_mean((difference**2).sum(axis=1), weights > 0)))
 
@@ -149,7 +155,7 @@ def relative_pose_error(
     estimated, reference = checked_pose_pair(xp, estimated=estimated, reference=reference)
     if not 1 <= delta < len(estimated):
         raise ValueError(f"delta: expected 1 <= delta < {len(estimated)}, the number of poses, got {delta}")
-    moved, true = (matmul(rigid.inverse(T[:-delta]), T[delta:]) for T in (estimated, reference))
+    moved, true = (_motion_between(T[:-delta], T[delta:]) for T in (estimated, reference))
     error = matmul(rigid.inverse(true), moved)
     squared_lengths = (error[:, :-1, -1] ** 2).sum(axis=1)
     squared_angles = rotation_angle(error[:, :-1, :-1]) ** 2
@@ -188,6 +194,10 @@ def point_distance(
         raise ValueError("mask: expected at least one valid point, got none")
     points = xp.where(mask[..., None], points, 0)
     require_finite("points", points)
+    if xp is not np:
+        mask = mask & is_usable(points)
+        points = xp.where(mask[..., None], points, 0)
+    estimated, reference = (_moved(T, -T[:1, :dim, dim]) for T in (estimated, reference))
     aligned = matmul(align_rigid(estimated[:, :dim, dim], reference[:, :dim, dim]), estimated)
     difference = _transform(aligned, points) - _transform(reference, points)
     return _number(_mean(safe_sqrt((difference**2).sum(axis=-1)), mask))
@@ -240,6 +250,19 @@ def _mean(values: Any, mask: Any) -> Any:
 def _transform(T: Any, points: Any) -> Any:
     dim = points.shape[-1]
     return matmul(points, T[..., :dim, :dim].swapaxes(-1, -2)) + T[..., None, :dim, dim]
+
+
+def _moved(T: Any, shift: Any) -> Any:
+    """Returns motions with another translation."""
+    xp, dim = namespace_of(T), T.shape[-1] - 1
+    top = xp.concatenate([T[..., :dim, :dim], (T[..., :dim, dim] + shift)[..., None]], axis=-1)
+    return xp.concatenate([top, T[..., dim:, :]], axis=-2)
+
+
+def _motion_between(T_world_first: Any, T_world_second: Any) -> Any:
+    """Returns `T_first_second`; the difference of the translations comes first, so that no digit is lost far out."""
+    here = T_world_first[..., :-1, -1]
+    return matmul(rigid.inverse(_moved(T_world_first, -here)), _moved(T_world_second, -here))
 
 
 def rotation_angle(R: Any) -> Any:

@@ -69,14 +69,16 @@ def attend(
 # and the products with 16 channels are faster on a CPU in this order. The bias is 0 or, without a key, -infinity.
 
 
-@jax.custom_vjp
+@jax.custom_jvp
 def _attend(queries: jax.Array, keys: jax.Array, values: jax.Array, bias: jax.Array) -> jax.Array:
-    return _attend_forward(queries, keys, values, bias)[0]
+    return _mixed_and_total(queries, keys, values, bias)[0]
 
 
-def _attend_forward(
+def _mixed_and_total(
     queries: jax.Array, keys: jax.Array, values: jax.Array, bias: jax.Array
-) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the weighted means, and the logarithm of the sum of the exponentials of each query's logits."""
+
     def of_head(queries: jax.Array, keys: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
         def of_block(query: jax.Array) -> tuple[jax.Array, jax.Array]:
             logits = _product("cn,cm->nm", keys, query) + bias[:, None]
@@ -93,33 +95,32 @@ def _attend_forward(
     # All heads at once where their logits fit the cache of a CPU.
     num_logits = queries.shape[0] * queries.shape[1] * queries.shape[3] * keys.shape[2]
     over_heads = partial(_one_after_the_other, of_head) if num_logits > MAX_LIVE_LOGITS else jax.vmap(of_head)
-    mixed, log_total = over_heads(queries, keys, values)
-    return mixed, (queries, keys, values, bias, mixed, log_total)
+    return over_heads(queries, keys, values)
 
 
-def _attend_backward(residuals: tuple[jax.Array, ...], gradient: jax.Array) -> tuple[jax.Array | None, ...]:
-    queries, keys, values, bias, mixed, log_total = residuals
+@_attend.defjvp
+def _attend_jvp(primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+    queries, keys, values, bias = primals
+    mixed, log_total = _mixed_and_total(*primals)
     dtype = queries.dtype
-    # The derivative by the logits is shares * (derivative by the shares - its mean under the shares).
-    means = jnp.sum(gradient * mixed, axis=2)
 
-    def of_head(keys: jax.Array, values: jax.Array, *blocks: jax.Array) -> tuple[jax.Array, ...]:
-        def of_block(
-            query: jax.Array, log_total: jax.Array, gradient: jax.Array, mean: jax.Array
-        ) -> tuple[jax.Array, ...]:
+    def of_head(keys: jax.Array, values: jax.Array, d_keys: jax.Array, d_values: jax.Array, *blocks: jax.Array) -> Any:
+        @jax.checkpoint
+        def of_block(keys: jax.Array, values: jax.Array, d_keys: jax.Array, d_values: jax.Array, block: Any) -> Any:
+            query, log_total, mixed, d_query = block
             shares = jnp.exp(_product("cn,cm->nm", keys, query) + bias[:, None] - log_total)
-            to_logits = (shares * (_product("cn,cm->nm", values, gradient) - mean)).astype(dtype)
-            to_values = _product("cm,nm->cn", gradient, shares.astype(dtype))
-            return _product("cn,nm->cm", keys, to_logits), _product("cm,nm->cn", query, to_logits), to_values
+            # In the type of the products, so that the backward pass multiplies in it, too.
+            d_logits = jnp.einsum("cn,cm->nm", keys, d_query) + jnp.einsum("cn,cm->nm", d_keys, query)
+            weighted = shares * d_logits.astype(jnp.float32)
+            from_values = jnp.einsum("cn,nm->cm", d_values, shares.astype(dtype))
+            from_logits = jnp.einsum("cn,nm->cm", values, weighted.astype(dtype))
+            return (from_logits + from_values).astype(jnp.float32) - mixed * jnp.sum(weighted, axis=0)
 
-        to_queries, to_keys, to_values = _one_after_the_other(of_block, *blocks)
-        return to_queries, jnp.sum(to_keys, axis=0), jnp.sum(to_values, axis=0)
+        return _one_after_the_other(lambda *block: of_block(keys, values, d_keys, d_values, block), *blocks)
 
-    found = _one_after_the_other(of_head, keys, values, queries, log_total, gradient.astype(dtype), means)
-    return *(x.astype(dtype) for x in found), None
-
-
-_attend.defvjp(_attend_forward, _attend_backward)
+    d_queries, d_keys, d_values, _ = tangents
+    tangent = _one_after_the_other(of_head, keys, values, d_keys, d_values, queries, log_total, mixed, d_queries)
+    return mixed, tangent
 
 
 def _one_after_the_other(function: Callable[..., Any], *arrays: jax.Array) -> Any:

@@ -1,21 +1,25 @@
-"""The maximum over neighbours of normalised differences: the inner loop of the encoder, with its own backward pass.
+"""The maximum over neighbours of normalised differences: the inner loop of the encoder, with its own derivative.
 
 The automatic derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the value on
-a CPU. The forward pass here visits the neighbours in turn, on (m, f) numbers that stay in the cache. The backward pass
-handles (m, f) winners and (m, k) pairs, never both at once. The length |x| of each pair is stored. The derivative of
-the norm is then a multiple of x = of_points + offset kernel, and its sums over the pairs are sums of numbers.
+a CPU. Where a derivative is asked for, the value here comes from a loop over the neighbours, on (m, f) numbers that
+stay in the cache. The derivative handles (m, f) winners and (m, k) pairs, never both at once: the length |x| of each
+pair is stored, and its derivative is a mean of products of x = of_points + offset kernel, which is a sum of a few
+numbers for each point and each pair. The rule is linear in the tangents, so JAX makes the backward pass from it.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
+from dpmjax.geometry.traced import with_axes_of
 from dpmjax.nets.layers import NORM_EPSILON
 from dpmjax.types import AnyArray
 
@@ -25,22 +29,7 @@ WINNERS = "winners"
 _UNROLL = 4
 
 
-class Residuals(NamedTuple):
-    """Values for the backward pass: the inputs; for each query and channel the winner and its normalised number; and
-    for each pair 1 / |x|.
-    """
-
-    of_points: jax.Array
-    offsets: jax.Array
-    kernel: jax.Array
-    neighbours: jax.Array
-    scale: jax.Array
-    winner: jax.Array
-    normalised: jax.Array
-    inverse: jax.Array
-
-
-@jax.custom_vjp
+@jax.custom_jvp
 def maximum_of_normalised(
     of_points: Float[Array, "n f"],
     offsets: Float[Array, "m k 3"],
@@ -66,10 +55,55 @@ def maximum_of_normalised(
     return jnp.max(x * _inverse_length(x) * scale, axis=1)
 
 
-def _forward(
-    of_points: jax.Array, offsets: jax.Array, kernel: jax.Array, neighbours: jax.Array, scale: jax.Array
-) -> tuple[jax.Array, Residuals]:
-    neighbours, shape = jnp.asarray(neighbours), (len(neighbours), of_points.shape[1])
+@functools.partial(maximum_of_normalised.defjvp, symbolic_zeros=True)
+def _maximum_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+    # With n = x / |x| of the winners: dn = (dx - n * mean over channels of (x . dx) / |x|) / |x|.
+    of_points, offsets, kernel, neighbours, scale = primals
+    to_points, to_offsets, to_kernel, _, to_scale = (None if _is_zero(tangent) else tangent for tangent in tangents)
+    winner, normalised, inverse = _winners(of_points, offsets, kernel, jnp.asarray(neighbours), scale)
+    won = jnp.arange(len(winner))[:, None], winner
+    # Parts of x . dx that are one number for each point, that are one vector for each point, and of pairs.
+    products, vectors, of_pairs = [], [], []
+    change = []
+    if to_points is not None:
+        products.append(jnp.sum(of_points * to_points, axis=1))
+        vectors.append(_product(to_points, kernel.T))
+        change.append(to_points[neighbours[won], jnp.arange(winner.shape[1])])
+    if to_kernel is not None:
+        vectors.append(_product(of_points, to_kernel.T))
+        of_pairs.append(_dots(_product(offsets, _product(kernel, to_kernel.T)), offsets))
+        change += [offsets[*won, axis] * to_kernel[axis] for axis in range(3)]
+    if to_offsets is not None:
+        x_kernel = _product(of_points, kernel.T)[neighbours] + _product(offsets, _product(kernel, kernel.T))
+        of_pairs.append(_dots(x_kernel, to_offsets))
+        change += [to_offsets[*won, axis] * kernel[axis] for axis in range(3)]
+    if products:
+        of_pairs.append(sum(products)[neighbours])
+    if vectors:
+        of_pairs.append(_dots(offsets, sum(vectors)[neighbours]))
+    tangent = jnp.zeros_like(normalised) if to_scale is None else normalised * to_scale
+    if change:
+        shrink = inverse**2 * sum(of_pairs) / winner.shape[1]
+        tangent = tangent + scale * (inverse[won] * sum(change) - normalised * shrink[won])
+    return normalised * scale, tangent
+
+
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero)
+
+
+def _dots(first: Float[Array, "m k 3"], second: Float[Array, "m k 3"]) -> Float[Array, "m k"]:
+    return jnp.sum(first * second, axis=-1)
+
+
+def _winners(
+    of_points: Float[Array, "n f"],
+    offsets: Float[Array, "m k 3"],
+    kernel: Float[Array, "3 f"],
+    neighbours: Int[Array, "m k"],
+    scale: Float[Array, " f"],
+) -> tuple[Int[Array, "m f"], Float[Array, "m f"], Float[Array, "m k"]]:
+    """Returns the winner of each query and channel, its normalised number, and 1 / |x| of each pair."""
 
     def visit(j: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         value, winner, of_winner, inverses = best
@@ -85,11 +119,12 @@ def _forward(
             inverses.at[:, j].set(inverse[:, 0]),
         )
 
-    zeros = jnp.zeros(shape, of_points.dtype)
-    empty = jnp.zeros(neighbours.shape, of_points.dtype)
-    start: tuple[jax.Array, ...] = zeros - jnp.inf, jnp.zeros(shape, jnp.int32), zeros, empty
+    num, shape = neighbours.shape[1], (len(neighbours), of_points.shape[1])
+    dtype = jnp.result_type(of_points, offsets, kernel)
+    zeros = with_axes_of((of_points, offsets, kernel, neighbours, scale), jnp.zeros(shape, dtype))
+    start = zeros.astype(jnp.result_type(dtype, scale)) - jnp.inf, zeros.astype(jnp.int32), zeros
+    start = *start, zeros[:, :1] * jnp.ones(num, dtype)
     # A while loop, because checkpointing splits a loop of known length, and stores values of every iteration.
-    num = neighbours.shape[1]
     at_once = max(size for size in range(1, _UNROLL + 1) if num % size == 0)
 
     def visit_some(state: tuple[jax.Array, tuple[jax.Array, ...]]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
@@ -100,32 +135,7 @@ def _forward(
 
     _, (_, *found) = lax.while_loop(lambda state: state[0] < num, visit_some, (jnp.zeros((), jnp.int32), start))
     winner, of_winner, inverses = (checkpoint_name(x, WINNERS) for x in found)
-    return of_winner * scale, Residuals(of_points, offsets, kernel, neighbours, scale, winner, of_winner, inverses)
-
-
-def _backward(residuals: Residuals, gradient: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, None, jax.Array]:
-    # With g = gradient * scale at the winners and 0 elsewhere, the derivative by x of a pair is
-    #     inverse * g - weight * x,   weight = inverse^2 * mean over channels of (g * normalised).
-    # The compiler removes unused outputs, such as those to the offsets.
-    of_points, offsets, kernel, neighbours, scale, winner, normalised, inverse = residuals
-    num_queries, num_channels = winner.shape
-    queries, channels = jnp.arange(num_queries)[:, None], jnp.arange(num_channels)
-    weighted = gradient * scale
-    along = jnp.zeros_like(inverse).at[queries, winner].add(weighted * normalised) / num_channels
-    weight = inverse**2 * along
-    won = weighted * inverse[queries, winner]
-    weighted_offsets = weight[..., None] * offsets
-    to_points = jnp.zeros_like(of_points).at[neighbours[queries, winner], channels].add(won)
-    weight_of_points = jnp.zeros(len(of_points), weight.dtype).at[neighbours].add(weight)
-    offsets_of_points = jnp.zeros((len(of_points), 3), weight.dtype).at[neighbours].add(weighted_offsets)
-    to_points -= _with_offsets(weight_of_points[:, None] * of_points, offsets_of_points, kernel)
-    to_kernel = jnp.stack([jnp.sum(won * offsets[queries, winner, axis], axis=0) for axis in range(3)])
-    squares = _product(weighted_offsets.reshape(-1, 3).T, offsets.reshape(-1, 3))
-    to_kernel -= _product(offsets_of_points.T, of_points) + _product(squares, kernel)
-    of_x = _product(of_points, kernel.T)[neighbours] + _product(offsets, _product(kernel, kernel.T))
-    to_offsets = jnp.zeros_like(offsets).at[queries, winner].add(won[..., None] * kernel.T)
-    to_offsets -= weight[..., None] * of_x
-    return to_points, to_offsets, to_kernel, None, jnp.sum(gradient * normalised, axis=0)
+    return winner, of_winner, inverses
 
 
 def _with_offsets(
@@ -143,6 +153,3 @@ def _product(a: Float[Array, "... k"], b: Float[Array, "k n"]) -> Float[Array, "
 
 def _inverse_length(x: Float[Array, "... f"]) -> Float[Array, "... 1"]:
     return lax.rsqrt(jnp.mean(x**2, axis=-1, keepdims=True) + NORM_EPSILON)
-
-
-maximum_of_normalised.defvjp(_forward, _backward)

@@ -176,6 +176,10 @@ def without_masked(level: PyramidLevel) -> PyramidLevel:
     return replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0))
 
 
+def _in_float32(level: PyramidLevel) -> PyramidLevel:
+    return replace(level, positions=jnp.asarray(level.positions, jnp.float32))
+
+
 def frame_directions(frame: Frame, finer: PyramidLevel, level: PyramidLevel) -> Float[Array, "m 2"] | None:
     """Computes the directions of the frames of the points of a level.
 
@@ -250,7 +254,7 @@ class PointEncoder(nn.Module):
             float32 features, one row for each point of that level; zero where its mask is False.
         """
         config = self.config
-        levels = [without_masked(level) for level in pyramid.levels]
+        levels = [_in_float32(without_masked(level)) for level in pyramid.levels]
         seen = jnp.asarray(levels[0].positions)
         if config.frame == "bearing":
             seen = to_ray_frame(seen, ray_directions(seen))
@@ -263,6 +267,7 @@ class PointEncoder(nn.Module):
         x = features.pop()
         num_steps = len(pyramid.interpolation)
         for step, interpolation in enumerate(pyramid.interpolation):
+            interpolation = replace(interpolation, weights=jnp.asarray(interpolation.weights, jnp.float32))
             fine = features.pop()
             num_features = config.output_channels if step == num_steps - 1 else fine.shape[1]
             propagation = FeaturePropagation(num_features, config.compute_dtype, name=f"propagation_{step}")

@@ -16,6 +16,7 @@ from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
 from dpmjax.geometry.rigid import safe_sqrt
+from dpmjax.geometry.traced import is_usable, with_axes_of
 from dpmjax.types import AnyArray
 
 _NORMAL_NEIGHBOURS = 6
@@ -79,7 +80,8 @@ def icp(
 
     Raises:
         ValueError: wrong shapes, unknown metric, an empty cloud, and where not traced: numbers that are not finite,
-            float32 points far from the origin, or a `T_init` that is no rigid motion.
+            float32 points far from the origin, or a `T_init` that is no rigid motion. In a traced call a point with a
+            coordinate that is not a number from -1e15 to 1e15 counts as invalid.
     """
     source = as_points("source", source, dimensions=(2, 3))
     target = as_points("target", target, dimensions=source.shape[1:]).astype(source.dtype)
@@ -147,6 +149,7 @@ def _require_motion(T_init: np.ndarray) -> None:
 
 @partial(jax.jit, static_argnames="metric")
 def _icp(source: _Cloud, target: _Cloud, start: Array, *, metric: str) -> IcpResult:
+    source, target = (_Cloud(points, mask & is_usable(points)) for points, mask in (source, target))
     source, target = (_Cloud(jnp.where(mask[:, None], points, 0), mask) for points, mask in (source, target))
     if metric == "plane":
         normals = estimate_normals(target.points, _NORMAL_NEIGHBOURS, target.mask).normals
@@ -177,6 +180,7 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
         return T_new, jnp.where(source.mask, change, 0.0).max(), count + 1
 
     begin = start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0)
+    begin = tuple(with_axes_of((source, target, normals, start), x) for x in begin)
     T, change, _ = jax.lax.while_loop(lambda c: (c[1] > resolution) & (c[2] < _MAX_ITERATIONS), iterate, begin)
     return T, change <= resolution
 

@@ -214,7 +214,7 @@ def encode_sample(model: Model, scan: SampleScans) -> DescriptorCloud:
         As `encode_pyramid`, in the frame after the motion.
     """
     # A rigid motion in metres is one in normalised coordinates with a shorter translation.
-    unit = jnp.ones((4, 4)).at[:3, 3].set(1 / model.config.scale_m)
+    unit = jnp.ones((4, 4), scan.T_augmented_lidar.dtype).at[:3, 3].set(1 / model.config.scale_m)
     return encode_pyramid(model, moved_pyramid(scan.pyramids, scan.T_augmented_lidar * unit))
 
 
