@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,32 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.types import AnyArray, ScanSet
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def runs_on_host(instead: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Makes a pipeline refuse traced arguments with one `ValueError`, at its first line.
+
+    Args:
+        instead: what to do inside a transformation, for the message, such as "call icp there".
+
+    Returns:
+        A decorator.
+    """
+
+    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        @functools.wraps(function)
+        def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+                name = function.__name__
+                raise ValueError(f"{name}: runs on the host and cannot be traced by jit, vmap or grad; {instead}")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
 
 
 def as_float(name: str, value: AnyArray) -> jax.Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require_type
+from dpmjax.checks import require_type, runs_on_host
 from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Report, fit
@@ -129,6 +129,7 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
     )  # fmt: skip
 
 
+@runs_on_host("call deepmapping.solve there")
 def fit_deepmapping(
     scans: Scans | ArrayLike,
     config: DeepMappingConfig | None = None,
@@ -162,6 +163,7 @@ def fit_deepmapping(
     return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 
 
+@runs_on_host("call deepmapping.solve there")
 def register_depth(
     images: DepthScans | ArrayLike,
     config: DeepMappingConfig | None = None,
@@ -197,6 +199,7 @@ def register_depth(
     return _keep_better(fitted, start, lambda T: 1.0 - float(projective_consistency(scans, T)))
 
 
+@runs_on_host("call deepmapping.solve there")
 def register_clouds(
     scans: CloudScans | Sequence[ArrayLike],
     config: DeepMappingConfig | None = None,

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.localization_training import (
     NUM_NODES,
@@ -167,6 +168,7 @@ class Relocalized(NamedTuple):
         return se2.to_matrix(self.pose)
 
 
+@runs_on_host("call it outside, and pass its result in")
 def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0.4) -> Relocalized:
     """Estimates poses of new scans, and detects scans outside of the map (DeepMapping section 4.1, figure 7).
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points, require_positive, require_some, require_type
+from dpmjax.checks import as_host_points, require_positive, require_some, require_type, runs_on_host
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
@@ -25,6 +25,7 @@ CHUNK = 4
 EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 
 
+@runs_on_host("call encode_pyramid on geometry.build_pyramid there")
 def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
@@ -49,6 +50,7 @@ def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: i
     return encode_pyramid(model, pyramid, num_elements=num_elements)
 
 
+@runs_on_host("call encode_pyramid on geometry.build_pyramid there")
 def encode_scans(
     model: Model, scans: Sequence[RawScan], *, scale: float = 1.0, num_elements: int | None = None
 ) -> DescriptorCloud:

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.checks import require_shape
+from dpmjax.checks import require_shape, runs_on_host
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
@@ -39,6 +39,7 @@ class Model:
     config: ModelConfig = flax.struct.field(pytree_node=False)
 
 
+@runs_on_host("call it outside, and pass its result in")
 def init_model(key: PRNGKeyArray, config: ModelConfig) -> Model:
     """Makes a model with random parameters: matrices N(0, 1 / rows), scales one, biases zero; float32.
 

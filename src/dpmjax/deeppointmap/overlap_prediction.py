@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import require_pairs
+from dpmjax.checks import require_pairs, runs_on_host
 from dpmjax.deeppointmap.confidence import OverlapEvidence
 from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
@@ -47,6 +47,7 @@ HIGH = 0.9
 MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
 
 
+@runs_on_host("call correlate there")
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
     """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
 
@@ -76,6 +77,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     return overlap_probability(model, *(cloud.described for cloud in clouds))
 
 
+@runs_on_host("call correlate there")
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dpmjax.checks import require_pairs, require_type
+from dpmjax.checks import require_pairs, require_type, runs_on_host
 from dpmjax.deeppointmap.confidence import MatchEvidence, gather_evidence, with_confidence
 from dpmjax.deeppointmap.encoding import scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
@@ -46,6 +46,7 @@ NOT_COMPARED = Verification(0.0, 0.0, 0.0, 0.0)
 OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
 
 
+@runs_on_host("call correlate and weighted_svd there")
 def register(
     model: Model,
     source: ScanOrCloud,
@@ -142,6 +143,7 @@ def register_each(
         return [_as_registration(model, hypotheses, motion.result()) for hypotheses, motion in started]
 
 
+@runs_on_host("call correlate and weighted_svd there")
 def register_pairs(
     model: Model,
     sources: Sequence[ScanOrCloud],

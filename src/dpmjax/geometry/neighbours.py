@@ -45,7 +45,8 @@ def k_nearest(
 
     Returns:
         Neighbours (m, k). With fewer than k valid points, the remaining columns are masked: index 0, distance infinite.
-        A query with a coordinate that is not a number from -1e15 to 1e15 has no neighbours. `squared_distances` is differentiable in both clouds.
+        A query with a coordinate that is not a number from -1e15 to 1e15 has no neighbours. `squared_distances` is
+        differentiable in both clouds.
 
     Raises:
         ValueError: the shapes do not match, or k is below 1.

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.checks import as_float, as_mask
+from dpmjax.checks import as_float, as_mask, runs_on_host
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
 from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
@@ -203,6 +203,7 @@ def point_distance(
     return _number(_mean(safe_sqrt((difference**2).sum(axis=-1)), mask))
 
 
+@runs_on_host("call relative_pose_error there")
 def registration_recall(
     T_estimated: Float[AnyArray, "n 4 4"],
     T_true: Float[AnyArray, "n 4 4"],

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dpmjax.checks import as_key, require_one_of, require_positive, require_type
+from dpmjax.checks import as_key, require_one_of, require_positive, require_type, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
@@ -158,6 +158,7 @@ class RegisteredScans(NamedTuple):
 
 
 @jax.enable_x64(False)  # float32, also where JAX has 64 bits
+@runs_on_host("call icp, or deepmapping.solve, there")
 def register_scans(
     scans: ScanSet | ArrayLike,
     config: RegistrationConfig | None = None,

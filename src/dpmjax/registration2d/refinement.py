@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dpmjax.checks import as_beams
+from dpmjax.checks import as_beams, runs_on_host
 from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.joint_alignment import align_all, restore_open, restore_torn
@@ -69,6 +69,7 @@ class Refined(NamedTuple):
 
 
 @jax.enable_x64(False)  # float32, also where JAX has 64 bits
+@runs_on_host("call icp there")
 def refine(
     scans: PlanarScans | ScanSet | ArrayLike,
     poses: ArrayLike,

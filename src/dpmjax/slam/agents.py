@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from dpmjax.checks import require_type
+from dpmjax.checks import require_type, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.slam.config import SlamConfig
@@ -125,6 +125,7 @@ class MergedMaps(NamedTuple):
         return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
+@runs_on_host("call it outside, and pass its result in")
 def run_agents(
     model: Model | SlamMethods, sequences: Sequence[Iterable[AnyScan]], config: SlamConfig | None = None
 ) -> AgentsResult:
@@ -173,6 +174,7 @@ def join_agents(
     return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)
 
 
+@runs_on_host("call it outside, and pass its result in")
 def merge_maps(model: Model | SlamMethods, *maps: KeyframeMap, on_keyframe: OnKeyframe = _ignore) -> MergedMaps:
     """Joins maps of different days or of different robots where they show the same places.
 

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dpmjax.checks import require_fields
+from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
@@ -118,6 +118,7 @@ class Localization(NamedTuple):
         return self.status == "found"
 
 
+@runs_on_host("call encode_pyramid, correlate and icp there")
 def localize(
     model: Model | SlamMethods,
     slam_map: KeyframeMap,

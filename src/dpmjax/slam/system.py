@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points, require_shape, require_type
+from dpmjax.checks import as_host_points, require_shape, require_type, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
@@ -165,6 +165,7 @@ def place_scans(T_world_keyframe: Poses, reports: Sequence[ScanReport]) -> Poses
     return rigid.inverse(T_world_scan[0]) @ T_world_scan if reports[0].scan == 0 else T_world_scan
 
 
+@runs_on_host("call encode_pyramid, correlate and icp there")
 def run_slam(
     model: Model | SlamMethods,
     scans: Iterable[AnyScan],

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from dpmjax.checks import require_fields
+from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
@@ -173,6 +173,7 @@ def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgre
 NO_HOOKS = TrainingHooks()
 
 
+@runs_on_host("take the gradient of a loss on encode_pyramid there")
 def train(
     drives: Sequence[LidarSequence] | ScanStore,
     config: TrainingConfig,
