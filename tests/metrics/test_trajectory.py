@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from dpmjax import absolute_trajectory_error, align_rigid, point_distance, relative_pose_error
+from dpmjax.metrics import align_poses
 from tests.tolerances import DOUBLE
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
@@ -128,6 +130,37 @@ def test_point_distance_is_its_definition(dim: int) -> None:
         distances.append(np.linalg.norm(T @ estimated[i] @ point - reference[i] @ point))
     hidden = np.where(mask[..., None], points, np.nan)
     np.testing.assert_allclose(point_distance(hidden, mask, estimated, reference), np.mean(distances), **DOUBLE)
+
+
+@DIMS
+@pytest.mark.parametrize("transform", [lambda f: f, jax.jit])
+def test_float32_at_map_coordinates_has_the_errors_of_float64(dim: int, transform) -> None:
+    estimated, reference = trajectories(10, dim)
+    for T in (estimated, reference):
+        T[:, :dim, dim] += np.array([5e5, 5e6, 300.0])[:dim]
+    narrow = [jnp.asarray(T, jnp.float32) for T in (estimated, reference)]
+    wide = [np.asarray(T, np.float64) for T in narrow]  # the same positions, rounded to half a metre
+    error = transform(absolute_trajectory_error)(*map(positions, narrow))
+    assert error.dtype == jnp.float32
+    np.testing.assert_allclose(error, absolute_trajectory_error(*map(positions, wide)), rtol=1e-4)
+    found, expected = transform(relative_pose_error)(*narrow), relative_pose_error(*wide)
+    np.testing.assert_allclose(found.translation_rmse, expected.translation_rmse, rtol=1e-4)
+    np.testing.assert_allclose(found.rotation_rmse, expected.rotation_rmse, rtol=1e-4)
+    points, mask = np.random.default_rng(11).normal(size=(25, 6, dim)).astype(np.float32), np.ones((25, 6), bool)
+    found = transform(point_distance)(jnp.asarray(points), mask, *narrow)
+    np.testing.assert_allclose(found, point_distance(points, mask, *wide), rtol=1e-4)
+
+
+def test_poses_at_map_coordinates_are_aligned_in_float32() -> None:
+    estimated, reference = trajectories(12, 3)
+    world = np.eye(4)
+    world[:3, 3] = [512.0, 4096.0, 256.0]  # with no rounding in float32, so that T itself can be compared
+    found = align_poses(
+        jnp.asarray(world @ estimated, jnp.float32), jnp.asarray(world @ reference, jnp.float32), lever=1.0
+    )
+    expected = world @ align_poses(estimated, reference, lever=1.0) @ np.linalg.inv(world)
+    np.testing.assert_allclose(found[:3, :3], expected[:3, :3], atol=2e-4)
+    np.testing.assert_allclose(found @ world[:, 3], expected @ world[:, 3], atol=5e-3)
 
 
 def test_bad_input_is_named(as_user) -> None:

@@ -55,6 +55,20 @@ def test_prepared_scans_and_drives_train_the_same_model(whole, tmp_path) -> None
     assert list(tmp_path.glob("*.npy"))
 
 
+@pytest.mark.slow
+def test_64_bits_change_parameters_in_the_same_direction_and_keep_them_float32(whole, float64) -> None:
+    trained = dpmjax.train([toy.drive()], TRAINING)
+    assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(trained.progress.state.params))
+    start = jax.tree.leaves(begin_training(TRAINING).state.params)
+    changes = [
+        np.concatenate([np.ravel(a - b) for a, b in zip(jax.tree.leaves(params), start, strict=True)])
+        for params in (trained.progress.state.params, whole[0].progress.state.params)
+    ]
+    lengths = [np.linalg.norm(change) for change in changes]
+    assert min(lengths) > 0
+    assert np.dot(*changes) > 0.98 * np.prod(lengths)
+
+
 def test_a_cache_for_prepared_scans_is_refused(tmp_path) -> None:
     with pytest.raises(ValueError, match="cache: expected None"):
         dpmjax.train(toy.store(), TRAINING, cache=tmp_path)
