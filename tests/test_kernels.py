@@ -240,15 +240,18 @@ def test_a_prediction_that_is_not_finite_is_never_left_out(name: str) -> None:
 
 def test_the_guide_lists_every_public_kernel() -> None:
     text = (REPOSITORY / "docs" / "guides" / "pure_functions.md").read_text()
-    found = re.findall(r"^\| `([\w.]+)` \| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
+    rows = re.findall(r"^\* (Derivative|No derivative), (masks|weights|neither): (.+)\.$", text, re.MULTILINE)
+    found = {
+        name: (derivative, missing) for derivative, missing, names in rows for name in re.findall("`(.+?)`", names)
+    }
     expected: dict[str, tuple[str, str]] = {}
     for name, kernel in KERNELS.items():
         if " " not in name and name != "match_hypotheses":
             masks = [mask for mask, filler in kernel.padding.items() if filler is False]
-            missing = "weights" if "weights" in kernel.padding else "masks" if masks else "none"
-            expected[name] = ("yes" if kernel.by else "none", missing)
+            missing = "weights" if "weights" in kernel.padding else "masks" if masks else "neither"
+            expected[name] = ("Derivative" if kernel.by else "No derivative", missing)
             assert callable(operator.attrgetter(name)(dpmjax))
-    assert {name: (derivative, missing) for name, derivative, missing in found} == expected
+    assert found == expected
 
 
 def test_degenerate_trajectories_have_an_error_and_a_gradient() -> None:
