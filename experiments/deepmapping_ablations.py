@@ -81,11 +81,12 @@ def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingCo
     phase = replace(
         dm.JOINT_DEPTH,
         num_steps=num_steps,
+        num_epochs=0,
         occupancy_weight=1.0 if variant == "without" else 0.5,
         final_learning_rate=0.1,
         beams_per_step=_NUM_PIXELS,
         num_free=number if ablation == "free" else 4,
-        is_sampled_as_published=False,
+        is_as_published=False,
     )
     localization = replace(fast.localization, kind="point") if variant == "PointNet" else fast.localization
     maps = {
