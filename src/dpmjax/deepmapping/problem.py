@@ -214,7 +214,7 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
         parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
 
         def logits_of(part: Float[Array, "c d"]) -> Float[Array, " c"]:
-            return apply(params.occupancy, part, weights)  # type: ignore[no-any-return]
+            return apply(params.occupancy, part, weights)
 
         is_kept = len(points) <= _MLP_KEPT
         return jax.lax.map(logits_of if is_kept else jax.checkpoint(logits_of), parts).reshape(-1)[: len(points)]
