@@ -49,11 +49,13 @@ SCANS_2D = Group("2-D scans", (
     Section("DeepMappingConfig", "dpmjax.deepmapping", "`fit_deepmapping(scans, config, key=key)`", {
         "cold_phases": ("", "phases from zero poses; see PhaseConfig"),
         "warm_phases": ("", "phases from given poses; see PhaseConfig"),
+        "unit": ("unit of the scans", "512 px in `preset('paper')`; None: the typical range of the scans"),
         "steps_per_call": ("steps", "lower: progress and Ctrl-C react sooner; higher: less overhead on a GPU"),
         "map_margin": ("share", "higher if the poses move far: M-Net covers this multiple of the scans' extent"),
     }),
     Section("PhaseConfig", "dpmjax.deepmapping", "`DeepMappingConfig(cold_phases=..., warm_phases=...)`", {
         "num_steps": ("steps", "more for large sets or noise; `deepmapping.with_steps(config, n)` scales all phases"),
+        "num_epochs": ("epochs", "instead of `num_steps`, for steps in proportion to the number of scans"),
         "occupancy_weight": ("0 to 1", "weight of M-Net's loss beside the Chamfer distance; 0 leaves M-Net out"),
         "learning_rate": ("", "lower if the loss jumps, higher if 800 steps do not move the poses far enough"),
 

@@ -1,14 +1,15 @@
 """Baselines of the DeepMapping paper that stand on other packages (extra `baselines`).
 
-L-BFGS by jaxopt on DeepMapping's loss without L-Net. A chain of scans by particle
-swarms of evosax. Multiway registration by Open3D, whose pairs are registered by iterated closest points. Neighbours in
-time are sure edges of a pose graph, and all further pairs uncertain ones. A line process removes wrong edges (Choi,
-Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with
-the settings of `as_direct`.
+L-BFGS by jaxopt on DeepMapping's loss without L-Net. Particle swarms of evosax, over all poses of a walk (the paper's
+baseline) or over the step between two scans. Multiway registration by Open3D, whose pairs are registered by iterated
+closest points. Neighbours in time are sure edges of a pose graph, and all further pairs uncertain ones. A line process
+removes wrong edges (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form
+is `fit_deepmapping` with the settings of `as_direct`.
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -80,8 +81,7 @@ SWARMS = Swarms()
 def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> np.ndarray:
     """Returns poses of planar scans, each onto the one before by a swarm on their Chamfer distance (eq. 5).
 
-    A swarm over all poses at once does not converge; over one relative pose of three numbers it does. Without evosax it
-    ends in a ModuleNotFoundError.
+    Without evosax it ends in a ModuleNotFoundError.
 
     Args:
         scans: n scans in order of time.
@@ -110,7 +110,7 @@ def _swarm_pairs(scans: ScanSet, widths: Float[Array, " 3"], key: jax.Array, *, 
         def misfit(pose: Float[Array, " 3"]) -> Array:
             return chamfer_distance(se2.transform_points(pose, after), before, after_mask, before_mask)
 
-        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), sizes=sizes)
+        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), sizes=sizes, num_unknowns=3)
         found, values = jax.lax.map(swarm, jax.random.split(pair_key, sizes.num_rounds))
         return found[values.argmin()] * widths
 
@@ -119,13 +119,15 @@ def _swarm_pairs(scans: ScanSet, widths: Float[Array, " 3"], key: jax.Array, *, 
     return jax.lax.map(best_of_rounds, pairs, batch_size=_PAIRS_AT_ONCE)
 
 
-def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+def _swarm(
+    misfit: Any, key: jax.Array, *, sizes: Swarms, num_unknowns: int
+) -> tuple[Float[Array, " u"], Float[Array, ""]]:
     """Returns the best particle of one swarm in the box from -1 to 1, and its misfit."""
     from evosax.algorithms import PSO
 
     start_key, init_key, key = jax.random.split(key, 3)
-    algorithm = PSO(population_size=sizes.num_particles, solution=jnp.zeros(3))
-    particles = jax.random.uniform(start_key, (sizes.num_particles, 3), minval=-1.0, maxval=1.0)
+    algorithm = PSO(population_size=sizes.num_particles, solution=jnp.zeros(num_unknowns))
+    particles = jax.random.uniform(start_key, (sizes.num_particles, num_unknowns), minval=-1.0, maxval=1.0)
     state = algorithm.init(init_key, particles, misfit(particles), algorithm.default_params)
 
     def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
@@ -136,6 +138,54 @@ def _swarm(misfit: Any, key: jax.Array, *, sizes: Swarms) -> tuple[Float[Array, 
 
     state, _ = jax.lax.scan(iterate, state, jax.random.split(key, sizes.num_iterations))
     return state.best_solution, state.best_fitness
+
+
+# Particles over all poses start within this: one typical range along each axis, and half a turn.
+_POSE_SPREAD = (1.0, 1.0, np.pi)
+
+
+def swarm_poses(
+    scans: ScanSet, config: DeepMappingConfig, sizes: Swarms = SWARMS, *, cpu_s: float, key: jax.Array
+) -> np.ndarray:
+    """Returns poses by swarms over all poses at once on the Chamfer distance of the fit (DeepMapping section 4.1).
+
+    As in the paper, rounds of fresh swarms follow each other until a time is used. Without evosax it ends in a
+    ModuleNotFoundError.
+
+    Args:
+        scans: n scans in order of time.
+        config: settings; its first cold phase gives the loss, here of the whole set, with `sizes.num_beams` beams.
+        sizes: of the swarms; `num_rounds` is not used.
+        cpu_s: process time of all rounds, without compilation; a round that has begun is finished.
+        key: key of the swarms and of the pairs that are compared.
+
+    Returns:
+        (n, 3) T_world_scan, x, y, heading; the first one zero.
+    """
+    data, unit = mapping_data(scans)
+    whole = {"poses": "free", "scans_per_window": None, "occupancy_weight": 0.0, "beams_per_step": sizes.num_beams}
+    phase = replace(config.cold_phases[0], **whole, scans_per_step=len(scans.points))
+    problem = mapping_problem(replace(config, cold_phases=(phase,)), data)
+    start, count = init(problem, data, key=key).params, len(scans.points) - 1
+    widths = jnp.array(_POSE_SPREAD)
+
+    def misfit(particle: Float[Array, " u"]) -> Float[Array, ""]:
+        poses = jnp.concatenate([jnp.zeros((1, 3)), particle.reshape(count, 3) * widths])
+        return problem.loss(problem.config, phase, replace(start, poses=poses), data, jnp.asarray(0), key)[0]
+
+    @jax.jit
+    def run_round(key: jax.Array) -> tuple[Array, Array]:
+        return _swarm(partial(jax.lax.map, misfit), key, sizes=sizes, num_unknowns=3 * count)
+
+    program = run_round.lower(key).compile()
+    best, least, begun, number = jnp.zeros(3 * count), np.inf, time.process_time(), 0
+    while number == 0 or time.process_time() - begun < cpu_s:
+        particle, value = program(jax.random.fold_in(key, number))
+        if float(value) < least:
+            best, least = particle, float(value)
+        number += 1
+    poses = np.asarray(best, np.float64).reshape(count, 3) * np.array(_POSE_SPREAD) * [unit, unit, 1.0]
+    return np.concatenate([np.zeros((1, 3)), poses])
 
 
 # Largest distances of matched points in the first round, and in the second round and the graph, in typical ranges of

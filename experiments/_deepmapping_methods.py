@@ -19,7 +19,8 @@ from dpmjax import ScanSet, cli, registration2d
 from dpmjax import deepmapping as dm
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
-from experiments._baselines import multiway, optimize_directly, swarm_chain
+from experiments._baselines import multiway, optimize_directly, swarm_chain, swarm_poses
+from experiments._plain_icp import chain_icp
 
 Candidates = dict[str, np.ndarray]
 
@@ -27,6 +28,8 @@ Candidates = dict[str, np.ndarray]
 SUCCESS_PX = 20.0
 
 _LBFGS_ITERATIONS = 150
+# Process time of the fast preset from zero poses, seconds a scan (deepmapping_suite_zero.json), as of the swarms.
+_FIT_CPU_S = 0.13
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,11 @@ def incremental(task: Task, metric: Literal["point", "plane"] = "plane") -> np.n
     return registration2d.incremental_icp(task.planar, metric).poses
 
 
+def _plain(task: Task, metric: Literal["point", "plane"]) -> np.ndarray:
+    """Returns poses by the paper's incremental ICP: from the identity, without a search."""
+    return chain_icp(task.scans, metric)
+
+
 def search(task: Task) -> np.ndarray:
     """Returns poses by global registration, from nothing but the scans: no odometry, no first guess, no refinement."""
     return registration2d.register_globally(task.planar).poses
@@ -103,7 +111,7 @@ def _refined_icp(task: Task) -> Candidates:
 
 
 def _direct_lbfgs(task: Task) -> np.ndarray:
-    """Returns poses by DeepMapping's loss without L-Net, from zero by L-BFGS."""
+    """Returns poses by DeepMapping's loss without L-Net, from zero poses by L-BFGS."""
     num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
     return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=task.key)
 
@@ -115,8 +123,18 @@ def _lnet_from_icp(task: Task) -> Candidates:
     return {START_NAMES["icp-plane"]: start, DEEPMAPPING: fitted}
 
 
+def _swarm_poses(task: Task) -> np.ndarray:
+    """Returns poses by swarms over all poses, in the time of the fast preset or of a part of its steps."""
+    config = dm.preset("fast")
+    share = 1.0 if task.steps is None else task.steps / sum(phase.num_steps for phase in config.cold_phases)
+    return swarm_poses(task.scans, config, cpu_s=_FIT_CPU_S * share * len(task.sequence), key=task.key)
+
+
 def _direct(task: Task, *, has_windows: bool) -> np.ndarray:
-    """Returns poses by DeepMapping's loss without L-Net, from zero by Adam; windows, or the whole set in each phase."""
+    """Returns poses by DeepMapping's loss without L-Net, by Adam; windows, or the whole set in each phase.
+
+    They start at the output of the untrained L-Nets, as in supplement B.
+    """
     config = dm.as_direct(dm.preset("fast"))
     if not has_windows:
         phases = tuple(replace(phase, scans_per_window=None) for phase in config.cold_phases)
@@ -174,10 +192,13 @@ class Method(NamedTuple):
 
 
 METHODS: dict[str, Method] = {
+    "icp-point-plain": Method("plain chain of ICP, point to point", partial(_plain, metric="point")),
+    "icp-plane-plain": Method("plain chain of ICP, point to line", partial(_plain, metric="plane")),
     "icp-point": Method(START_NAMES["icp-point"], partial(incremental, metric="point")),
     "icp-plane": Method(START_NAMES["icp-plane"], incremental),
     "icp-refined": Method("incremental ICP, refined", _refined_icp),
     "multiway": Method("multiway registration of Open3D", lambda task: multiway(task.scans), "open3d"),
+    "swarm-poses": Method("particle swarms over all poses, in the time of L-Net", _swarm_poses, "evosax"),
     "particle-swarm": Method(
         "particle swarms, each scan onto the one before", lambda task: swarm_chain(task.scans, key=task.key), "evosax"
     ),
@@ -185,8 +206,10 @@ METHODS: dict[str, Method] = {
     "lnet-icp": Method("L-Net and M-Net from incremental ICP", _lnet_from_icp),
     "search": Method(START_NAMES["global"], search),
     "search-refined": Method("global registration, refined", lambda task: refined(task, search(task))),
-    "direct-adam": Method("direct optimisation from zero, Adam", partial(_direct, has_windows=False)),
-    "direct-windows": Method("direct optimisation from zero in windows, Adam", partial(_direct, has_windows=True)),
+    "direct-adam": Method("direct optimisation from L-Net's start, Adam", partial(_direct, has_windows=False)),
+    "direct-windows": Method(
+        "direct optimisation from L-Net's start in windows, Adam", partial(_direct, has_windows=True)
+    ),
     "direct-lbfgs": Method("direct optimisation from zero, L-BFGS", _direct_lbfgs, "jaxopt"),
     "global-deepmapping": Method("global registration, then DeepMapping", _global_deepmapping),
     "all": Method("ICP, global registration, DeepMapping from it, and each refined", _all_candidates),

@@ -4,8 +4,11 @@
     python -m experiments.deepmapping_relocalize run
 
 RUN is a folder of `dpmjax map2d` on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
-poses of each scan, and M-Net chooses. Headings are random and unknown. Written beside the results of RUN:
-relocalization.png, relocalization.json, and relocalization.npz with the numbers of each scan.
+poses of each scan, and M-Net chooses. Headings are random and unknown. Beside it stands L-Net alone, as in the paper:
+the scans have the heading of the nearest scan of the fit, and the output of L-Net is the pose. That L-Net is the one of
+the fit where a single one moved all scans from zero poses, as with --preset paper; else it is trained on the poses of
+the fit. Written beside the results of RUN: relocalization.png, relocalization.json, and relocalization.npz with the
+numbers of each scan.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from dpmjax.io import ScanSequence
 EXPERIMENT = "deepmapping_relocalize"
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
 _RIGHT_PX = 20.0
+# Scans of a batch.
+_CHUNK = 256
 # Training steps of L-Net on the poses of the run.
 _NUM_STEPS = 5000
 _BINS_PX = (0.0, 10.0, 20.0, 50.0, 100.0, 1500.0)
@@ -58,28 +63,37 @@ def main(config: Config) -> None:
     sequence, fitted = run.sequence, run.fitted
     grid = simulation.make_world(run.world).is_obstacle
     truth = free_poses(grid, config)
-    points, mask = simulation.scan_world(grid, truth, num_beams=sequence.points.shape[1])
     begun = time.perf_counter()
     scans = ScanSet(sequence.points, sequence.mask)
     trained = dm.train_localization(fitted, scans, num_steps=_NUM_STEPS, key=jax.random.key(config.seed))
     jax.block_until_ready(trained.params)
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
-    found = dm.relocalize(trained, ScanSet(points, mask))
+    found = dm.relocalize(trained, scan_all(grid, truth, sequence))
+    relocalization_s = time.perf_counter() - begun
     errors, turns = errors_at(found.pose, truth, fitted, sequence)
     queries = Queries(errors, turns, found.is_known, is_mapped(truth, fitted, sequence), found.nats)
+    has_one_net = can_localize_alone(fitted)
+    turned = turn_to_nearest(truth, sequence)
+    poses = localize_alone(fitted if has_one_net else trained, scan_all(grid, turned, sequence))
+    errors, turns = errors_at(poses, turned, fitted, sequence)
+    alone = queries._replace(errors=errors, turns=turns)
     report = {
         "world": sequence.name,
         "num_scans": len(sequence),
         "num_poses": len(truth),
         **summarise(queries, truth, sequence),
+        "lnet_alone": {
+            "network": "of the fit" if has_one_net else "trained on the poses of the fit",
+            "groups": summarise(alone, truth, sequence)["groups"],
+        },
         "training_s": training_s,
-        "relocalization_s": time.perf_counter() - begun,
+        "relocalization_s": relocalization_s,
         "seed": config.seed,
         **cli.environment(),
     }
     cli.write_json(config.run / "relocalization.json", report)
-    np.savez(config.run / "relocalization.npz", truth=truth, **queries._asdict())
-    draw(config, sequence, grid.shape, truth, queries)
+    np.savez(config.run / "relocalization.npz", truth=truth, errors_alone=alone.errors, **queries._asdict())
+    draw(config, sequence, grid.shape, truth, {"L-Net alone, known heading": alone, "L-Net and M-Net": queries})
     print(lines_of(report), f"results in {config.run}", sep="\n")
 
 
@@ -101,13 +115,17 @@ class Queries(NamedTuple):
     nats: np.ndarray
 
 
-def draw(config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: np.ndarray, queries: Queries) -> None:
-    """Draws relocalization.png: maps of the errors, of all scans and of those that are known."""
-    panels = []
-    for name, rows in (("all scans", np.ones(len(truth), bool)), ("scans that are known", queries.is_known)):
+def draw(
+    config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: np.ndarray, methods: dict[str, Queries]
+) -> None:
+    """Draws relocalization.png: maps of the errors of each method, and of the last one for the scans that are known."""
+    panels, everywhere = [], np.ones(len(truth), bool)
+    last, queries = list(methods.items())[-1]
+    shown = {name: (found.errors, everywhere) for name, found in methods.items()}
+    for name, (errors, rows) in (shown | {f"{last}, known scans": (queries.errors, queries.is_known)}).items():
         image = np.full(shape, np.nan)[:: config.stride_px, :: config.stride_px]
-        image[tuple((truth[rows, 1::-1] // config.stride_px).astype(int).T)] = queries.errors[rows]
-        share = float((queries.errors[rows] < _RIGHT_PX).mean()) if rows.any() else 0.0
+        image[tuple((truth[rows, 1::-1] // config.stride_px).astype(int).T)] = errors[rows]
+        share = float((errors[rows] < _RIGHT_PX).mean()) if rows.any() else 0.0
         panels.append(viz.ErrorMap(name, f"{share:.0%} of {rows.sum()} below {_RIGHT_PX:.0f} px", image))
     side = config.stride_px * np.array(panels[0].error.shape)
     extent = (0.0, side[1], 0.0, side[0])
@@ -122,6 +140,35 @@ def free_poses(grid: np.ndarray, config: Config) -> np.ndarray:
     places = np.column_stack([columns, rows]) * config.stride_px + half + 0.5
     headings = np.random.default_rng([config.seed, 7]).uniform(-np.pi, np.pi, len(places))
     return np.column_stack([places, headings])
+
+
+def scan_all(grid: np.ndarray, poses: np.ndarray, sequence: ScanSequence) -> ScanSet:
+    """Returns the scans at poses, with the number of beams of the sequence."""
+    return ScanSet(*simulation.scan_world(grid, poses, num_beams=sequence.points.shape[1]))
+
+
+def turn_to_nearest(truth: np.ndarray, sequence: ScanSequence) -> np.ndarray:
+    """Returns the poses with the heading of the nearest scan of the fit."""
+    from scipy.spatial import KDTree
+
+    _, nearest = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
+    return np.column_stack([truth[:, :2], sequence.reference_poses[nearest, 2]])
+
+
+def can_localize_alone(fitted: dm.Fitted) -> bool:
+    """Returns True where one L-Net has moved all scans of the fit from zero poses."""
+    is_one = all(phase.poses == "network" and phase.scans_per_window is None for phase in fitted.config.cold_phases)
+    return is_one and not np.any(np.asarray(fitted.params.start))
+
+
+def localize_alone(fitted: dm.Fitted, scans: ScanSet) -> np.ndarray:
+    """Returns the output of L-Net for each scan as its pose, in the world of the fit; no search, no M-Net."""
+    parts = []
+    for k in range(0, len(scans.points), _CHUNK):
+        part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
+        found = dm.propose_poses(fitted.params.localization, part, num_turns=1, fit_config=fitted.config)
+        parts.append(np.asarray(found[:, 0], np.float64))
+    return np.concatenate(parts) * [fitted.unit, fitted.unit, 1.0]
 
 
 def is_mapped(truth: np.ndarray, fitted: dm.Fitted, sequence: ScanSequence) -> np.ndarray:
@@ -178,11 +225,13 @@ def _numbers(queries: Queries, rows: np.ndarray) -> cli.Row:
 
 def lines_of(report: cli.Row) -> str:
     """Returns the numbers of each group of scans for the console."""
-    lines = [
-        f"{name}: {row['num_poses']} scans, median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees, "
-        f"{row['share_below_20_px']:.0%} below {_RIGHT_PX:.0f} px, {row['share_known']:.0%} called known"
-        for name, row in report["groups"].items()
-    ]
+
+    def line(name: str, row: cli.Row) -> str:
+        errors = f"median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees"
+        return f"{name}: {row['num_poses']} scans, {errors}, {row['share_below_20_px']:.0%} below {_RIGHT_PX:.0f} px"
+
+    lines = [f"{line(name, row)}, {row['share_known']:.0%} called known" for name, row in report["groups"].items()]
+    lines += [line(f"L-Net alone, {name}", row) for name, row in report["lnet_alone"]["groups"].items()]
     precision = report["precision_of_known"]
     answer = "none is called known" if precision is None else f"{precision:.1%} of those called known are right"
     known = f"{answer}; {report['share_of_mapped_known']:.0%} of the mapped ones are called known"

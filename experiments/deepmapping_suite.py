@@ -30,10 +30,12 @@ NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
 class Config(shared.TableOptions):
     """Options of the suite."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "walks", "methods"})
 
     limit: Annotated[int | None, arg(metavar="N")] = None
     """Only the first N trajectories; they go through worlds and lengths in turn."""
+    walks: tuple[int, ...] = ()
+    """Only the trajectories of these numbers: 0 to 49 of 128 poses, 100 to 124 of 256; without it, all."""
     range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
     """Standard deviation of the range noise."""
 
@@ -41,6 +43,9 @@ class Config(shared.TableOptions):
         """Checks names and ranges."""
         super().__post_init__()
         cli.check_least(self, limit=1, range_noise_px=0)
+        known = [entry["walk"] for entry in list_trajectories()]
+        if unknown := set(self.walks) - set(known):
+            raise ValueError(f"--walks: expected some of 0 to {NUM_SHORT - 1} and 100 to {max(known)}, got {unknown}")
 
 
 def list_trajectories() -> list[dict[str, int]]:
@@ -53,7 +58,8 @@ def list_trajectories() -> list[dict[str, int]]:
 
 def main(config: Config) -> list[cli.Row]:
     """Runs the missing cases, and writes the table."""
-    cells = list_trajectories()[: config.limit]
+    chosen = [entry for entry in list_trajectories() if not config.walks or entry["walk"] in config.walks]
+    cells = chosen[: config.limit]
     return shared.run_methods(config, EXPERIMENT, cells, partial(_prepare, config), report)
 
 

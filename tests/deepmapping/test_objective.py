@@ -22,7 +22,8 @@ def make_world(block_length: int = NUM_SCANS) -> WorldBatch:
     points = rng.uniform(-1, 1, (NUM_SCANS, NUM_POINTS, 2)).astype(np.float32)
     mask = rng.uniform(size=(NUM_SCANS, NUM_POINTS)) < 0.8
     sensors = rng.normal(scale=0.3, size=(NUM_SCANS, 2)).astype(np.float32)
-    return WorldBatch(*map(jnp.asarray, (points, sensors, mask)), block_length, jnp.asarray(0.2))
+    is_scan = np.ones(NUM_SCANS, bool)
+    return WorldBatch(*map(jnp.asarray, (points, sensors, mask, is_scan)), block_length, jnp.asarray(0.2))
 
 
 def some_logits(points: jax.Array) -> jax.Array:
@@ -49,22 +50,31 @@ def test_chamfer_of_no_pair_is_zero() -> None:
     assert float(chamfer_term(make_world(block_length=1), jnp.array([1, 2]))) == 0.0
 
 
-def test_occupancy_is_the_binary_cross_entropy_of_valid_beams() -> None:
+@pytest.mark.parametrize("has_equal_scans", [False, True])
+def test_occupancy_is_the_binary_cross_entropy_of_valid_beams(has_equal_scans: bool) -> None:
     world = make_world()
     factors = jnp.asarray(np.random.default_rng(2).uniform(size=(NUM_SCANS, NUM_POINTS, 4)), jnp.float32)
     hits, sensors, mask = (np.asarray(x, np.float64) for x in (world.points, world.sensors, world.mask))
-    occupied, free = [], []
+    occupied, free = [[] for _ in mask], [[] for _ in mask]
     for scan in range(NUM_SCANS):
         for beam in np.flatnonzero(mask[scan]):
-            occupied.append(hits[scan, beam])
-            free += [sensors[scan] + f * (hits[scan, beam] - sensors[scan]) for f in np.asarray(factors)[scan, beam]]
+            occupied[scan].append(hits[scan, beam])
+            shares = np.asarray(factors)[scan, beam]
+            free[scan] += [sensors[scan] + share * (hits[scan, beam] - sensors[scan]) for share in shares]
 
-    def probability(points: list[np.ndarray]) -> np.ndarray:
+    def probability(points: list[np.ndarray] | np.ndarray) -> np.ndarray:
         x, y = np.array(points).T
         return 1.0 / (1.0 + np.exp(-(np.sin(3.0 * x) - 2.0 * y)))
 
-    expected = -np.log(probability(occupied)).mean() - np.log(1.0 - probability(free)).mean()
-    np.testing.assert_allclose(occupancy_term(world, some_logits, factors), expected, **ACCUMULATED)
+    if has_equal_scans:
+        # Eq. 4: the mean of each scan, then the mean over K scans.
+        scans = zip(occupied, free, strict=True)
+        expected = np.mean([-np.log(probability(o)).mean() - np.log(1.0 - probability(f)).mean() for o, f in scans])
+    else:
+        hit, passed = (probability(np.concatenate(points)) for points in (occupied, free))
+        expected = -np.log(hit).mean() - np.log(1.0 - passed).mean()
+    found = occupancy_term(world, some_logits, factors, has_equal_scans=has_equal_scans)
+    np.testing.assert_allclose(found, expected, **ACCUMULATED)
 
 
 def factors_of(world: WorldBatch, config: PhaseConfig, progress: float) -> np.ndarray:
@@ -83,7 +93,7 @@ def test_free_factors_lie_between_sensor_and_hit(config: PhaseConfig) -> None:
 def test_shared_factors_are_the_same_for_all_beams_and_scans() -> None:
     shared = factors_of(make_world(), JOINT, 0.0)
     np.testing.assert_array_equal(shared, np.broadcast_to(shared[:1, :1], shared.shape))
-    own = factors_of(make_world(), replace(JOINT, is_sampled_as_published=False), 0.0)
+    own = factors_of(make_world(), replace(JOINT, is_as_published=False), 0.0)
     assert len(np.unique(own)) > 0.99 * own.size
 
 

@@ -19,6 +19,7 @@ from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.types import ScanSet
+from tests.tolerances import ACCUMULATED, ROUNDING
 
 KEY = jax.random.key(3)
 # The fast preset in small: fewer levels, beams and steps.
@@ -77,16 +78,10 @@ def test_picture_is_dark_at_walls_and_light_in_free_space(tiny_walk, warm) -> No
 def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
     config = dm.preset("paper")
     (phase,) = config.cold_phases
-    assert (phase.num_free, phase.is_sampled_as_published, phase.occupancy_weight, phase.num_offsets) == (
-        19,
-        True,
-        0.1,
-        3,
-    )
     # Its phase with all samplings, and its networks with fewer channels; a rate that shows in few steps.
     small = replace(
         config,
-        cold_phases=(replace(phase, num_steps=60),),
+        cold_phases=(replace(phase, num_epochs=60),),
         localization=replace(config.localization, features=(16, 32, 64), hidden=(32,)),
         occupancy=replace(config.occupancy, features=(32, 32)),
         steps_per_call=20,
@@ -104,16 +99,119 @@ def test_steps_of_the_paper_preset_lower_its_loss(tiny_data) -> None:
         assert any(not np.array_equal(a, b) for a, b in pairs) == moves, name
 
 
-def test_every_scan_is_in_some_batch_of_the_published_order() -> None:
+@pytest.mark.parametrize("num_scans", [8, 9, 11])
+def test_an_epoch_has_every_scan_once_in_the_order_of_time(num_scans: int) -> None:
     phase = replace(dm.preset("paper").cold_phases[0], scans_per_step=4)
-    rows = [np.asarray(blocks_of_step(phase, 11, jnp.int32(k), key=KEY)).reshape(-1) for k in range(3)]
-    assert set(np.concatenate(rows).tolist()) == set(range(11))
-    assert all((np.diff(r) == 1).all() for r in rows)
+    num_steps = -(-num_scans // 4)
+    for epoch in range(2):
+        batches = [
+            blocks_of_step(phase, num_scans, jnp.int32(epoch * num_steps + k), key=KEY) for k in range(num_steps)
+        ]
+        rows = np.concatenate([np.asarray(batch.rows[batch.is_scan]) for batch in batches])
+        assert rows.tolist() == list(range(num_scans))
+
+
+@pytest.mark.parametrize(("num_scans", "num_steps"), [(32, 3000), (128, 3000), (256, 6000), (300, 9000)])
+def test_steps_of_the_paper_preset_are_3000_epochs(num_scans: int, num_steps: int) -> None:
+    no_scans = ScanSet(jnp.zeros((num_scans, 4, 2)), jnp.ones((num_scans, 4), bool))
+    for start in (None, jnp.zeros((num_scans, 3))):
+        (phase,) = mapping_problem(dm.preset("paper"), MappingData(no_scans, start)).phases
+        assert (phase.num_steps, phase.num_epochs) == (num_steps, 0)
+
+
+def test_paper_preset_has_the_published_numbers() -> None:
+    config = dm.preset("paper")
+    assert config.cold_phases == config.warm_phases
+    (phase,) = config.cold_phases
+    gamma = phase.occupancy_weight
+    np.testing.assert_allclose((1.0 - gamma) / gamma, 10.0)  # lambda of eq. 6
+    assert (phase.num_free, phase.scans_per_step, phase.num_offsets, phase.max_offset) == (19, 128, 3, 3)
+    assert (phase.learning_rate, phase.final_learning_rate, phase.adam_decay) == (1e-3, 1.0, (0.9, 0.999))
+    assert (config.localization.dilation, config.unit) == (2, 512.0)
+    (phase,) = dm.preset("paper", "depth").cold_phases
+    np.testing.assert_allclose((1.0 - phase.occupancy_weight) / phase.occupancy_weight, 0.1)
+    assert (phase.num_free, phase.scans_per_step, phase.num_epochs) == (35, 8, 3000)
+
+
+def test_loss_of_a_short_last_batch_is_that_of_its_scans_alone(tiny_data) -> None:
+    config = dm.preset("paper")
+    phase = replace(config.cold_phases[0], scans_per_step=8)
+    config = replace(
+        config,
+        cold_phases=(phase,),
+        localization=replace(config.localization, features=(8, 16, 16), hidden=(8,)),
+        occupancy=replace(config.occupancy, features=(8, 8)),
+    )
+    scans = tiny_data.scans
+    params = init(mapping_problem(config, tiny_data), tiny_data, key=KEY).params
+
+    def loss(rows: slice, step: int) -> tuple[float, dm.problem.Params]:
+        data = MappingData(ScanSet(scans.points[rows], scans.mask[rows]))
+        problem = mapping_problem(config, data)
+        own = replace(params, start=params.start[rows])
+        value = jax.value_and_grad(lambda p: problem.loss(config, problem.phases[0], p, data, jnp.int32(step), KEY)[0])
+        return jax.jit(value)(own)
+
+    # Batches of 20 scans: 0 to 7, 8 to 15, 16 to 19.
+    for rows, step in ((slice(8, 16), 1), (slice(16, 20), 2)):
+        (one, grad), (other, grad_other) = loss(slice(0, 20), step), loss(rows, 0)
+        np.testing.assert_allclose(one, other, **ACCUMULATED)
+        for net in ("localization", "occupancy"):
+            pairs = zip(*(jax.tree.leaves(getattr(g, net)) for g in (grad, grad_other)), strict=True)
+            assert all(np.allclose(a, b, rtol=1e-3, atol=1e-5) for a, b in pairs)
+
+
+def test_a_given_unit_scales_scans_and_poses(tiny_walk) -> None:
+    scans, start = ScanSet(tiny_walk.points, tiny_walk.mask), tiny_walk.reference_poses
+    data, unit = dm.mapping_data(scans, start, unit=512.0)
+    assert unit == 512.0
+    np.testing.assert_allclose(data.scans.points, tiny_walk.points / 512.0, **ROUNDING)
+    np.testing.assert_allclose(data.start, start / [512.0, 512.0, 1.0], **ROUNDING)
+
+
+def test_a_unit_that_is_none_of_the_scans_is_refused(tiny_walk, as_user) -> None:
+    in_metres = ScanSet(tiny_walk.points / 100.0, tiny_walk.mask)
+    with pytest.raises(ValueError, match="unit: expected a length like the ranges of the scans"):
+        dm.fit_deepmapping(in_metres, dm.preset("paper"), key=KEY)
+
+
+# Losses of the preset `fast` at its initial parameters, by phase, from zero poses or from given ones.
+FAST_LOSSES = {("L-Net", True): 0.1781985, ("free poses", True): 0.7525633, ("free poses", False): 0.7428900}
+
+
+def test_losses_of_the_fast_preset_do_not_change(tiny_walk, shaken) -> None:
+    for (name, is_cold), expected in FAST_LOSSES.items():
+        data, _ = dm.mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask), None if is_cold else shaken)
+        problem = mapping_problem(dm.preset("fast"), data)
+        phase = next(phase for phase in problem.phases if phase.name == name)
+        params = init(problem, data, key=KEY).params
+        loss, _ = problem.loss(problem.config, phase, params, data, jnp.int32(0), KEY)
+        np.testing.assert_allclose(loss, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("length", [None, 8])
+def test_direct_optimisation_starts_at_the_output_of_the_untrained_networks(tiny_data, length: int | None) -> None:
+    phases = tuple(replace(phase, scans_per_window=length) for phase in SMALL.cold_phases)
+    config = replace(SMALL, cold_phases=phases)
+    poses = []
+    for settings in (config, dm.as_direct(config)):
+        problem = mapping_problem(settings, tiny_data)
+        state = init(problem, tiny_data, key=KEY)
+        poses.append(problem.poses(settings, problem.phases[0], state.params, tiny_data))
+    np.testing.assert_allclose(*poses, **ACCUMULATED)
+    assert float(jnp.abs(poses[1]).max()) > 1e-3
+
+
+def test_direct_optimisation_keeps_given_poses(tiny_walk, shaken) -> None:
+    data, unit = dm.mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask), shaken)
+    params = init(mapping_problem(dm.as_direct(SMALL), data), data, key=KEY).params
+    np.testing.assert_allclose(params.poses * np.array([unit, unit, 1.0]), shaken, rtol=1e-5, atol=1e-3)
 
 
 def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
-    rows = np.asarray(blocks_of_step(dm.preset("fast").warm_phases[0], 1000, jnp.int32(0), key=KEY))
+    rows, is_scan = map(np.asarray, blocks_of_step(dm.preset("fast").warm_phases[0], 1000, jnp.int32(0), key=KEY))
     assert rows.shape == (8, 32)
+    assert is_scan.all()
     assert (np.diff(rows, axis=1) == 1).all()
     assert rows.min() >= 0
     assert rows.max() < 1000
@@ -122,7 +220,7 @@ def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
 @pytest.mark.parametrize(("num_scans", "shape"), [(16, (1, 16)), (40, (1, 32)), (100, (3, 32))])
 def test_steps_of_few_scans_have_one_block(num_scans: int, shape: tuple[int, int]) -> None:
     phase = replace(dm.preset("fast").warm_phases[0], scans_per_step=num_scans)
-    rows = np.asarray(blocks_of_step(phase, 200, jnp.int32(0), key=KEY))
+    rows = np.asarray(blocks_of_step(phase, 200, jnp.int32(0), key=KEY).rows)
     assert rows.shape == shape
     assert (np.diff(rows, axis=1) == 1).all()
 
@@ -173,6 +271,8 @@ def test_unknown_presets_and_too_few_steps_are_refused() -> None:
         dm.preset("quick")
     with pytest.raises(ValueError, match="steps: expected at least one"):
         dm.with_steps(dm.preset("fast"), 1)
+    with pytest.raises(ValueError, match="num_epochs"):
+        replace(dm.preset("paper").cold_phases[0], num_steps=5)
 
 
 def test_scans_without_an_order_get_a_pointnet() -> None:

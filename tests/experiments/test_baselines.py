@@ -1,18 +1,23 @@
-"""Baselines that stand on other packages: swarms and Open3D's multiway registration."""
+"""Baselines: swarms, Open3D's multiway registration, and the plain chain of ICP."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 
+from dpmjax import chamfer_distance, metrics
+from dpmjax.deepmapping import preset
+from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments._baselines import Swarms, multiway, multiway_images, swarm_chain
+from experiments._baselines import Swarms, multiway, multiway_images, swarm_chain, swarm_poses
+from experiments._plain_icp import align, chain_icp
 from tests.optional import import_or_skip
 
 QUICK = Swarms(num_particles=24, num_iterations=30, num_rounds=1, num_beams=64)
@@ -59,6 +64,48 @@ def test_swarms_never_see_masked_beams(walk) -> None:
         for hidden in (0.0, 1e4)
     )
     np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("with_swarms")
+def test_swarms_over_all_poses_improve_with_time(walk) -> None:
+    config, scans = preset("fast"), scans_of(walk.take(np.arange(3)))
+    poses = [swarm_poses(scans, config, QUICK, cpu_s=seconds, key=jax.random.key(0)) for seconds in (0.0, 2.0)]
+    chain = [se2.transform_points(found, np.asarray(scans.points)) for found in poses]
+    misfits = [np.mean([float(chamfer_distance(a, b)) for a, b in itertools.pairwise(points)]) for points in chain]
+    assert misfits[1] <= misfits[0]
+    assert all((found[0] == 0.0).all() for found in poses)
+
+
+@pytest.mark.parametrize("metric", ["point", "plane"])
+def test_plain_chain_is_textbook_icp_composed(walk, metric) -> None:
+    poses = chain_icp(scans_of(walk), metric)
+    assert (poses[0] == 0.0).all()
+    one, other = (np.asarray(walk.points[k][walk.mask[k]], np.float64) for k in (1, 2))
+    step = align(other, one, metric, 1e-6)
+    np.testing.assert_allclose(se2.compose(poses[1], step), poses[2], atol=1e-3)
+    # At the end no pair of nearest points can be brought closer together.
+    moved = se2.transform_points(step, other)
+    nearest = one[np.linalg.norm(moved[:, None] - one, axis=-1).argmin(axis=1)]
+    if metric == "point":
+        R = metrics.align_rigid(moved, nearest)
+        np.testing.assert_allclose(R, np.eye(3), atol=2e-2)
+    assert (
+        np.linalg.norm(nearest - moved, axis=1).mean()
+        < np.linalg.norm(one[np.linalg.norm(other[:, None] - one, axis=-1).argmin(axis=1)] - other, axis=1).mean()
+    )
+
+
+@pytest.mark.parametrize("metric", ["point", "plane"])
+def test_plain_icp_finds_a_small_motion(metric) -> None:
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    target = np.column_stack([3.0 * np.cos(angle), np.sin(angle)]) + 0.3 * np.column_stack(
+        [np.cos(3 * angle), angle * 0]
+    )
+    pose = np.array([0.03, -0.02, 0.01])
+    source = se2.transform_points(se2.inverse(pose), target)
+    np.testing.assert_allclose(align(rng.permutation(source), target, metric, 1e-9), pose, atol=2e-3)
 
 
 @pytest.mark.usefixtures("with_open3d")

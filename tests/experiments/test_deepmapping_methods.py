@@ -33,10 +33,13 @@ from tests.optional import import_or_skip
 # ATE in px that each method stays below on the tiny walk; the start of all poses at zero has 14 px there. The direct
 # optimisation has two steps only: it must run and give poses.
 LARGEST_ATE_PX = {
+    "icp-point-plain": 10.0,
+    "icp-plane-plain": 3.0,
     "icp-point": 3.0,
     "icp-plane": 0.1,
     "icp-refined": 0.01,
     "multiway": 3.0,
+    "swarm-poses": 500.0,
     "particle-swarm": 10.0,
     "lnet-zero": 30.0,
     "lnet-icp": 0.1,

@@ -123,6 +123,25 @@ def test_ablations_change_one_thing_each() -> None:
             assert changed <= (2 if ablation == "mnet" else 1)
 
 
+def test_interval_of_the_median_draws_whole_trajectories() -> None:
+    trajectories = np.repeat(np.arange(10), 3)
+    values = np.random.default_rng(0).normal(size=30)
+    low, high = deepmapping_ablations.interval_of_median(values, trajectories.tolist())
+    assert low < np.median(values) < high
+    # Equal runs of a trajectory say nothing more than one of them.
+    repeated = deepmapping_ablations.interval_of_median(np.repeat(values[:10], 3), trajectories.tolist())
+    assert repeated == deepmapping_ablations.interval_of_median(values[:10], list(range(10)))
+    assert deepmapping_ablations.interval_of_median(values, [0] * 30) == [np.median(values)] * 2
+
+
+def test_scans_of_the_bare_network_have_the_heading_of_the_nearest_scan() -> None:
+    walk = simulate_sequence(0, 6, num_beams=16)
+    near = walk.reference_poses[[4, 1]] + np.array([0.1, -0.1, 2.0])
+    turned = deepmapping_relocalize.turn_to_nearest(near, walk)
+    np.testing.assert_array_equal(turned[:, :2], near[:, :2])
+    np.testing.assert_array_equal(turned[:, 2], walk.reference_poses[[4, 1], 2])
+
+
 def test_relocalization_tells_known_from_right_and_mapped() -> None:
     walk = simulate_sequence(0, 4, num_beams=16)
     truth = walk.reference_poses + np.array([0.0, 15.0, 0.0])

@@ -50,13 +50,14 @@ def test_weights_start_xavier_uniform_with_the_gain_of_relu() -> None:
     assert all(not np.asarray(x).any() for x in jax.tree.leaves(params) if x.ndim == 1)
 
 
-def test_convolution_is_that_of_the_textbook() -> None:
-    config = LocalizationNetConfig(features=(5,), strides=(2,), hidden=())
+@pytest.mark.parametrize("dilation", [2, 3])
+def test_convolution_is_that_of_the_textbook(dilation: int) -> None:
+    config = LocalizationNetConfig(features=(5,), strides=(2,), dilation=dilation, hidden=())
     net, points = LocalizationNet(config), jax.random.normal(KEY, (20, 2))
     params = jax.jit(net.init)(KEY, points, jnp.ones(20, bool))["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 2, 5)
-    padded = np.pad(np.asarray(points, np.float64), ((3, 3), (0, 0)))
-    features = np.array([sum(padded[b + 3 * k] @ weight[k] for k in range(3)) for b in range(0, 20, 2)])
+    padded = np.pad(np.asarray(points, np.float64), ((dilation, dilation), (0, 0)))
+    features = np.array([sum(padded[b + dilation * k] @ weight[k] for k in range(3)) for b in range(0, 20, 2)])
     expected = features.max(0) @ np.asarray(params["Dense_0"]["kernel"], np.float64)
     np.testing.assert_allclose(
         jax.jit(net.apply)({"params": params}, points, jnp.ones(20, bool)), expected, **ACCUMULATED
@@ -95,7 +96,7 @@ def test_circular_convolution_does_not_see_where_the_turn_begins() -> None:
 
 
 def test_image_convolution_is_that_of_the_textbook() -> None:
-    config = LocalizationNetConfig(features=(4,), strides=(2,), hidden=())
+    config = LocalizationNetConfig(features=(4,), strides=(2,), dilation=3, hidden=())
     net, points, mask = LocalizationNet(config), jax.random.normal(KEY, (6, 8, 3)), jnp.ones((6, 8), bool)
     params = jax.jit(net.init)(KEY, points, mask)["params"]
     weight = np.asarray(params["DilatedConvolution_0"]["Dense_0"]["kernel"], np.float64).reshape(3, 3, 3, 4)

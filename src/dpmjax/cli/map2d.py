@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -137,7 +137,8 @@ def register_sequence(
         if len(rows) < len(sequence):
             bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
-        return partial(recorder, measure=results.ate_of(fitted, geometry.typical_range(fitted.points, fitted.mask)))
+        unit = fit_settings(config, sequence).unit or geometry.typical_range(fitted.points, fitted.mask)
+        return partial(recorder, measure=results.ate_of(fitted, unit))
 
     def advance(share: float) -> None:
         bar.update(share - bar.n)
@@ -252,8 +253,10 @@ def registration_settings(config: Config, sequence: ScanSequence) -> registratio
 
 
 def fit_settings(config: Config, sequence: ScanSequence) -> deepmapping.DeepMappingConfig:
-    """Returns the preset, with the given number of steps."""
+    """Returns the preset, with the given number of steps; the unit of the paper is that of its worlds in pixels."""
     settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
+    if sequence.unit == "m":
+        settings = replace(settings, unit=None)
     return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
 
 
@@ -300,7 +303,9 @@ def read_map2d_run(path: Path) -> Map2dRun:
         raise ValueError(f"{path} is a run on {sequence.name}, in metres: give a run on a built-in world (--world)")
     settings = fit_settings(config, sequence)
     data, unit = deepmapping.mapping_data(
-        results.scan_set_of(sequence), None if config.init == "zero" else np.load(trajectory)
+        results.scan_set_of(sequence),
+        None if config.init == "zero" else np.load(trajectory),
+        unit=settings.unit,
     )
     problem = deepmapping.mapping_problem(settings, data)
     like = deepmapping.init(problem, data, key=jax.random.key(0))

@@ -34,6 +34,7 @@ from .mapping import register_depth as register_depth
 from .problem import MappingData as MappingData
 from .problem import Problem as Problem
 from .relocalization import Relocalized as Relocalized
+from .relocalization import propose_poses as propose_poses
 from .relocalization import relocalize as relocalize
 from .toy import Initialization as Initialization
 from .toy import ToyConfig as ToyConfig

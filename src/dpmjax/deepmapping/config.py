@@ -53,12 +53,13 @@ CHAMFER = ChamferComparison()
 
 @dataclass(frozen=True)
 class PhaseConfig:
-    """One phase of the fit. Lengths are in typical ranges; nine beams in ten are shorter than the typical range.
+    """One phase of the fit. Lengths are in units of the fit (`DeepMappingConfig.unit`), by default typical ranges; nine
+    beams in ten are shorter than the typical range.
 
     Attributes:
         name: name in logs and pictures.
         poses: "network": L-Net gives the poses; "free": the poses themselves are optimised.
-        num_steps: number of steps of Adam.
+        num_steps: number of steps of Adam; 0: `num_epochs` counts.
         occupancy_weight: gamma in gamma BCE + (1 - gamma) comparison; 0 leaves M-Net out.
         learning_rate: learning rate of L-Net or of the poses.
         final_learning_rate: learning rate at the end as a share of the first one, with a cosine schedule.
@@ -68,9 +69,11 @@ class PhaseConfig:
         num_offsets: number of later scans that each scan is compared to.
         max_offset: the largest distance in time of two scans that are compared; neighbours are always compared.
         num_free: number of free samples on each beam, drawn between sensor and hit.
-        is_sampled_as_published: True for the sampling of the published program: a free sample lies at the same share
-            of every beam, and batches follow each other in time. Otherwise the samples of each beam and the batches
-            are random.
+        num_epochs: number of times that all scans are used, from which the number of scans gives the number of steps;
+            0: `num_steps` counts.
+        is_as_published: True for batches that follow each other in time, the last one shorter; for free samples at the
+            same share of every beam; and for means of each scan (eq. 4), then over scans. Otherwise the batches and
+            the samples of each beam are random, and all points have the same weight.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
         comparison: method that compares pairs of scans. Only depth images can be compared by projection, and only
@@ -82,9 +85,10 @@ class PhaseConfig:
 
     name: str
     poses: Literal["network", "free"]
-    num_steps: int
     occupancy_weight: float
     learning_rate: float
+    num_steps: int = 0
+    num_epochs: int = 0
     final_learning_rate: float = 1.0
     adam_decay: tuple[float, float] = (0.9, 0.999)
     scans_per_step: int = 256
@@ -92,7 +96,7 @@ class PhaseConfig:
     num_offsets: int = 3
     max_offset: int = 3
     num_free: int = 1
-    is_sampled_as_published: bool = False
+    is_as_published: bool = False
     surface_distance: tuple[float, float] | None = None
     comparison: Comparison = CHAMFER
     scans_per_window: int | None = None
@@ -100,7 +104,10 @@ class PhaseConfig:
     def __post_init__(self) -> None:
         require_fields(self, "occupancy_weight", low=0, high=1)
         require_fields(self, "num_offsets", low=1, high=self.max_offset)
-        require_fields(self, "num_steps", low=1)
+        require_fields(self, "num_steps", low=0 if self.num_epochs else 1)
+        require_fields(self, "num_epochs", low=0)
+        if self.num_epochs and self.num_steps:
+            raise ValueError(f"num_epochs: expected 0 beside num_steps, got {self.num_epochs}")
         require_fields(self, "scans_per_step", "beams_per_step", low=2)
         if self.scans_per_window is not None:
             require_fields(self, "scans_per_window", low=2)
@@ -142,6 +149,7 @@ class DeepMappingConfig:
         warm_phases: phases of a fit from given poses.
         localization: shape of L-Net.
         occupancy: shape of M-Net.
+        unit: unit of length of networks and losses, in the unit of the points; None: the typical range of the scans.
         steps_per_call: the largest number of steps that are compiled into one call.
         map_margin: side of the map as a multiple of the extent of the scans at the start of a phase.
         motion: degrees of freedom of a depth camera; "full" for clouds.
@@ -151,10 +159,11 @@ class DeepMappingConfig:
     warm_phases: tuple[PhaseConfig, ...] = (REFINE,)
     localization: LocalizationNetConfig = field(
         default_factory=lambda: LocalizationNetConfig(
-            features=(32, 64, 128), strides=(1, 2, 2), is_circular=True, hidden=(128, 64), output_scale=0.1
+            features=(32, 64, 128), strides=(1, 2, 2), dilation=3, is_circular=True, hidden=(128, 64), output_scale=0.1
         )
     )
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
+    unit: float | None = None
     steps_per_call: int = 25
     map_margin: float = 1.15
     motion: Motion = "planar"
@@ -168,6 +177,8 @@ class DeepMappingConfig:
 
 def as_direct(config: DeepMappingConfig) -> DeepMappingConfig:
     """Returns settings of the paper's baseline: the same losses and steps, but free poses instead of L-Net.
+
+    From zero the poses start at the output of the untrained L-Net (supplement B).
 
     Args:
         config: settings of a fit.
@@ -196,10 +207,10 @@ def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
     def shorten(phases: tuple[PhaseConfig, ...]) -> tuple[PhaseConfig, ...]:
         if num_steps < len(phases):
             raise ValueError(f"steps: expected at least one for each of {len(phases)} phases, got {num_steps}")
-        total = sum(phase.num_steps for phase in phases)
+        total = max(1, sum(phase.num_steps for phase in phases))
         counts = [max(1, round(phase.num_steps * num_steps / total)) for phase in phases[:-1]]
         counts.append(max(1, num_steps - sum(counts)))
-        return tuple(replace(phase, num_steps=count) for phase, count in zip(phases, counts, strict=True))
+        return tuple(replace(p, num_steps=count, num_epochs=0) for p, count in zip(phases, counts, strict=True))
 
     cold, warm = shorten(config.cold_phases), shorten(config.warm_phases)
     return replace(config, cold_phases=cold, warm_phases=warm, steps_per_call=min(config.steps_per_call, num_steps))
@@ -208,17 +219,19 @@ def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
 # M-Net of the fast presets in space.
 _SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
 
-# Phase of the paper: 3000 epochs of two batches for 256 scans, all beams, 19 free samples, gamma 0.1, windows of 4.
+# Phase of the paper (section 4.1). With gamma = 1 / (1 + lambda), both losses have the ratio of eq. 6 with lambda = 10,
+# and Adam's steps do not depend on the common factor. The paper does not give the number of neighbours of eq. 7; the
+# published program has 3.
 JOINT = PhaseConfig(
     name="L-Net and M-Net",
     poses="network",
-    num_steps=6000,
-    occupancy_weight=0.1,
+    num_epochs=3000,
+    occupancy_weight=1.0 / 11.0,
     learning_rate=1e-3,
     scans_per_step=128,
     beams_per_step=1 << 30,
     num_free=19,
-    is_sampled_as_published=True,
+    is_as_published=True,
 )
 
 # Cold start of depth images.
@@ -251,10 +264,9 @@ REFINE_DEPTH = replace(
     comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
 )
 
-# Phase of the paper for depth images: all pixels, 35 free samples on each ray, gamma 0.9, comparison of neighbours.
-JOINT_DEPTH = replace(
-    JOINT, num_steps=3000, occupancy_weight=0.9, scans_per_step=256, num_offsets=1, max_offset=1, num_free=35
-)
+# Phase of the paper for depth images (section 4.2): lambda = 0.1, 35 free samples on each ray, batches of 8 images. As
+# in the published program, each image is compared to the next one.
+JOINT_DEPTH = replace(JOINT, occupancy_weight=1.0 / 1.1, scans_per_step=8, num_offsets=1, max_offset=1, num_free=35)
 
 # Cold start of clouds.
 LOCALIZE_CLOUDS = replace(LOCALIZE_DEPTH, num_steps=300, beams_per_step=256)
@@ -275,8 +287,8 @@ REFINE_CLOUDS = replace(
     comparison=PlaneComparison(width=(0.04, 0.002)),
 )
 
-# Losses and sampling of the paper, for clouds.
-JOINT_CLOUDS = replace(JOINT, num_steps=3000, scans_per_step=64, beams_per_step=2048)
+# Losses and sampling of the paper, for clouds, which it does not have.
+JOINT_CLOUDS = replace(JOINT, scans_per_step=64, beams_per_step=2048)
 
 
 _FAST: dict[str, DeepMappingConfig] = {
@@ -284,7 +296,7 @@ _FAST: dict[str, DeepMappingConfig] = {
     "depth": DeepMappingConfig(
         cold_phases=(LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH),
         warm_phases=(REFINE_DEPTH,),
-        localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), hidden=(128, 64)),
+        localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), dilation=3, hidden=(128, 64)),
         occupancy=_SPATIAL_GRID,
         steps_per_call=50,
         map_margin=1.2,
@@ -298,11 +310,12 @@ _FAST: dict[str, DeepMappingConfig] = {
         motion="full",
     ),
 }
-# Phase and L-Net of the paper for each sensor.
+# Phase, L-Net and unit of the paper for each sensor. Its worlds have a side of 1024 px, two units of the published
+# program; the unit of its depth images is 2 m.
 _PAPER = {
-    "planar": (JOINT, LocalizationNetConfig()),
-    "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4)),
-    "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point")),
+    "planar": (JOINT, LocalizationNetConfig(), 512.0),
+    "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4), 2.0),
+    "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point"), None),
 }
 
 
@@ -316,7 +329,9 @@ def preset(
     """Returns the settings of a preset.
 
     Args:
-        name: "fast" (seconds to a minute on two cores) or "paper" (its networks, losses and sampling).
+        name: "fast" (seconds to a minute on two cores) or "paper" (its networks, losses, sampling, epochs and unit).
+            The unit of planar scans is that of the paper's worlds, 512 px; for scans in metres use
+            `dataclasses.replace(preset("paper"), unit=None)`, or half of the side of the area.
         sensor: "planar" scans, "depth" images or lidar "clouds".
         motion: degrees of freedom of a depth camera.
         is_organised: False for planar scans whose beams have no order; L-Net is a PointNet then.
@@ -333,8 +348,8 @@ def preset(
     if sensor == "depth":
         config = replace(config, motion=motion)
     if name == "paper":
-        phase, net = _PAPER[sensor]
-        config = replace(config, cold_phases=(phase,), warm_phases=(phase,), steps_per_call=1)
+        phase, net, unit = _PAPER[sensor]
+        config = replace(config, cold_phases=(phase,), warm_phases=(phase,), unit=unit, steps_per_call=1)
         config = replace(config, localization=net, occupancy=OccupancyConfig())
     elif sensor == "depth" and motion == "full":
         # Real depth images in SE(3) do not agree to half a percent of the depth, and initial poses are less accurate.

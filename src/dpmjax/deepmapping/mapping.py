@@ -31,6 +31,8 @@ from dpmjax.types import ScanSet
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}
 # Kernel width, in typical ranges, of the misfit that compares the fit of clouds with its initial poses.
 _MISFIT_KERNEL_WIDTH = 0.004
+# A given unit of length is between the first of these shares and the second of the typical range.
+_UNIT_SHARES = 0.1, 10.0
 # Number of samples on a beam that mark cells as explored.
 _SAMPLES = 64
 
@@ -83,22 +85,32 @@ class Registered(NamedTuple):
     fitted: Fitted
 
 
-def mapping_data(scans: Scans | ArrayLike, start: ArrayLike | None = None) -> tuple[MappingData, float]:
-    """Checks scans and poses, and takes the typical range of the scans as the unit of length.
+def mapping_data(
+    scans: Scans | ArrayLike, start: ArrayLike | None = None, *, unit: float | None = None
+) -> tuple[MappingData, float]:
+    """Checks scans and poses, and scales both to the unit of length of the fit.
 
     Args:
         scans: DepthScans, CloudScans, or planar scans as `as_scan_set` takes them.
         start: initial poses: (n, 3) x, y, heading or (n, 3, 3) matrices of planar scans, else (n, 4, 4)
             T_world_scan; None: cold start.
+        unit: unit of length of the fit (`DeepMappingConfig.unit`); None: the typical range of the scans.
 
     Returns:
-        Data of the problem, and the typical range in the unit of the scans.
+        Data of the problem, and the unit of length, in the unit of the scans.
 
     Raises:
-        ValueError: the scans or the poses have a wrong shape or are not finite, or a scan has no valid beam.
+        ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or the unit
+            is more than ten times smaller or larger than the typical range.
     """
     checked = scans if isinstance(scans, DepthScans | CloudScans) else as_scan_set(scans)
-    unit, sensor = typical_range(checked.points, checked.mask), _SENSORS[type(checked)]
+    reach, sensor = typical_range(checked.points, checked.mask), _SENSORS[type(checked)]
+    unit = reach if unit is None else unit
+    if not _UNIT_SHARES[0] * reach <= unit <= _UNIT_SHARES[1] * reach:
+        raise ValueError(
+            f"unit: expected a length like the ranges of the scans, of which nine in ten are below {reach:.4g}, got "
+            f"{unit:.4g}; dataclasses.replace(config, unit=None) takes the ranges as unit"
+        )
     T_start = None if start is None else sensor.scaled_start(start, len(checked.points), unit)
     scaled = replace(checked, points=checked.points / unit)
     if isinstance(scaled, CloudScans):
@@ -115,7 +127,7 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
         data: data of `mapping_data`.
 
     Returns:
-        The problem; poses are as in `Fitted`, in typical ranges.
+        The problem; poses are as in `Fitted`, in units of the fit.
 
     Raises:
         ValueError: clouds move in the plane by these settings.
@@ -145,7 +157,8 @@ def fit_deepmapping(
             ScanSet, DepthScans (section 4.2) or CloudScans.
         config: settings; None: the fast preset of planar scans; `preset` has those of other sensors.
         key: key of the whole run.
-        start: initial poses, as `mapping_data` takes them; None: cold start from zero.
+        start: initial poses, as `mapping_data` takes them; None: cold start, of all poses at zero, or free poses at the
+            output of the untrained L-Net.
         engine: training function, called as `engine(problem, data, key=key)`;
             `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
 
@@ -157,7 +170,7 @@ def fit_deepmapping(
     """
     config = config or DeepMappingConfig()
     require_type("config", config, DeepMappingConfig, "DeepMappingConfig or preset")
-    data, unit = mapping_data(scans, start)
+    data, unit = mapping_data(scans, start, unit=config.unit)
     done = engine(mapping_problem(config, data), data, key=key)
     poses = _SENSORS[type(data.scans)].unscaled(done.poses, unit)
     return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))

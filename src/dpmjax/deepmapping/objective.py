@@ -21,7 +21,19 @@ from dpmjax.losses import chamfer_distance, occupancy_loss
 _BLOCK = 32
 
 
-def blocks_of_step(phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array) -> Int[Array, "w m"]:
+class Batch(NamedTuple):
+    """Scans of one step.
+
+    Attributes:
+        rows: (w, m) indices of the scans of each block, neighbours in time.
+        is_scan: (w, m) False for entries that fill a short last batch.
+    """
+
+    rows: Int[Array, "w m"]
+    is_scan: Bool[Array, "w m"]
+
+
+def blocks_of_step(phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, key: jax.Array) -> Batch:
     """Selects the scans of a step: all windows, or all scans if they are few, else random blocks of neighbours in time.
 
     Args:
@@ -31,18 +43,36 @@ def blocks_of_step(phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, 
         key: key of the step.
 
     Returns:
-        Indices of the scans of each block, neighbours in time.
+        The batch.
     """
+    if phase.scans_per_window is None and phase.is_as_published and num_scans > phase.scans_per_step:
+        # The published order: batches follow each other in time, and the last one is shorter.
+        first = step % num_batches(phase, num_scans) * phase.scans_per_step
+        rows = first + jnp.arange(phase.scans_per_step)[None]
+        return Batch(jnp.minimum(rows, num_scans - 1), rows < num_scans)
+    rows = _rows_of_step(phase, num_scans, key=key)
+    return Batch(rows, jnp.ones(rows.shape, bool))
+
+
+def num_batches(phase: PhaseConfig, num_scans: int) -> int:
+    """Returns the number of batches that follow each other in time, the steps of an epoch.
+
+    Args:
+        phase: phase of the fit.
+        num_scans: number of scans of the set.
+
+    Returns:
+        The number, at least 1.
+    """
+    return max(1, -(-num_scans // phase.scans_per_step))
+
+
+def _rows_of_step(phase: PhaseConfig, num_scans: int, *, key: jax.Array) -> Int[Array, "w m"]:
     if phase.scans_per_window is not None:
         return jnp.asarray(window_rows(num_scans, phase.scans_per_window))
     count = phase.scans_per_step
     if num_scans <= count:
         return jnp.arange(num_scans)[None]
-    if phase.is_sampled_as_published:
-        # The published order: batches follow each other in time. The last batch overlaps with the one before, so that
-        # all have one length and no scan is left out.
-        first = step % -(-num_scans // count) * count
-        return jnp.minimum(first, num_scans - count) + jnp.arange(count)[None]
     length = min(_BLOCK, count)
     first = jax.random.randint(key, (count // length, 1), 0, num_scans - length + 1)
     return first + jnp.arange(length)
@@ -111,12 +141,13 @@ MapLogits = Callable[[Float[Array, "n d"]], Float[Array, " n"]]
 
 
 class WorldBatch(NamedTuple):
-    """Scans of one step in the world frame, in the order of time; lengths in typical ranges.
+    """Scans of one step in the world frame, in the order of time; lengths in units of the fit.
 
     Attributes:
         points: (m, b, d) hits.
         sensors: (m, d) centres of the sensors.
         mask: (m, b) False for beams that measured nothing.
+        is_scan: (m,) False for entries that fill a short last batch; they take part in no mean.
         block_length: number of neighbours in time in each block of scans.
         progress: progress of the phase, 0 at its start, 1 at its end.
     """
@@ -124,6 +155,7 @@ class WorldBatch(NamedTuple):
     points: Float[Array, "m b d"]
     sensors: Float[Array, "m d"]
     mask: Bool[Array, "m b"]
+    is_scan: Bool[Array, " m"]
     block_length: int
     progress: Float[Array, ""]
 
@@ -133,7 +165,7 @@ class Terms(NamedTuple):
 
     Attributes:
         occupancy: eq. 4, in nats.
-        chamfer: eq. 7 divided by the number of pairs, in typical ranges; for images compared by projection, 1 less
+        chamfer: eq. 7 divided by the number of pairs, in units of the fit; for images compared by projection, 1 less
             the projective consistency; for clouds compared by planes, the misfit.
     """
 
@@ -167,7 +199,7 @@ def free_factors(world: WorldBatch, phase: PhaseConfig, *, key: jax.Array) -> Fl
     """
     uniform_key, surface_key = jax.random.split(key)
     shape = (*world.mask.shape, phase.num_free)
-    if phase.is_sampled_as_published:
+    if phase.is_as_published:
         factors = jnp.broadcast_to(jax.random.uniform(uniform_key, shape[2:]), shape)
     else:
         factors = jax.random.uniform(uniform_key, shape)
@@ -181,13 +213,17 @@ def free_factors(world: WorldBatch, phase: PhaseConfig, *, key: jax.Array) -> Fl
     return jnp.concatenate([factors, near[..., None]], axis=-1)
 
 
-def occupancy_term(world: WorldBatch, map_logits: MapLogits, factors: Float[Array, "m b s"]) -> Float[Array, ""]:
+def occupancy_term(
+    world: WorldBatch, map_logits: MapLogits, factors: Float[Array, "m b s"], *, has_equal_scans: bool = False
+) -> Float[Array, ""]:
     """Computes DeepMapping eq. 4: hits are occupied, samples on the beams are free; both means have the same weight.
 
     Args:
         world: the scans.
         map_logits: M-Net with its parameters.
         factors: positions of the free samples.
+        has_equal_scans: True for the means of each scan, averaged over the scans, as the equation has it. Otherwise all
+            points have the same weight.
 
     Returns:
         The binary cross entropy, in nats.
@@ -195,7 +231,10 @@ def occupancy_term(world: WorldBatch, map_logits: MapLogits, factors: Float[Arra
     free = jax.vmap(sample_free_space)(world.sensors, world.points, factors)
     num_hits, dimensions = world.mask.size, world.points.shape[-1]
     logits = map_logits(jnp.concatenate([world.points.reshape(-1, dimensions), free.reshape(-1, dimensions)]))
-    weights = world.mask.astype(logits.dtype)
+    mask = world.mask & world.is_scan[:, None]
+    weights = mask.astype(logits.dtype)
+    if has_equal_scans:
+        weights /= jnp.maximum(mask.sum(axis=-1, keepdims=True), 1)
     hit = occupancy_loss(logits[:num_hits], jnp.ones(()), weights.reshape(-1))
     free_weights = jnp.broadcast_to(weights[..., None], factors.shape).reshape(-1)
     return hit + occupancy_loss(logits[num_hits:], jnp.zeros(()), free_weights)
@@ -210,7 +249,7 @@ def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Compa
         comparison: comparison of the phase, with its limit of the distances.
 
     Returns:
-        The mean over all pairs, in typical ranges; 0 without a pair.
+        The mean over all pairs, in units of the fit; 0 without a pair.
 
     Raises:
         ValueError: the comparison is of another type.
@@ -223,7 +262,7 @@ def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Compa
 
     def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
         later = jnp.minimum(own + offset, num_scans - 1)
-        is_pair = own % world.block_length + offset < world.block_length
+        is_pair = (own % world.block_length + offset < world.block_length) & world.is_scan[later]
         distance = jax.vmap(partial(chamfer_distance, max_distance=max_distance))(
             world.points, world.points[later], world.mask, world.mask[later]
         )

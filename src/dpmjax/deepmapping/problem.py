@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -15,11 +15,14 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
-from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, occupancy_term
+from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, num_batches, occupancy_term
 from dpmjax.nets.mapping import make_map_net
 
 # Number of points that an MLP as M-Net evaluates at once: 16 MB for each layer of 512.
 _MLP_CHUNK = 1 << 13
+# Up to this number of points, the hidden layers are kept for the backward pass (6 KB a point). For more, they would
+# take gigabytes and are evaluated again, which makes a step a third longer.
+_MLP_KEPT = 1 << 18
 # Learning rates of M-Net; a step changes few nodes of a grid and all weights of an MLP.
 _MAP_LEARNING_RATE = {"grid": 0.1, "mlp": 1e-3}
 # Weight of the mean square of a grid's nodes.
@@ -57,7 +60,7 @@ class Problem:
 
 
 class MappingData(NamedTuple):
-    """Data of DeepMapping, in typical ranges.
+    """Data of DeepMapping, in units of the fit (`DeepMappingConfig.unit`), by default typical ranges.
 
     Attributes:
         scans: ScanSet, DepthScans or CloudScans.
@@ -72,7 +75,7 @@ class Sensor(NamedTuple):
     """Functions of DeepMapping that depend on the sensor: poses, and comparison of pairs of scans.
 
     Attributes:
-        scaled_start: (start, number of scans, unit) -> checked poses in typical ranges.
+        scaled_start: (start, number of scans, unit) -> checked poses in units of the fit.
         unscaled: (poses, unit) -> float64 poses in the unit of the points.
         init: function of `Problem`.
         loss: function of `Problem`.
@@ -90,7 +93,7 @@ class Sensor(NamedTuple):
 
 @flax.struct.dataclass
 class MapFrame:
-    """Square or cube of the world that maps to [-1, 1]^d, the domain of M-Net; in typical ranges."""
+    """Square or cube of the world that maps to [-1, 1]^d, the domain of M-Net; in units of the fit."""
 
     centre: Float[Array, " d"]
     half_side: Float[Array, ""]
@@ -98,7 +101,7 @@ class MapFrame:
 
 @flax.struct.dataclass
 class Params:
-    """Parameters of a fit; lengths in typical ranges, angles in radians.
+    """Parameters of a fit; lengths in units of the fit, angles in radians.
 
     Attributes:
         localization: weights of L-Net; with windows, a leading axis has one L-Net for each window.
@@ -116,16 +119,23 @@ class Params:
 
 
 def phases_of(config: DeepMappingConfig, data: MappingData) -> tuple[PhaseConfig, ...]:
-    """Returns the phases of a fit: cold from zero poses, or warm from given poses.
+    """Returns the phases of a fit: cold from zero poses, or warm from given poses; epochs are counted as steps.
 
     Args:
         config: settings of the fit.
         data: data with initial poses, or without.
 
     Returns:
-        The phases.
+        The phases, each with its number of steps.
     """
-    return config.cold_phases if data.start is None else config.warm_phases
+    num_scans = data.scans.mask.shape[0]
+
+    def count_steps(phase: PhaseConfig) -> PhaseConfig:
+        if not phase.num_epochs:
+            return phase
+        return replace(phase, num_steps=phase.num_epochs * num_batches(phase, num_scans), num_epochs=0)
+
+    return tuple(map(count_steps, config.cold_phases if data.start is None else config.warm_phases))
 
 
 def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
@@ -140,8 +150,9 @@ def make_optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.Gradi
     """
     decay = optax.cosine_decay_schedule(phase.learning_rate, phase.num_steps, phase.final_learning_rate)
     moving = optax.adam(decay, *phase.adam_decay)
-    map_rate = _MAP_LEARNING_RATE["grid" if config.occupancy.kind == "grid" else "mlp"]
-    map_adam = optax.adam(map_rate, 0.8 if phase.poses == "free" else 0.9, phase.adam_decay[1])
+    has_grid = config.occupancy.kind == "grid"
+    map_rate = _MAP_LEARNING_RATE["grid" if has_grid else "mlp"]
+    map_adam = optax.adam(map_rate, 0.8 if has_grid and phase.poses == "free" else 0.9, phase.adam_decay[1])
     labels: Any = Params(localization="network", poses="free", occupancy="map", start="fixed", frame="fixed")  # type: ignore[arg-type]
     return optax.multi_transform(
         {
@@ -181,7 +192,7 @@ def choose_frame(points_world: Float[Array, "... d"], mask: Array, margin: float
 
 
 def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Array, " l"] | None = None) -> MapLogits:
-    """Returns M-Net as a function of points in the world frame, in typical ranges.
+    """Returns M-Net as a function of points in the world frame, in units of the fit.
 
     Args:
         params: parameters of the fit.
@@ -199,12 +210,14 @@ def bind_map(params: Params, config: DeepMappingConfig, level_weights: Float[Arr
         local = (points - params.frame.centre) / params.frame.half_side
         if occupancy.kind == "grid" or len(points) <= _MLP_CHUNK:
             return apply(params.occupancy, local, weights)
-        # The hidden layers of all samples would take gigabytes, so parts are evaluated in turn and re-evaluated in the
-        # backward pass.
         count = -(-len(points) // _MLP_CHUNK)
         parts = jnp.pad(local, ((0, count * _MLP_CHUNK - len(points)), (0, 0))).reshape(count, _MLP_CHUNK, -1)
-        logits_of_parts = jax.lax.map(jax.checkpoint(lambda part: apply(params.occupancy, part, weights)), parts)
-        return logits_of_parts.reshape(-1)[: len(points)]
+
+        def logits_of(part: Float[Array, "c d"]) -> Float[Array, " c"]:
+            return apply(params.occupancy, part, weights)
+
+        is_kept = len(points) <= _MLP_KEPT
+        return jax.lax.map(logits_of if is_kept else jax.checkpoint(logits_of), parts).reshape(-1)[: len(points)]
 
     return logits
 
@@ -250,7 +263,8 @@ def mapping_loss(
     gamma, loss, occupancy = phase.occupancy_weight, pair_term, jnp.zeros(())
     if gamma > 0.0:
         logits = bind_map(params, config, level_weights(phase, config.occupancy.num_levels, world.progress))
-        occupancy = occupancy_term(world, logits, free_factors(world, phase, key=key))
+        factors = free_factors(world, phase, key=key)
+        occupancy = occupancy_term(world, logits, factors, has_equal_scans=phase.is_as_published)
         loss = gamma * occupancy + (1.0 - gamma) * pair_term
         if config.occupancy.kind == "grid":
             squares = sum(jnp.sum(x**2) for x in jax.tree.leaves(params.occupancy))

@@ -114,13 +114,17 @@ def _planar_init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -
         rows = window_rows(len(start), phase.scans_per_window)
         localization = jax.vmap(make_net)(jax.random.split(net_key, len(rows)))
         poses = start[rows] if phase.poses == "free" else start
-    return Params(
+    params = Params(
         localization=localization,
         poses=poses,
         occupancy=init_map_net(config.occupancy, key=map_key),
         start=start,
         frame=_planar_frame(config, scans, start),
     )
+    if phase.poses == "network" or data.start is not None:
+        return params
+    # The paper's direct baseline starts from the output of an untrained L-Net.
+    return replace(params, poses=_localize_all(config, phase, params, scans).reshape(poses.shape))
 
 
 def _planar_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array, "n 3"]) -> MapFrame:
@@ -141,15 +145,19 @@ def _planar_poses(
 ) -> Float[Array, "n 3"]:
     """Computes the poses of all planar scans (`Problem.poses`), from the same number of beams as in training."""
     scans, count = data.scans, data.scans.mask.shape[0]
-    poses = params.poses
-    if phase.poses == "network":
-        rows = np.arange(count)[None] if phase.scans_per_window is None else window_rows(count, phase.scans_per_window)
-        poses = _localize(config, phase, params, _thinned(scans, choose_beams(scans.mask.shape[1], phase)), rows)
+    poses = _localize_all(config, phase, params, scans) if phase.poses == "network" else params.poses
     return poses.reshape(count, 3) if phase.scans_per_window is None else join_windows(poses, count)
 
 
+def _localize_all(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: ScanSet
+) -> Float[Array, "w m 3"]:
+    """Computes the poses of all planar scans, window by window where there are windows, by L-Net."""
+    rows = window_rows(scans.mask.shape[0], phase.scans_per_window or scans.mask.shape[0])
+    return _localize(config, phase, params, _thinned(scans, choose_beams(scans.mask.shape[1], phase)), rows)
+
+
 def _thinned(scans: ScanSet, beams: Int[Array, " c"]) -> ScanSet:
-    """Returns the scans with these beams alone."""
     return ScanSet(scans.points[:, beams], scans.mask[:, beams])
 
 
@@ -180,21 +188,21 @@ def _planar_loss(
     beam_key, row_key = jax.random.split(batch_key)
     num_scans, num_beams = scans.mask.shape
     some = _thinned(scans, choose_beams(num_beams, phase, jax.random.randint(beam_key, (), 0, num_beams)))
-    rows = blocks_of_step(phase, num_scans, step, key=row_key)
+    rows, is_scan = blocks_of_step(phase, num_scans, step, key=row_key)
     if phase.poses == "network":
         poses = _localize(config, phase, params, some, rows)
     else:
         poses = params.poses[rows] if phase.scans_per_window is None else params.poses
     poses, flat = poses.reshape(-1, 3), rows.reshape(-1)
     points = se2.transform_points(poses, some.points[flat])
-    world = WorldBatch(points, poses[:, :2], some.mask[flat], rows.shape[1], progress)
+    world = WorldBatch(points, poses[:, :2], some.mask[flat], is_scan.reshape(-1), rows.shape[1], progress)
     free_key, offset_key = jax.random.split(loss_key)
     offsets = draw_offsets(phase, rows.shape[1] - 1, key=offset_key)
     return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)
 
 
 def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
-    """Checks initial poses x, y, heading and scales them from the unit of the points to typical ranges."""
+    """Checks initial poses x, y, heading and scales them from the unit of the points to that of the fit."""
     poses = se2.as_poses("start", start, num_scans) / [unit, unit, 1.0]
     _require_near_origin(poses[:, :2])
     return jnp.asarray(poses, jnp.float32)
@@ -207,7 +215,7 @@ def _require_near_origin(positions: NDArray[np.float64]) -> None:
 
 
 def _planar_unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
-    """Scales poses x, y, heading from typical ranges to the unit of the points."""
+    """Scales poses x, y, heading from the unit of the fit to that of the points."""
     return np.asarray(poses, np.float64) * [unit, unit, 1.0]
 
 
@@ -216,7 +224,7 @@ PLANAR = Sensor(_planar_start, _planar_unscaled, _planar_init, _planar_loss, _pl
 
 
 def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
-    """Checks initial poses and scales them from the unit of the points to typical ranges."""
+    """Checks initial poses and scales them from the unit of the points to that of the fit."""
     T = np.array(poses, np.float64)
     if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
         raise ValueError(f"start: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
@@ -226,7 +234,7 @@ def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array,
 
 
 def _unscaled(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
-    """Scales poses from typical ranges to the unit of the points."""
+    """Scales poses from the unit of the fit to that of the points."""
     T = np.array(poses, np.float64)
     T[..., :3, 3] *= unit
     return T
@@ -252,7 +260,7 @@ def _poses(
     data: MappingData,
     rows: Int[Array, " m"] | slice = _ALL,
 ) -> Float[Array, "m 4 4"]:
-    """Computes the poses of these scans, by default of all (`Problem.poses`): T_start @ motion, in typical ranges."""
+    """Computes the poses of these scans, by default of all (`Problem.poses`): T_start @ motion, in units of the fit."""
     return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
 
 
@@ -315,8 +323,13 @@ def _depth_loss(
     scans, progress = data.scans, step / phase.num_steps
     count = scans.mask.shape[0]
     sample = _draw_pixels(scans, phase.beams_per_step, key=batch_key)
-    T = _poses(config, phase, params, data)
-    world = WorldBatch(rigid.transform_points(T, sample.points), T[:, :3, 3], sample.mask, count, progress)
+    rows, is_scan = jnp.arange(count), jnp.ones(count, bool)
+    if phase.is_as_published:
+        (rows,), (is_scan,) = blocks_of_step(phase, count, step, key=batch_key)
+        sample, count = PixelSample(sample.points[rows], sample.mask[rows]), len(is_scan)
+    T = _poses(config, phase, params, data, rows)
+    points = rigid.transform_points(T, sample.points)
+    world = WorldBatch(points, T[:, :3, 3], sample.mask, is_scan, count, progress)
     free_key, offset_key = jax.random.split(loss_key)
     if isinstance(phase.comparison, ProjectiveComparison):
         tolerance = interpolate_log(phase.comparison.tolerance, progress)
@@ -354,7 +367,7 @@ def _cloud_loss(
     """Computes eq. 6 of DeepMapping for lidar clouds (`Problem.loss`): points by planes or the Chamfer distance."""
     row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
     scans, progress = data.scans, step / phase.num_steps
-    blocks = blocks_of_step(phase, scans.mask.shape[0], step, key=row_key)
+    blocks, is_scan = blocks_of_step(phase, scans.mask.shape[0], step, key=row_key)
     rows, length = blocks.reshape(-1), blocks.shape[1]
     offsets = draw_offsets(phase, length - 1, key=offset_key)
     comparison = phase.comparison
@@ -366,7 +379,7 @@ def _cloud_loss(
     samples = _draw_points(clouds, phase.beams_per_step, key=point_key)
     own = jnp.arange(len(rows))
     points = rigid.transform_points(T[own], samples.positions[own])
-    world = WorldBatch(points, T[own, :3, 3], samples.mask[own], length, progress)
+    world = WorldBatch(points, T[own, :3, 3], samples.mask[own], is_scan.reshape(-1), length, progress)
     if not isinstance(comparison, PlaneComparison):
         pair_term = chamfer_term(world, offsets, comparison)
     else:

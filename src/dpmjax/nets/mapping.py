@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import require_one_of, require_some
+from dpmjax.checks import require_fields, require_one_of, require_some
 
 # Xavier-uniform with the gain of ReLU, as in the published networks.
 HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
@@ -27,6 +27,7 @@ class LocalizationNetConfig:
         kind: "conv" for beams or pixels in order, "point" (PointNet, supplement A) for any set of points.
         features: channels of the layers before the maximum over the beams.
         strides: strides of the same layers; "point" ignores them.
+        dilation: distance of the three taps of a convolution along each axis, in beams or pixels.
         is_circular: the last beam is the neighbour of the first (a full turn); else zeros follow.
         hidden: channels of the layers after the maximum.
         output_scale: factor on the initial weights of the last layer; a small one lets all poses begin near zero.
@@ -35,18 +36,16 @@ class LocalizationNetConfig:
     kind: Literal["conv", "point"] = "conv"
     features: tuple[int, ...] = (64, 128, 1024)
     strides: tuple[int, ...] = (1, 1, 1)
+    dilation: int = 2
     is_circular: bool = False
     hidden: tuple[int, ...] = (512, 256)
     output_scale: float = 1.0
 
     def __post_init__(self) -> None:
         require_one_of("kind", self.kind, ("conv", "point"))
+        require_fields(self, "dilation", low=1)
         if self.kind == "conv" and len(self.strides) != len(self.features):
             raise ValueError(f"strides: expected one for each of {len(self.features)} layers, got {self.strides}")
-
-
-# Distance of the three taps of a convolution along each axis, in beams or pixels: that of the published program.
-_DILATION = 3
 
 
 class DilatedConvolution(nn.Module):
@@ -57,6 +56,7 @@ class DilatedConvolution(nn.Module):
 
     features: int
     stride: int
+    dilation: int
     is_circular: bool
 
     @nn.compact
@@ -70,11 +70,10 @@ class DilatedConvolution(nn.Module):
             Channels of every `stride`-th beam or pixel.
         """
         *size, _ = x.shape
-        padded = jnp.pad(
-            x, [(_DILATION, _DILATION)] * len(size) + [(0, 0)], mode="wrap" if self.is_circular else "constant"
-        )
+        apart = self.dilation
+        padded = jnp.pad(x, [(apart, apart)] * len(size) + [(0, 0)], mode="wrap" if self.is_circular else "constant")
         taps = [
-            padded[tuple(slice(k * _DILATION, k * _DILATION + n, self.stride) for k, n in zip(tap, size, strict=True))]
+            padded[tuple(slice(k * apart, k * apart + n, self.stride) for k, n in zip(tap, size, strict=True))]
             for tap in product(range(3), repeat=len(size))
         ]
         return nn.Dense(self.features, kernel_init=HE_LIKE)(jnp.concatenate(taps, axis=-1))
@@ -102,7 +101,7 @@ class LocalizationNet(nn.Module):
         for layer, features in enumerate(config.features):
             if config.kind == "conv":
                 stride = config.strides[layer]
-                x = DilatedConvolution(features, stride, config.is_circular)(x)
+                x = DilatedConvolution(features, stride, config.dilation, config.is_circular)(x)
                 mask = mask[(slice(None, None, stride),) * mask.ndim]
             else:
                 x = nn.Dense(features, kernel_init=HE_LIKE)(x)
