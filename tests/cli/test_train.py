@@ -27,7 +27,6 @@ from dpmjax.deeppointmap import (
     init_training,
     training_preset,
 )
-from dpmjax.deeppointmap.training.curriculum import stage_layouts
 from dpmjax.deeppointmap.training.loop import after_evaluation
 from dpmjax.weights import load_model
 from tests.deeppointmap import toy
@@ -46,12 +45,12 @@ class StopAfter:
         return int(self._left < 0)
 
 
-def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float = math.inf):
+def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, total_s: float = math.inf):
     folder.mkdir(exist_ok=True)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
     records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
-    return run_training(records, toy.store(), TRAINING, hooks, seed=0, plateau_s=plateau_s)
+    return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
 
 
 def num_steps(trained) -> int:
@@ -141,7 +140,7 @@ def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:
 def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_groups() -> None:
     settings = training_settings(Config(scans=96, groups=(32,)))
     assert settings.sampling.num_scans == 96
-    assert sum(map(sum, stage_layouts(32, settings.sampling)[0])) == 96
+    assert max(settings.layout_at(step, seed=0).num_scans for step in range(20)) == 96
     with pytest.raises(ValueError, match="num_scans: expected at least the largest group, 4, got 3"):
         training_settings(Config(scans=3, groups=(4,)))
 
@@ -220,11 +219,23 @@ def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> 
 
 
 @pytest.mark.slow
-def test_seconds_go_on_where_the_decay_begins(tmp_path: Path) -> None:
-    train(tmp_path, plateau_s=0.01)
+def test_a_training_ends_after_its_seconds_at_the_end_of_its_cosine(tmp_path: Path) -> None:
+    """The first step compiles and the second one shows the pace: then no second is left."""
+    train(tmp_path, total_s=0.01)
     rows = read_history(tmp_path / HISTORY)
-    assert 2 <= len(rows) < TRAINING.num_steps
+    assert len(rows) == 3 < TRAINING.num_steps
     assert np.all(np.diff([float(row["run_s"]) for row in rows]) > 0)
+    trained = train(tmp_path, is_resumed=True, total_s=3600.0)
+    assert num_steps(trained) == 3
+
+
+@pytest.mark.slow
+def test_a_resumed_training_that_finishes_takes_a_quarter_of_its_steps(tmp_path: Path) -> None:
+    train(tmp_path, stop_after=2)
+    trained = train(tmp_path, is_resumed=True, total_s=0.0)
+    assert num_steps(trained) == int(trained.progress.state.end) == 3
+    rates = [float(row["learning_rate"]) for row in read_history(tmp_path / HISTORY)]
+    assert rates[2] == pytest.approx(1e-5 + (1e-3 - 1e-5) * (1 + math.cos(math.pi * 0.5)) / 2, rel=1e-4)
 
 
 @pytest.mark.slow

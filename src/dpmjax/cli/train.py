@@ -87,9 +87,11 @@ class Config(ProcessOptions):
     town_length_m: Annotated[float, arg(metavar="M")] = 600.0
     """Length of the drive through each town."""
     hours: Annotated[float | None, arg(metavar="H")] = None
-    """Train for about H hours: the learning rate falls in the last part of them. Without it, the steps decide."""
+    """Train for about H hours, at most the steps of the preset: the learning rate falls until then. Without it, the
+    steps decide."""
     finish: FlagCreatePairsOff[bool] = False
-    """Let the learning rate fall from here on, and end: with --resume, a run that was planned longer ends well."""
+    """Let the learning rate fall faster from here on, and end: with --resume, a run that was planned longer ends
+    after a quarter of the steps it has done."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
     """Folder where prepared scans are kept between runs; 0.8 MB for each scan of `small`."""
     held_out_pairs: Annotated[int, arg(metavar="N")] = 60
@@ -139,8 +141,8 @@ def main(config: Config) -> None:
                 sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=length_m, on_wait=on_wait)
                 records = Records(folder, settings, sets, seed=config.seed, weights=first)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
-        plateau_s = plateau_seconds(config)
-        trained = run_training(records, store, settings, hooks, seed=config.seed, plateau_s=plateau_s)
+        total_s = 0.0 if config.finish else 3600 * (config.hours or math.inf)
+        trained = run_training(records, store, settings, hooks, seed=config.seed, total_s=total_s)
         if trained.stopped_by:
             stop.request(trained.stopped_by)
         bad = merged(store.bad)
@@ -175,13 +177,6 @@ def training_sources(config: Config, sampling: deeppointmap.SamplingConfig) -> l
         if (reason := deeppointmap.why_useless(io.open_lidar_sequence(path), sampling)) is not None:
             raise ValueError(f"--validate {path}: {reason}")
     return sources
-
-
-def plateau_seconds(config: Config) -> float:
-    """Returns the seconds of steps after which the learning rate falls; infinite where the steps decide."""
-    if config.finish:
-        return 0.0
-    return math.inf if config.hours is None else 3600 * config.hours * (1 - deeppointmap.DECAY_RATIO)
 
 
 def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:

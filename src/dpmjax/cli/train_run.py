@@ -165,7 +165,7 @@ class Records:
         total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
-        self.run_s = self.earlier_s
+        self.run_s, self._pace_s = self.earlier_s, math.nan
         self._seen: set[dpm.CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
@@ -188,6 +188,7 @@ class Records:
             values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
         measured = {name: f"{value:.7g}" for name, value in values.items()}
         self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
+        self._pace_s = record.speed.run_s / record.speed.num_steps if record.speed.num_steps else math.nan
         self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=round(self.run_s, 3), **measured)
         self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
         self._bar.total = int(progress.state.end)
@@ -196,6 +197,18 @@ class Records:
         if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
             self.save(progress)
             self._last_saved = time.perf_counter()
+
+    def steps_left(self, step: int, *, total_s: float) -> int:
+        """Returns the number of steps in the seconds that remain of `total_s`; 0 where the plan stays as it is.
+
+        Where `total_s` is 0, a quarter of the steps that were done before this call remain.
+        """
+        if total_s == 0:
+            first, end = int(self.start.state.step), int(self.start.state.end)
+            return min(max(1, math.ceil(first / 4)), end - first) if step == first else 0
+        if not math.isfinite(total_s) or math.isnan(self._pace_s):
+            return 0
+        return max(1, round((total_s - self.run_s) / self._pace_s))
 
     def save(self, progress: dpm.TrainingProgress) -> None:
         """Writes a checkpoint, and the best parameters where they have changed since the last one."""
@@ -234,18 +247,18 @@ def run_training(
     hooks: dpm.TrainingHooks,
     *,
     seed: int,
-    plateau_s: float = math.inf,
+    total_s: float = math.inf,
 ) -> dpm.Trained:
     """Returns the result of training, after saving its last state; one process has records.
 
-    After `plateau_s` seconds of steps, compilation and evaluation, those of earlier calls included, the decay of the
-    learning rate begins.
+    Training ends after about `total_s` seconds of steps, compilation and evaluation, those of earlier calls included;
+    with 0 it ends after a quarter of the steps that are done.
     """
     if records is None:
         return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
         hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
-        hooks = replace(hooks, finish=lambda: records.run_s >= plateau_s)
+        hooks = replace(hooks, steps_left=partial(records.steps_left, total_s=total_s))
         trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         return trained

@@ -58,7 +58,6 @@ from .scan_registration import match_clouds as match_clouds
 from .scan_registration import register as register
 from .scan_registration import register_clouds as register_clouds
 from .scan_registration import register_pairs as register_pairs
-from .training.curriculum import DECAY_RATIO as DECAY_RATIO
 from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import TrainingConfig as TrainingConfig
 from .training.curriculum import training_preset as training_preset

@@ -1,9 +1,8 @@
 """Settings of training: the stages of the curriculum, and the sizes of the maps in their samples.
 
-The sizes are a few fixed layouts for each stage, so that no step computes on empty rows. With groups
-of up to 4 scans, attention over padded maps costs 5 times as much as over the valid scans alone, and 13 times with up
-to 16. So the sizes of the groups are not drawn for each step. All layouts of a stage together have the proportions of
-the published draw, and the steps take the layouts in turn. Each layout compiles one step.
+Each step draws one size for all of its groups, and how it is split into two maps (DeepPointMap's published program).
+The arrays of a step have the capacity of the next powers of two, so that all sizes of a training need few compiled
+steps: up to 15 for maps of up to 16 scans.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -20,30 +19,34 @@ from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
-# Probability that a group is one pair of scans, in every stage.
+# Probability that all groups of a step are pairs of scans, whatever the stage; other steps may draw pairs, too.
 PAIR_PROBABILITY = 0.34
 
 # Smallest distance of a scan from its anchor, metres; nearer ones are too similar (published configuration).
 MIN_DISTANCE_M = 0.25
 
-# Share of the steps in which the learning rate falls, at the end (DeepPointMap's published configuration).
-DECAY_RATIO = 0.2
+LAYOUT_STREAM = 3105
 
-# Number of scans in the first and in the second map of a group.
-GroupShape = tuple[int, int]
 
-# The groups of one sample, small ones first.
-Layout = tuple[GroupShape, ...]
+class Layout(NamedTuple):
+    """Sizes of the groups of one sample, or their capacities.
 
-# Largest number of layouts of a stage, and of their scans together: a large sample has room for all sizes of groups.
-NUM_LAYOUTS, LAYOUT_SCANS = 4, 128
-# Golden ratio: any number of its multiples modulo 1 are spread evenly.
-GOLDEN = 0.6180339887498949
+    Attributes:
+        num_source: number of scans in the first map of each group, at most that of the second.
+        num_target: number of scans in the second map of each group.
+        num_groups: number of groups.
+        num_scans: number of scans of all groups.
+    """
+
+    num_source: int
+    num_target: int
+    num_groups: int
+    num_scans: int
 
 
 @dataclass(frozen=True)
 class CurriculumStage:
-    """A part of training with one size of groups. Each stage compiles one step for each of its layouts.
+    """A part of training with one largest size of groups.
 
     Attributes:
         max_group: largest number of scans in both maps of a group together; the published curriculum doubles it from 2
@@ -66,8 +69,8 @@ class SamplingConfig:
     Attributes:
         num_scans: capacity of one sample, all groups together.
         max_distance_m: largest distance of a scan of a group from its anchor, above `MIN_DISTANCE_M`.
-        max_side: largest number of scans of one map. Half of the groups in which one scan can stand against all others
-            are split so.
+        max_side: largest number of scans of one map. Half of the groups of at most this size are split into one scan
+            against all others.
     """
 
     num_scans: int = 32
@@ -92,9 +95,9 @@ class TrainingConfig:
         augment: augmentation of each scan. Each step draws a new motion for each scan.
         num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
         objective: losses.
-        learning_rate: learning rate after the warm-up and before the decay.
-        final_learning_rate: learning rate at the end of the decay.
-        warmup_steps: number of steps in which the learning rate rises from 0.
+        learning_rate: first value of the learning rate, which falls by a cosine over the whole training.
+        final_learning_rate: learning rate at the end.
+        warmup_steps: number of steps in which a factor of the learning rate rises from 0 to 1.
         max_gradient_norm: longer gradients are scaled down to this norm.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
@@ -149,17 +152,18 @@ class TrainingConfig:
             step -= stage.num_steps
         return self.curriculum[-1]
 
-    def layout_at(self, step: int) -> Layout:
-        """Finds the layout of a step; those of its stage take turns.
+    def layout_at(self, step: int, *, seed: int) -> Layout:
+        """Draws the sizes of the groups of a step, which all samples of its batch share.
 
         Args:
             step: number of the step, from 0.
+            seed: seed of the training.
 
         Returns:
-            The layout.
+            The layout, the same one every time.
         """
-        layouts = stage_layouts(self.stage_at(step).max_group, self.sampling)
-        return layouts[step % len(layouts)]
+        rng = np.random.default_rng([LAYOUT_STREAM, seed, step])
+        return draw_layout(self.stage_at(step).max_group, self.sampling, rng)
 
     def with_steps(self, num_steps: int) -> TrainingConfig:
         """Shortens or stretches all stages in proportion, none to less than one step.
@@ -256,44 +260,42 @@ PRESETS = {
 }
 
 
-@functools.cache
-def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
-    """Makes the layouts of a stage.
+def draw_layout(max_group: int, config: SamplingConfig, rng: np.random.Generator) -> Layout:
+    """Draws the size of all groups of a step, and its split (DeepPointMap's published program).
 
-    The published draw of a group: two scans with `PAIR_PROBABILITY`, else 2 to `max_group`, each number equally likely.
-    One half of the groups is split into one scan against all others; the second half is split anywhere. The losses
-    are symmetric, so the smaller map of a group is always the first.
+    The size is 2 with `PAIR_PROBABILITY`, else 2 to `max_group`, each number equally likely. The losses are symmetric,
+    so the smaller map of a group is always the first.
 
     Args:
         max_group: largest number of scans in both maps of a group together.
-        config: capacity of a sample, and proportions.
+        config: capacity of a sample, and of a map.
+        rng: source of the draws.
 
     Returns:
-        From 1 to `NUM_LAYOUTS` different layouts of at most `config.num_scans` scans each.
+        As many groups as a sample has room for.
     """
-    num_layouts = max(1, min(NUM_LAYOUTS, LAYOUT_SCANS // config.num_scans))
-    sizes = np.arange(2, max_group + 1)
-    shares = np.full(len(sizes), (1 - PAIR_PROBABILITY) / len(sizes))
-    shares[0] += PAIR_PROBABILITY
-    num_groups = max(1, round(num_layouts * config.num_scans / float(sizes @ shares)))
-    drawn = np.searchsorted(np.cumsum(shares) / shares.sum(), (np.arange(num_groups) + 0.5) / num_groups)
-    layouts: list[list[GroupShape]] = [[] for _ in range(num_layouts)]
-    room = [config.num_scans] * num_layouts
-    for number, size in enumerate(sorted(sizes[drawn].tolist(), reverse=True)):
-        emptiest = int(np.argmax(room))
-        # Where the last large group does not fit, a smaller one takes its place.
-        size = min(size, room[emptiest])
-        if size >= 2:
-            layouts[emptiest].append(_split(size, (number * GOLDEN) % 1, config))
-            room[emptiest] -= size
-    for layout, left in zip(layouts, room, strict=True):
-        layout.extend([(1, 1)] * (left // 2))
-    return tuple(dict.fromkeys(tuple(sorted(layout)) for layout in layouts))
-
-
-def _split(size: int, draw: float, config: SamplingConfig) -> GroupShape:
+    size = 2 if rng.random() < PAIR_PROBABILITY else int(rng.integers(2, max_group + 1))
+    is_scan_to_map = size <= config.max_side and rng.random() < 0.5
     least, most = max(1, size - config.max_side), min(size - 1, config.max_side)
-    if least == 1 and draw < 0.5:
-        return 1, size - 1
-    first = least + int((2 * draw % 1) * (most - least + 1))
-    return min(first, size - first), max(first, size - first)
+    first = 1 if is_scan_to_map else int(rng.integers(least, most + 1))
+    num_groups = config.num_scans // size
+    return Layout(min(first, size - first), max(first, size - first), num_groups, num_groups * size)
+
+
+@functools.cache
+def layout_capacity(layout: Layout, config: SamplingConfig) -> Layout:
+    """Finds the capacity of the arrays for a layout; each capacity compiles one step.
+
+    Args:
+        layout: sizes from `draw_layout`.
+        config: capacity of a sample, and of a map.
+
+    Returns:
+        The next power of two of each map, and room for the groups and scans of all layouts with these.
+    """
+    sides = [1 << (num - 1).bit_length() for num in (layout.num_source, layout.num_target)]
+    ranges = [range(side // 2 + 1, min(side, config.max_side) + 1) for side in sides]
+    sizes = {source + target for source in ranges[0] for target in ranges[1] if source + target <= config.num_scans}
+    num_groups = {size: config.num_scans // size for size in sizes}
+    num_scans = max(size * num for size, num in num_groups.items())
+    return Layout(ranges[0][-1], ranges[1][-1], max(num_groups.values()), num_scans)

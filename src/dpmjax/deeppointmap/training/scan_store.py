@@ -26,7 +26,12 @@ from jaxtyping import Array, Int
 from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
-from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import (
+    MIN_DISTANCE_M,
+    SamplingConfig,
+    TrainingConfig,
+    layout_capacity,
+)
 from dpmjax.deeppointmap.training.sampling import (
     PlacedScans,
     RegistrationSample,
@@ -307,7 +312,14 @@ class SampleMaker:
     """Makes the batch of any step; a context manager that ends its thread."""
 
     def __init__(
-        self, store: ScanStore, config: TrainingConfig, *, seed: int, num_samples: int = 1, first_sample: int = 0
+        self,
+        store: ScanStore,
+        config: TrainingConfig,
+        *,
+        seed: int,
+        num_samples: int = 1,
+        first_sample: int = 0,
+        num_in_step: int | None = None,
     ) -> None:
         """Starts the thread.
 
@@ -317,9 +329,11 @@ class SampleMaker:
             seed: seed of the run.
             num_samples: number of samples of a batch, one for each device of this process.
             first_sample: number of the first sample among the samples of all processes.
+            num_in_step: number of samples of all processes; None: this process is alone.
         """
         self._store, self._config, self._seed = store, config, seed
         self._numbers = range(first_sample, first_sample + num_samples)
+        self._num_in_step = num_in_step or num_samples
         self._thread = ThreadPoolExecutor(1)
 
     def __enter__(self) -> SampleMaker:
@@ -359,18 +373,19 @@ class SampleMaker:
     def _sample(self, step: int, number: int) -> RegistrationSample:
         rng = np.random.default_rng([SAMPLE_STREAM, self._seed, step, number])
         table, sampling = self._store.table, self._config.sampling
-        layout = self._config.layout_at(step)
+        layout = self._config.layout_at(step, seed=self._seed)
+        capacity = layout_capacity(layout, sampling)
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
         rows = np.concatenate([group.rows for group in groups if group is not None])
-        # The number of scans is always that of the layout: another number would be compiled again.
-        num_spare = sum(map(sum, layout)) - len(rows)
+        # The number of scans is always that of the capacity: another number would be compiled again.
+        num_spare = capacity.num_scans - len(rows)
         padded = np.concatenate([rows, np.full(num_spare, rows[0])])
         scans, placed = self._store.read(padded, self._config, rng)
         placed = PlacedScans(*(values[: len(rows)] for values in placed))
-        return RegistrationSample(scans, arrange_groups(groups, layout, placed))
+        return RegistrationSample(scans, arrange_groups(groups, capacity, placed))
 
     def _anchor(self, step: int, number: int) -> int:
-        # Every scan is the first anchor once in an epoch, in another order for each device.
-        epoch, place = divmod(step, len(self._store.table))
-        order = np.random.default_rng([EPOCH_STREAM, self._seed, epoch, number]).permutation(len(self._store.table))
+        # Every scan is a first anchor once in an epoch, whatever the number of devices.
+        epoch, place = divmod(step * self._num_in_step + number, len(self._store.table))
+        order = np.random.default_rng([EPOCH_STREAM, self._seed, epoch]).permutation(len(self._store.table))
         return int(order[place])
