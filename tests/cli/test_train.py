@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.cli import train_run
+from dpmjax.cli import train_preparation, train_run
 from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
@@ -256,7 +256,7 @@ def broken_drive() -> None:
 @pytest.mark.slow
 def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
     with pytest.raises(ValueError, match="no drive"):
-        train_run.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
+        train_preparation.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
 
 
 @pytest.mark.slow
@@ -274,5 +274,5 @@ def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, num_drive
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_run.prepare_sources([toy.drive] * num_drives, TRAINING, tmp_path, seed=0, on_wait=stop)
+        train_preparation.prepare_sources([toy.drive] * num_drives, TRAINING, tmp_path, seed=0, on_wait=stop)
     assert not list(tmp_path.iterdir())

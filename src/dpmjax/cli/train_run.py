@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import replace
 from functools import partial
-from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -82,56 +77,6 @@ def draw_sets(
         on_wait()
         sets.append(one())
     return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
-
-
-def prepare_sources(
-    sources: Sequence[cli.Source],
-    settings: dpm.TrainingConfig,
-    folder: Path,
-    *,
-    seed: int,
-    on_wait: Callable[[], object] = lambda: None,
-) -> list[dpm.PreparedDrive]:
-    """Returns all drives, each prepared in a process of its own and kept in `folder` for later runs.
-
-    `on_wait` is called every second, or after each scan of a single drive; an error of it ends the preparation.
-    """
-    prepare = partial(_prepare, settings=settings, folder=folder, seed=seed)
-    if len(sources) == 1:
-        with tqdm(desc="prepare scans", unit=" scans", dynamic_ncols=True) as bar:
-            return [prepare(sources[0], on_scan=lambda: (bar.update(1), on_wait()))]
-    # A fresh interpreter: a fork of a process that runs JAX may hang.
-    num_workers = min(len(sources), os.cpu_count() or 1)
-    with ProcessPoolExecutor(num_workers, get_context("spawn"), initializer=_begin_worker) as pool:
-        begun = [pool.submit(prepare, source) for source in sources]
-        with tqdm(desc="prepare scans", total=len(begun), unit=" drives", dynamic_ncols=True) as bar:
-            try:
-                remaining = set(begun)
-                while remaining:
-                    done, remaining = wait(remaining, timeout=1.0, return_when=FIRST_COMPLETED)
-                    for one in done:
-                        one.result()  # an error ends the preparation of all drives
-                    bar.update(len(done))
-                    on_wait()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in active_children():
-                    process.kill()
-                    process.join()
-                    for unfinished in folder.glob(f".*.npy.{process.pid}*"):
-                        unfinished.unlink()
-                raise
-        return [one.result() for one in begun]
-
-
-def _begin_worker() -> None:
-    # The device belongs to the process that trains, and so does the answer to Ctrl-C.
-    jax.config.update("jax_platforms", "cpu")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _prepare(source: cli.Source, *, settings: dpm.TrainingConfig, **options: Any) -> dpm.PreparedDrive:
-    return dpm.prepare_drive(source(), settings, **options)
 
 
 class Records:

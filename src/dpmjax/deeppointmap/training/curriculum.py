@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
+from dpmjax.deeppointmap.model import Initialization
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
@@ -24,6 +25,10 @@ PAIR_PROBABILITY = 0.34
 
 # Smallest distance of a scan from its anchor, metres; nearer ones are too similar (published configuration).
 MIN_DISTANCE_M = 0.25
+
+# Capacity of the pairs within 2 m of a descriptor, of which the published loss takes all. More need more memory; with
+# fewer, pairs of merged maps are left out.
+MAX_CLOSE = 64
 
 LAYOUT_STREAM = 3105
 
@@ -94,11 +99,20 @@ class TrainingConfig:
         sampling: choice of the scans of a sample.
         augment: augmentation of each scan. Each step draws a new motion for each scan.
         num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
+            0 prepares the scan anew at each use, which needs no disk and more processors.
+        thins_as_in_use: True: the points of a scan are thinned as for `encode`, in their order, and outliers are
+            removed. False: they are shuffled before the voxel filter, and outliers stay.
+        thins_maps: True: maps are thinned as in SLAM, to at most 1,024 descriptors. False: they keep all descriptors.
+        refines_labels: True: the scans of a group are aligned by ICP from their given poses (ours, as the published
+            program aligns pairs beforehand).
+        num_epochs: number of times that each scan is the first of a group; `train` computes the steps. None: the steps
+            are those of the curriculum.
+        initialization: random parameters before the first step, as for `init_model`.
         objective: losses.
         learning_rate: first value of the learning rate, which falls by a cosine over the whole training.
         final_learning_rate: learning rate at the end.
         warmup_steps: number of steps in which a factor of the learning rate rises from 0 to 1.
-        max_gradient_norm: longer gradients are scaled down to this norm.
+        max_gradient_norm: longer gradients are scaled down to this norm; infinity for none.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
     """
@@ -109,18 +123,28 @@ class TrainingConfig:
     )
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    num_variants: int = 4
-    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    num_variants: int = 0
+    thins_as_in_use: bool = False
+    thins_maps: bool = False
+    refines_labels: bool = False
+    num_epochs: float | None = None
+    initialization: Initialization = "uniform"
+    # The published loss takes all pairs within its radius.
+    objective: ObjectiveConfig = field(default_factory=lambda: ObjectiveConfig(max_close=MAX_CLOSE))
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-5
     warmup_steps: int = 0
-    max_gradient_norm: float = 35.0
+    max_gradient_norm: float = math.inf
     scans_at_once: int = 8
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm")
-        require_fields(self, "warmup_steps", low=0)
-        require_fields(self, "scans_at_once", "num_variants", low=1)
+        require_positive_fields(self, "learning_rate", "final_learning_rate")
+        require_fields(self, "warmup_steps", "num_variants", low=0)
+        require_fields(self, "scans_at_once", low=1)
+        require_one_of("initialization", self.initialization, get_args(Initialization))
+        for name, value in (("max_gradient_norm", self.max_gradient_norm), ("num_epochs", self.num_epochs)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: expected more than 0, got {value}")
         require_count("len(curriculum)", len(self.curriculum))
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:
@@ -172,12 +196,26 @@ class TrainingConfig:
             num_steps: about this many steps in all.
 
         Returns:
-            A new configuration.
+            A new configuration, whose steps no longer depend on the number of scans.
         """
         ratio = num_steps / self.num_steps
         stages = tuple(replace(stage, num_steps=max(1, round(stage.num_steps * ratio))) for stage in self.curriculum)
         warmup = min(round(self.warmup_steps * min(ratio, 1)), sum(stage.num_steps for stage in stages) - 1)
-        return replace(self, curriculum=stages, warmup_steps=warmup)
+        return replace(self, curriculum=stages, warmup_steps=warmup, num_epochs=None)
+
+    def for_scans(self, num_scans: int, *, num_samples: int = 1) -> TrainingConfig:
+        """Computes the steps of `num_epochs` for a data set.
+
+        Args:
+            num_scans: number of scans of all drives.
+            num_samples: number of samples of a step, one for each device.
+
+        Returns:
+            A configuration with fixed steps; the same one where `num_epochs` is None.
+        """
+        if self.num_epochs is None:
+            return self
+        return self.with_steps(math.ceil(self.num_epochs * num_scans / num_samples))
 
 
 # Parts that DeepPointMap's Table 2 leaves out.
@@ -237,6 +275,10 @@ PRESETS = {
         # Few steps need weaker augmentation, more positives, and a direct loss on the encoder.
         augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.3),
         objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
+        num_variants=4,
+        thins_as_in_use=True,
+        thins_maps=True,
+        initialization="normal",
         learning_rate=2e-3,
         warmup_steps=20,
         max_gradient_norm=5.0,
@@ -254,9 +296,13 @@ PRESETS = {
         warmup_steps=200,
         max_gradient_norm=10.0,
         num_variants=2,
+        thins_as_in_use=True,
+        thins_maps=True,
+        initialization="normal",
         scans_at_once=4,
     ),
-    "paper": TrainingConfig(),
+    # Steps of the curriculum: twelve epochs of 10,000 scans on one device.
+    "paper": TrainingConfig(num_epochs=12.0),
 }
 
 

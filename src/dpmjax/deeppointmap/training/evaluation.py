@@ -18,8 +18,9 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.scan_registration import trace_match
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig, training_pairs
+from dpmjax.deeppointmap.training.preparation import prepare_drive
 from dpmjax.deeppointmap.training.sampling import SampleScans
-from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drive
+from dpmjax.deeppointmap.training.scan_store import ScanStore
 from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
@@ -157,7 +158,7 @@ def draw_evaluation_pairs(
     rng = np.random.default_rng([PAIR_STREAM, seed])
     thinned = drive.take(slice(None, None, -(-len(drive) // max_scans)))
     pairs = tuple(_draw(thinned, num_pairs, kind, rng) for kind in kinds)
-    settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1)
+    settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1, thins_as_in_use=True)
     store = ScanStore([prepare_drive(thinned, settings)])
     scans, placed = store.read(np.arange(len(thinned)), settings, rng)
     return EvaluationPairs(scans, placed.T_world_scan, pairs, config.scale_m)

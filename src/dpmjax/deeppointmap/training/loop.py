@@ -188,13 +188,13 @@ def train(
 ) -> Trained:
     """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
-    Each scan is prepared once before the first step. With several processes (`join_processes`), each calls this
-    function with the same arguments; process 0 alone evaluates and reports.
+    Each scan is prepared before the first step, or at each use where `config.num_variants` is 0. With several processes
+    (`join_processes`), each calls this function with the same arguments; process 0 alone evaluates and reports.
 
     Args:
         drives: sequences with a true pose for each scan, such as `io.open_lidar_sequence` and
             `simulation.simulate_scenes` return; or scans that are prepared already.
-        config: settings of training; `training_preset` has three.
+        config: settings of training; `training_preset` has three. Its epochs are converted to steps.
         seed: seed of parameters, samples and augmentation.
         start: progress to continue from, of which that of process 0 counts; or a model with the first parameters;
             None begins with random ones.
@@ -214,10 +214,12 @@ def train(
         raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
     # Calibrations belong to the parameters that they were fitted for.
     config = replace(config, model=replace(config.model, calibration=None, overlap=None))
-    if not isinstance(start, TrainingProgress):
-        start = begin_training(config, seed=seed, start=start)
+    begun = start if isinstance(start, TrainingProgress) else begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
-    progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
+    config = config.for_scans(len(store.table), num_samples=jax.device_count())
+    if not isinstance(start, TrainingProgress):
+        begun = replace(begun, state=replace(begun.state, end=np.asarray(config.num_steps, np.int32)))
+    progress, stopped_by, speed = _run_steps(store, config, hooks, begun, seed=seed)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
     return Trained(_local(Model(params, config.model)), progress, stopped_by, speed)
 

@@ -142,7 +142,7 @@ class MapOfScans:
 
     Attributes:
         rows: rows of its scans in the sample; 0 where a map has fewer scans.
-        mask: False where a map has fewer scans or descriptors, and where `matching.thinned_mask` removes one.
+        mask: False where a map has fewer scans or descriptors, and where thinning removes one.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
 
@@ -208,13 +208,16 @@ class RegistrationSample:
     groups: GroupBatch
 
 
-def arrange_groups(groups: Sequence[Group | None], capacity: Layout, placed: PlacedScans) -> GroupBatch:
+def arrange_groups(
+    groups: Sequence[Group | None], capacity: Layout, placed: PlacedScans, *, thins: bool = True
+) -> GroupBatch:
     """Arranges groups as NumPy arrays, whose shapes depend on the capacity only.
 
     Args:
         groups: groups from `draw_groups`.
         capacity: capacity from `layout_capacity`.
         placed: the scans of all groups: the source of the first group, its target, the source of the second, ...
+        thins: True for maps without the descriptors that `matching.thinned_mask` removes.
 
     Returns:
         The groups.
@@ -232,7 +235,7 @@ def arrange_groups(groups: Sequence[Group | None], capacity: Layout, placed: Pla
     ]
     rows_of += [None] * (capacity.num_groups - len(rows_of))
     sources, targets = (
-        _maps_of_scans([None if rows is None else rows[side] for rows in rows_of], placed, capacity[side])
+        _maps_of_scans([None if rows is None else rows[side] for rows in rows_of], placed, capacity[side], thins)
         for side in (0, 1)
     )
     T = np.tile(np.eye(4), (len(rows_of), 1, 1))
@@ -254,7 +257,9 @@ def stack(trees: Sequence[TreeT]) -> TreeT:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def _maps_of_scans(rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedScans, capacity: int) -> MapOfScans:
+def _maps_of_scans(
+    rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedScans, capacity: int, thins: bool
+) -> MapOfScans:
     num_descriptors = placed.mask.shape[1]
     padded = np.zeros((len(rows), capacity), np.int32)
     mask = np.zeros((len(rows), capacity, num_descriptors), bool)
@@ -263,8 +268,8 @@ def _maps_of_scans(rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedS
         if scans is not None:
             padded[number, : len(scans)] = scans
             positions, is_there = placed.positions_world[scans].reshape(-1, 3), placed.mask[scans].reshape(-1)
-            thinned = thinned_mask(positions, is_there, num_descriptors)
-            mask[number, : len(scans)] = thinned.reshape(len(scans), -1)
+            kept = thinned_mask(positions, is_there, num_descriptors) if thins else is_there
+            mask[number, : len(scans)] = kept.reshape(len(scans), -1)
             T_world_first = placed.T_world_scan[scans[0]]
             T_map_scan[number, : len(scans)] = rigid.inverse(T_world_first) @ placed.T_world_scan[scans]
     return MapOfScans(padded, mask, T_map_scan)

@@ -43,8 +43,8 @@ from dpmjax.types import AnyArray, DescriptorCloud
 # Groups of about this many scans are decoded at the same time, or of as many scans as are encoded at the same time.
 GROUP_SCANS_AT_ONCE = 16
 
-# Largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans, and attention over all
-# of them would cost twenty times as much.
+# Largest number of descriptors of a thinned map (ours). Thinning leaves a fifth of a map of 16 scans, and attention
+# over all of them would cost twenty times as much.
 MAX_DESCRIPTORS = 1024
 
 # Weight decay of AdamW.
@@ -101,7 +101,7 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
     Returns:
         The state.
     """
-    params = init_model(key, config.model).params
+    params = init_model(key, config.model, distribution=config.initialization).params
     return TrainingState(
         params=params,
         optimizer=_optimizer(config).init(params),
@@ -123,9 +123,11 @@ def finish(state: TrainingState, num_steps: int) -> TrainingState:
         The state with its new end.
     """
     require_count("num_steps", num_steps)
-    plan = {name: np.asarray(getattr(state, name)) for name in ("step", "end", "planned_at", "planned_progress")}
+    plan: dict[str, Any] = {
+        name: np.asarray(getattr(state, name)) for name in ("step", "end", "planned_at", "planned_progress")
+    }
     progress = np.asarray(_progress(replace(state, **plan)))
-    end = plan["step"] + np.int32(num_steps)
+    end = np.asarray(plan["step"] + num_steps, np.int32)
     return replace(state, end=end, planned_at=plan["step"], planned_progress=progress)
 
 
@@ -180,11 +182,12 @@ def batch_loss(
 
     def of_sample(sample: RegistrationSample) -> tuple[Array, ObjectiveTerms]:
         clouds = _in_parts(functools.partial(encode_sample, model), sample.scans, config.scans_at_once)
+        merged = functools.partial(_merged, thins=config.thins_maps)
         in_groups = max(GROUP_SCANS_AT_ONCE, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
             # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
-            maps, T = (_merged(clouds, group.source), _merged(clouds, group.target)), group.T_target_source
+            maps, T = (merged(clouds, group.source), merged(clouds, group.target)), group.T_target_source
             correlated = correlate(model, *maps)
             close = training_pairs(*maps, T, config=config.objective)
             sides = zip(maps, correlated, correlated[::-1], close, strict=True)
@@ -251,10 +254,10 @@ def _side(
     )
 
 
-def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
+def _merged(clouds: DescriptorCloud, scans: MapOfScans, *, thins: bool) -> DescriptorCloud:
     chosen: DescriptorCloud = jax.tree.map(lambda x: x[scans.rows], clouds)
     union = merge_clouds(replace(chosen, mask=chosen.mask & scans.mask), scans.T_map_scan)
-    if len(union.mask) <= MAX_DESCRIPTORS:
+    if not thins or len(union.mask) <= MAX_DESCRIPTORS:
         return union
     # Valid rows stand in front, those of the nearest scan first.
     order = jnp.argsort(~union.mask, stable=True)[:MAX_DESCRIPTORS]
@@ -265,7 +268,7 @@ def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
 def _progress(state: TrainingState) -> Float[Array, ""]:
     length = jnp.maximum(state.end - state.planned_at, 1)
     share = jnp.clip((state.step - state.planned_at) / length, 0, 1).astype(jnp.float32)
-    return state.planned_progress + (1 - state.planned_progress) * share
+    return jnp.asarray(state.planned_progress + (1 - state.planned_progress) * share)
 
 
 def _learning_rate(state: TrainingState, config: TrainingConfig) -> Float[Array, ""]:
