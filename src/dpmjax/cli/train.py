@@ -87,7 +87,7 @@ class Config(ProcessOptions):
     decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 600.0
+    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the drive through each town."""
     refine_labels: FlagCreatePairsOff[bool] = False
     """Align the scans of each group by point-to-plane ICP, from the given poses: for drives whose poses are decimetres
@@ -99,7 +99,7 @@ class Config(ProcessOptions):
     """Let the learning rate fall faster from here on, and end: with --resume, a run that was planned longer ends
     after a quarter of the steps it has done."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
-    """Folder where prepared scans are kept between runs: 0.7 MB for each scan of `tiny`, 0.5 MB of `small`. The needed
+    """Folder where prepared scans are kept between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The needed
     and the free space are printed first."""
     variants: Annotated[int | None, arg(metavar="N")] = None
     """Prepare each scan N times and choose among these; fewer need less disk, 0.8 MB for each of `paper`. 0: prepare it
