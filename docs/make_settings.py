@@ -118,10 +118,12 @@ SLAM = Group("SLAM", (
 TRAINING = Group("Training", (
     Section("TrainingConfig", "dpmjax.deeppointmap", "`train(drives, training_preset('small'))`", {
         "curriculum": ("", "stages of `CurriculumStage(max_group, num_steps)`; `config.with_steps(n)` scales all"),
-        "num_variants": ("variants", "more augmented variants of each scan: more disk, less overfitting"),
+        "num_epochs": ("epochs", "instead of the steps of the curriculum: passes over all scans"),
+        "num_variants": ("variants", "more variants of each scan: more disk, less overfitting; 0: new ones each time"),
+        "refines_labels": ("", "True where poses of neighbours are decimetres off"),
         "learning_rate": ("", "lower (1e-4) to tune trained weights on few scans"),
-        "final_learning_rate": ("", "at the end of the decay"),
-        "max_gradient_norm": ("", "lower if the loss jumps"),
+        "final_learning_rate": ("", "at the end of the cosine"),
+        "max_gradient_norm": ("", "10 if the loss jumps"),
         "scans_at_once": ("scans", "more on a GPU, fewer if memory is short"),
     }),
     Section("SamplingConfig", "dpmjax.deeppointmap", "`TrainingConfig(sampling=...)`", {

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import errno
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-from dpmjax.cli import train_run
+from dpmjax.cli import train_preparation, train_run
 from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
-from dpmjax.cli.train import NAME, Config, main, training_settings
+from dpmjax.cli.train import NAME, Config, for_devices, main, training_settings
 from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
@@ -25,9 +27,9 @@ from dpmjax.deeppointmap import (
     draw_evaluation_pairs,
     init_model,
     init_training,
+    prepare_drive,
     training_preset,
 )
-from dpmjax.deeppointmap.training.curriculum import stage_layouts
 from dpmjax.deeppointmap.training.loop import after_evaluation
 from dpmjax.weights import load_model
 from tests.deeppointmap import toy
@@ -46,12 +48,12 @@ class StopAfter:
         return int(self._left < 0)
 
 
-def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float = math.inf):
+def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, total_s: float = math.inf):
     folder.mkdir(exist_ok=True)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
     records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
-    return run_training(records, toy.store(), TRAINING, hooks, seed=0, plateau_s=plateau_s)
+    return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
 
 
 def num_steps(trained) -> int:
@@ -124,6 +126,9 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
     [
         ({"steps": 1}, "--steps"),
         ({"num_towns": 0}, "--num-towns"),
+        ({"epochs": 0.0}, "--epochs"),
+        ({"epochs": 3.0, "steps": 100}, "--epochs: expected without --steps"),
+        ({"variants": -1}, "--variants"),
         ({"town_length_m": 5.0}, "--town-length-m"),
         ({"weights": "dpm_small", "frame": "local"}, "--frame"),
     ],
@@ -141,9 +146,18 @@ def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:
 def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_groups() -> None:
     settings = training_settings(Config(scans=96, groups=(32,)))
     assert settings.sampling.num_scans == 96
-    assert sum(map(sum, stage_layouts(32, settings.sampling)[0])) == 96
+    assert max(settings.layout_at(step, seed=0).num_scans for step in range(20)) == 96
     with pytest.raises(ValueError, match="num_scans: expected at least the largest group, 4, got 3"):
         training_settings(Config(scans=3, groups=(4,)))
+
+
+def test_the_paper_trains_for_epochs_and_options_have_its_values_as_defaults() -> None:
+    paper = training_settings(Config(preset="paper"))
+    assert (paper.num_epochs, paper.num_variants, paper.refines_labels) == (12, 0, False)
+    assert training_settings(Config(preset="paper", steps=500)).num_epochs is None
+    changed = training_settings(Config(preset="paper", epochs=3, variants=2, refine_labels=True))
+    assert (changed.num_epochs, changed.num_variants, changed.refines_labels) == (3, 2, True)
+    assert for_devices(changed, 1000).num_steps == 3000 // jax.device_count()
 
 
 def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,11 +234,23 @@ def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> 
 
 
 @pytest.mark.slow
-def test_seconds_go_on_where_the_decay_begins(tmp_path: Path) -> None:
-    train(tmp_path, plateau_s=0.01)
+def test_a_training_ends_after_its_seconds_at_the_end_of_its_cosine(tmp_path: Path) -> None:
+    """The first step compiles and the second one shows the pace: then no second is left."""
+    train(tmp_path, total_s=0.01)
     rows = read_history(tmp_path / HISTORY)
-    assert 2 <= len(rows) < TRAINING.num_steps
+    assert len(rows) == 3 < TRAINING.num_steps
     assert np.all(np.diff([float(row["run_s"]) for row in rows]) > 0)
+    trained = train(tmp_path, is_resumed=True, total_s=3600.0)
+    assert num_steps(trained) == 3
+
+
+@pytest.mark.slow
+def test_a_resumed_training_that_finishes_takes_a_quarter_of_its_steps(tmp_path: Path) -> None:
+    train(tmp_path, stop_after=2)
+    trained = train(tmp_path, is_resumed=True, total_s=0.0)
+    assert num_steps(trained) == int(trained.progress.state.end) == 3
+    rates = [float(row["learning_rate"]) for row in read_history(tmp_path / HISTORY)]
+    assert rates[2] == pytest.approx(1e-5 + (1e-3 - 1e-5) * (1 + math.cos(math.pi * 0.5)) / 2, rel=1e-4)
 
 
 @pytest.mark.slow
@@ -245,7 +271,7 @@ def broken_drive() -> None:
 @pytest.mark.slow
 def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
     with pytest.raises(ValueError, match="no drive"):
-        train_run.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
+        train_preparation.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
 
 
 @pytest.mark.slow
@@ -257,11 +283,39 @@ def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
         train_run.draw_sets(TRAINING, 2, [], length_m=100.0, on_wait=stop)
 
 
+def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=100_000))
+    with pytest.raises(ValueError, match=r"^--cache .*: 24 scans of .* need .* --variants 1 needs") as refused:
+        train_preparation.prepare_sources([toy.drive], TRAINING, tmp_path / "new", seed=0)
+    assert "\n" not in str(refused.value)
+    assert not list(tmp_path.iterdir())
+    (drive,) = train_preparation.prepare_sources([toy.drive], replace(TRAINING, num_variants=0), tmp_path, seed=0)
+    assert len(drive.pyramids) == 24
+    assert "nothing is kept on disk" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_long_drive_is_prepared_in_parts_as_in_one(tmp_path, monkeypatch, capsys) -> None:
+    """Twice the same drive is one file; the bar counts scans, and a second call finds the file."""
+    monkeypatch.setattr(train_preparation, "MIN_PART", 7)
+    alone = prepare_drive(toy.drive(), TRAINING)
+    for _ in range(2):
+        found = train_preparation.prepare_sources([toy.drive] * 2, TRAINING, tmp_path, seed=0)
+        for drive in found:
+            np.testing.assert_array_equal(np.load(drive.pyramids), alone.pyramids)
+            assert drive.bad == alone.bad
+    told = capsys.readouterr()
+    assert told.out.count("prepares 24 scans of 0.0") == 1
+    assert "24/24" in told.err
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".npy"]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("num_drives", [1, 2])
 def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, num_drives: int) -> None:
     def stop() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_run.prepare_sources([toy.drive] * num_drives, TRAINING, tmp_path, seed=0, on_wait=stop)
+        train_preparation.prepare_sources([toy.drive] * num_drives, TRAINING, tmp_path, seed=0, on_wait=stop)
     assert not list(tmp_path.iterdir())

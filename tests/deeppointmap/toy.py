@@ -44,6 +44,10 @@ TRAINING = TrainingConfig(
     model=MODEL,
     curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)),
     sampling=SamplingConfig(num_scans=6, max_side=2),
+    num_variants=4,
+    thins_as_in_use=True,
+    thins_maps=True,
+    initialization="normal",
     objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
 )
 

@@ -32,6 +32,7 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import cli, deeppointmap, io, simulation, viz, weights
+from dpmjax.sequences import LidarSequence
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
@@ -77,6 +78,8 @@ class Config(ProcessOptions):
     preset decides."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
+    epochs: Annotated[float | None, arg(metavar="N")] = None
+    """Train until each scan was N times the first of a group, instead of --steps; `paper` takes 12, as published."""
     groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
     """Largest group of scans of each stage of the curriculum, such as 8 16 8 16; without it, the preset decides."""
     scans: Annotated[int | None, arg(metavar="N")] = None
@@ -84,14 +87,23 @@ class Config(ProcessOptions):
     decides."""
     num_towns: Annotated[int, arg(metavar="N")] = 4
     """How many towns to train on, where town is among the data."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 600.0
+    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the drive through each town."""
+    refine_labels: FlagCreatePairsOff[bool] = False
+    """Align the scans of each group by point-to-plane ICP, from the given poses: for drives whose poses are decimetres
+    off between neighbours."""
     hours: Annotated[float | None, arg(metavar="H")] = None
-    """Train for about H hours: the learning rate falls in the last part of them. Without it, the steps decide."""
+    """Train for about H hours, at most the steps of the preset: the learning rate falls until then. Without it, the
+    steps decide."""
     finish: FlagCreatePairsOff[bool] = False
-    """Let the learning rate fall from here on, and end: with --resume, a run that was planned longer ends well."""
+    """Let the learning rate fall faster from here on, and end: with --resume, a run that was planned longer ends
+    after a quarter of the steps it has done."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
-    """Folder where prepared scans are kept between runs; 0.8 MB for each scan of `small`."""
+    """Folder where prepared scans are kept between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The needed
+    and the free space are printed first."""
+    variants: Annotated[int | None, arg(metavar="N")] = None
+    """Prepare each scan N times and choose among these; fewer need less disk, 0.8 MB for each of `paper`. 0: prepare it
+    anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
     held_out_pairs: Annotated[int, arg(metavar="N")] = 60
     """Pairs of each kind of the held-out town that recall is reported on."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
@@ -102,9 +114,14 @@ class Config(ProcessOptions):
     def __post_init__(self) -> None:
         """Checks ranges."""
         cli.check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2, scans=2)
+        cli.check_least(self, variants=0)
         cli.check_least(self, town_length_m=100, num_processes=1, process_id=0)
         if self.hours is not None and not 0 < self.hours < math.inf:
             raise ValueError(f"--hours: expected more than 0, got {self.hours}")
+        if self.epochs is not None and not 0 < self.epochs < math.inf:
+            raise ValueError(f"--epochs: expected more than 0, got {self.epochs}")
+        if self.steps is not None and self.epochs is not None:
+            raise ValueError("--epochs: expected without --steps; give one of the two")
         if not self.data:
             raise ValueError("--data: expected town or a folder of scans")
         if self.weights is not None and self.frame is not None:
@@ -119,12 +136,13 @@ def main(config: Config) -> None:
     join_processes(config.coordinator, config.num_processes, config.process_id)
     if config.coordinator is not None:  # not before the processes have found each other
         cli.select_device(config.device)
-    from dpmjax.cli.train_run import Records, draw_sets, prepare_sources, run_training
+    from dpmjax.cli.train_preparation import prepare_sources
+    from dpmjax.cli.train_run import Records, draw_sets, run_training
 
     with together():
         first = None if config.weights is None else weights.load_model(config.weights)
         settings = training_settings(config, first)
-        sources = training_sources(config, settings.sampling)
+        sources = training_sources(config, settings)
         folder = cli.open_run_folder(config, NAME) if is_first() else None
     with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
         with together():
@@ -132,6 +150,7 @@ def main(config: Config) -> None:
             on_wait = stop.end_if_requested if config.coordinator is None else lambda: None
             drives = prepare_sources(sources, settings, config.cache, seed=config.seed, on_wait=on_wait)
             store = deeppointmap.ScanStore(drives)
+            settings = for_devices(settings, len(store.table))
             records = None
             if folder is not None:
                 print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
@@ -139,8 +158,8 @@ def main(config: Config) -> None:
                 sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=length_m, on_wait=on_wait)
                 records = Records(folder, settings, sets, seed=config.seed, weights=first)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
-        plateau_s = plateau_seconds(config)
-        trained = run_training(records, store, settings, hooks, seed=config.seed, plateau_s=plateau_s)
+        total_s = 0.0 if config.finish else 3600 * (config.hours or math.inf)
+        trained = run_training(records, store, settings, hooks, seed=config.seed, total_s=total_s)
         if trained.stopped_by:
             stop.request(trained.stopped_by)
         bad = merged(store.bad)
@@ -166,10 +185,13 @@ def main(config: Config) -> None:
         print_summary(folder, metrics)
 
 
-def training_sources(config: Config, sampling: deeppointmap.SamplingConfig) -> list[cli.Source]:
+def training_sources(config: Config, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
     """Returns the drives of --data; a drive of --validate or --data that has no pairs of scans raises a ValueError."""
+    sampling = settings.sampling
     town = partial(simulation.simulate_drive, length_m=config.town_length_m, mixture=simulation.TRAINING_MIXTURE)
-    towns = [partial(town, config.seed + number) for number in range(config.num_towns)]
+    towns: list[cli.Source] = [partial(town, config.seed + number) for number in range(config.num_towns)]
+    if settings.num_variants == 0:  # scans that are read at each use are simulated once
+        towns = [partial(kept_drive, source, config.cache) for source in towns]
     sources = cli.find_sources(config.data, towns, sampling)
     for path in config.validate:
         if (reason := deeppointmap.why_useless(io.open_lidar_sequence(path), sampling)) is not None:
@@ -177,11 +199,16 @@ def training_sources(config: Config, sampling: deeppointmap.SamplingConfig) -> l
     return sources
 
 
-def plateau_seconds(config: Config) -> float:
-    """Returns the seconds of steps after which the learning rate falls; infinite where the steps decide."""
-    if config.finish:
-        return 0.0
-    return math.inf if config.hours is None else 3600 * config.hours * (1 - deeppointmap.DECAY_RATIO)
+def kept_drive(source: cli.Source, folder: Path) -> LidarSequence:
+    """Returns a drive whose scans are kept in a folder from their first reading on."""
+    return cli.keep_scans(source(), folder)
+
+
+def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppointmap.TrainingConfig:
+    """Returns settings whose epochs are steps: all devices together pass once over the scans in an epoch."""
+    import jax
+
+    return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
 def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
@@ -195,6 +222,9 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
+    settings = replace(settings, refines_labels=config.refine_labels)
+    if config.variants is not None:
+        settings = replace(settings, num_variants=config.variants)
     stages = settings.curriculum
     if config.groups:
         num_steps = max(1, settings.num_steps // len(config.groups))
@@ -205,6 +235,8 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
         settings = replace(settings, scans_at_once=num_scans)
     for part in config.without:
         settings = deeppointmap.without(settings, part)
+    if config.epochs is not None:
+        return replace(settings, num_epochs=config.epochs)
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 

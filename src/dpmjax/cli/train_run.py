@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import replace
 from functools import partial
-from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -84,56 +79,6 @@ def draw_sets(
     return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
 
 
-def prepare_sources(
-    sources: Sequence[cli.Source],
-    settings: dpm.TrainingConfig,
-    folder: Path,
-    *,
-    seed: int,
-    on_wait: Callable[[], object] = lambda: None,
-) -> list[dpm.PreparedDrive]:
-    """Returns all drives, each prepared in a process of its own and kept in `folder` for later runs.
-
-    `on_wait` is called every second, or after each scan of a single drive; an error of it ends the preparation.
-    """
-    prepare = partial(_prepare, settings=settings, folder=folder, seed=seed)
-    if len(sources) == 1:
-        with tqdm(desc="prepare scans", unit=" scans", dynamic_ncols=True) as bar:
-            return [prepare(sources[0], on_scan=lambda: (bar.update(1), on_wait()))]
-    # A fresh interpreter: a fork of a process that runs JAX may hang.
-    num_workers = min(len(sources), os.cpu_count() or 1)
-    with ProcessPoolExecutor(num_workers, get_context("spawn"), initializer=_begin_worker) as pool:
-        begun = [pool.submit(prepare, source) for source in sources]
-        with tqdm(desc="prepare scans", total=len(begun), unit=" drives", dynamic_ncols=True) as bar:
-            try:
-                remaining = set(begun)
-                while remaining:
-                    done, remaining = wait(remaining, timeout=1.0, return_when=FIRST_COMPLETED)
-                    for one in done:
-                        one.result()  # an error ends the preparation of all drives
-                    bar.update(len(done))
-                    on_wait()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in active_children():
-                    process.kill()
-                    process.join()
-                    for unfinished in folder.glob(f".*.npy.{process.pid}*"):
-                        unfinished.unlink()
-                raise
-        return [one.result() for one in begun]
-
-
-def _begin_worker() -> None:
-    # The device belongs to the process that trains, and so does the answer to Ctrl-C.
-    jax.config.update("jax_platforms", "cpu")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _prepare(source: cli.Source, *, settings: dpm.TrainingConfig, **options: Any) -> dpm.PreparedDrive:
-    return dpm.prepare_drive(source(), settings, **options)
-
-
 class Records:
     """The table, the progress bar, the checkpoints and the evaluation of a run; one process has them.
 
@@ -165,7 +110,7 @@ class Records:
         total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
-        self.run_s = self.earlier_s
+        self.run_s, self._pace_s = self.earlier_s, math.nan
         self._seen: set[dpm.CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
@@ -188,6 +133,7 @@ class Records:
             values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
         measured = {name: f"{value:.7g}" for name, value in values.items()}
         self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
+        self._pace_s = record.speed.run_s / record.speed.num_steps if record.speed.num_steps else math.nan
         self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=round(self.run_s, 3), **measured)
         self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
         self._bar.total = int(progress.state.end)
@@ -196,6 +142,18 @@ class Records:
         if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
             self.save(progress)
             self._last_saved = time.perf_counter()
+
+    def steps_left(self, step: int, *, total_s: float) -> int:
+        """Returns the number of steps in the seconds that remain of `total_s`; 0 where the plan stays as it is.
+
+        Where `total_s` is 0, a quarter of the steps that were done before this call remain.
+        """
+        if total_s == 0:
+            first, end = int(self.start.state.step), int(self.start.state.end)
+            return min(max(1, math.ceil(first / 4)), end - first) if step == first else 0
+        if not math.isfinite(total_s) or math.isnan(self._pace_s):
+            return 0
+        return max(1, round((total_s - self.run_s) / self._pace_s))
 
     def save(self, progress: dpm.TrainingProgress) -> None:
         """Writes a checkpoint, and the best parameters where they have changed since the last one."""
@@ -234,18 +192,18 @@ def run_training(
     hooks: dpm.TrainingHooks,
     *,
     seed: int,
-    plateau_s: float = math.inf,
+    total_s: float = math.inf,
 ) -> dpm.Trained:
     """Returns the result of training, after saving its last state; one process has records.
 
-    After `plateau_s` seconds of steps, compilation and evaluation, those of earlier calls included, the decay of the
-    learning rate begins.
+    Training ends after about `total_s` seconds of steps, compilation and evaluation, those of earlier calls included;
+    with 0 it ends after a quarter of the steps that are done.
     """
     if records is None:
         return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
         hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
-        hooks = replace(hooks, finish=lambda: records.run_s >= plateau_s)
+        hooks = replace(hooks, steps_left=partial(records.steps_left, total_s=total_s))
         trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         return trained

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from typing import Any
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -39,13 +39,19 @@ class Model:
     config: ModelConfig = flax.struct.field(pytree_node=False)
 
 
+Initialization = Literal["normal", "uniform"]
+
+
 @runs_on_host("call it outside, and pass its result in")
-def init_model(key: PRNGKeyArray, config: ModelConfig) -> Model:
-    """Makes a model with random parameters: matrices N(0, 1 / rows), scales one, biases zero; float32.
+def init_model(key: PRNGKeyArray, config: ModelConfig, *, distribution: Initialization = "normal") -> Model:
+    """Makes a model with random parameters; float32.
 
     Args:
         key: used once.
         config: configuration of the model.
+        distribution: "normal": matrices N(0, 1 / rows), biases zero. "uniform": matrices and their biases are uniform
+            within 1 / sqrt(rows), the default of PyTorch's linear layers (DeepPointMap's published program). Scales of
+            norms are one and their biases zero with both.
 
     Returns:
         The model.
@@ -53,13 +59,16 @@ def init_model(key: PRNGKeyArray, config: ModelConfig) -> Model:
     shapes = model_shapes(config)
     # One long draw is cut up on the host; a draw for each of the 200 arrays would take ten seconds to compile.
     num_numbers = sum(leaf.size for leaf in jax.tree.leaves(shapes))
-    draw = np.asarray(jax.random.normal(key, (num_numbers,), jnp.float32))
+    is_normal = distribution == "normal"
+    sample = jax.random.normal if is_normal else functools.partial(jax.random.uniform, minval=-1.0)
+    draw = np.asarray(sample(key, (num_numbers,), jnp.float32))
+    rows = {path[:-1]: leaf.shape[0] for path, leaf in jax.tree.leaves_with_path(shapes) if leaf.ndim == 2}
     ends = iter(np.cumsum([leaf.size for leaf in jax.tree.leaves(shapes)]))
 
     def start(path: tuple[Any, ...], leaf: jax.ShapeDtypeStruct) -> jax.Array:
         end = next(ends)
-        if leaf.ndim == 2:
-            return jnp.asarray(draw[end - leaf.size : end].reshape(leaf.shape) / np.float32(leaf.shape[0]) ** 0.5)
+        if leaf.ndim == 2 or (not is_normal and path[-1].key == "bias" and path[:-1] in rows):
+            return jnp.asarray(draw[end - leaf.size : end].reshape(leaf.shape) / np.float32(rows[path[:-1]]) ** 0.5)
         return jnp.asarray(np.full(leaf.shape, path[-1].key.endswith("scale"), np.float32))
 
     return Model(jax.tree_util.tree_map_with_path(start, shapes), config)

@@ -25,6 +25,21 @@ def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
     np.testing.assert_allclose(clouds.features, expected.features, **ACCUMULATED)
 
 
+@pytest.mark.slow
+def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(assert_compiles_nothing) -> None:
+    model = init_model(jax.random.key(0), toy.MODEL)
+    kinds = (PairKind(2.0, 10.0), PairKind(2.0, 10.0, num_scans=3))
+    few, many = (
+        draw_evaluation_pairs(toy.drive(num_scans=num_scans), num_pairs, toy.MODEL, kinds=kinds)
+        for num_scans, num_pairs in ((6, 3), (24, 13))
+    )
+    evaluate_registration(model, few)
+    with assert_compiles_nothing():
+        found = evaluate_registration(model, many)
+    assert [len(recall.translation_errors_m) for recall in found.recalls] == [13, 13]
+    assert found.clouds.positions.shape[0] == 24
+
+
 def test_a_map_holds_its_first_scan_once() -> None:
     kind = PairKind(2.0, 10.0, num_scans=4)
     some = draw_evaluation_pairs(toy.drive(num_scans=12, step_m=3.0), 20, toy.MODEL, kinds=(kind,)).pairs[0]

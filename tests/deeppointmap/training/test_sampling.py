@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
-from dpmjax.deeppointmap.training.curriculum import PAIR_PROBABILITY, stage_layouts
+from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
 
@@ -24,63 +26,107 @@ def placed(T_world_scan: np.ndarray) -> PlacedScans:
     return PlacedScans(T_world_scan, positions_world, np.ones((len(T_world_scan), 4), bool))
 
 
-@pytest.mark.parametrize(("num_scans", "max_num"), [(32, 4), (96, 1), (512, 1)])
-@pytest.mark.parametrize("max_group", [2, 4, 8, 16, 32])
-def test_layouts_hold_the_sizes_of_the_published_draw_and_leave_no_room(
-    max_group: int, num_scans: int, max_num: int
-) -> None:
-    config = SamplingConfig(num_scans)
-    layouts = stage_layouts(max_group, config)
-    assert 1 <= len(layouts) <= max_num
-    shapes = [shape for layout in layouts for shape in layout]
-    assert all(config.num_scans - 2 <= sum(map(sum, layout)) <= config.num_scans for layout in layouts)
-    assert all(1 <= a <= b <= config.max_side and a + b <= max_group for a, b in shapes)
-    sizes = np.array([sum(shape) for shape in shapes])
-    # Of the mean size of the published draw, within what fits into so few samples.
-    mean = 2 * PAIR_PROBABILITY + (1 - PAIR_PROBABILITY) * (2 + max_group) / 2
-    assert 0.7 < sizes.mean() / mean < 1.4
-    assert max_group == 2 or sizes.max() > max_group / 2
+def published_sizes(max_group: int, rng: np.random.Generator, num: int = 40_000) -> np.ndarray:
+    """DeepPointMap's published draw of the size of a step."""
+    return np.where(rng.random(num) < 0.34, 2, rng.integers(2, max_group + 1, num))
 
 
-@pytest.mark.parametrize("max_group", [2, 8])
-def test_groups_hold_scans_of_one_place(max_group: int) -> None:
+def drawn_layouts(config: TrainingConfig, max_group: int, num: int = 4_000) -> list[Layout]:
+    """The layouts of the steps of one stage, as a training draws them."""
+    stage = replace(config, curriculum=(CurriculumStage(max_group, num),))
+    return [stage.layout_at(step, seed=7) for step in range(num)]
+
+
+@pytest.mark.parametrize(
+    ("preset", "max_group", "share"),
+    [
+        *(("small", *row) for row in ((2, 1.0), (4, 0.56), (8, 0.43), (16, 0.38))),
+        *(("paper", *row) for row in ((2, 1.0), (4, 0.56), (8, 0.43), (16, 0.38), (32, 0.36))),
+    ],
+)
+def test_the_share_of_scan_pairs_and_the_mean_size_are_those_of_the_published_draw(preset, max_group, share) -> None:
+    layouts = drawn_layouts(training_preset(preset), max_group)
+    # The loss of a step is the mean over its groups, and all groups of a step have one size.
+    is_pair = [(layout.num_source, layout.num_target) == (1, 1) for layout in layouts]
+    assert abs(np.mean(is_pair) - share) < 0.03
+    sizes = np.array([layout.num_source + layout.num_target for layout in layouts])
+    published = published_sizes(max_group, np.random.default_rng(0))
+    standard_error = published.std() / np.sqrt(len(sizes))
+    assert abs(sizes.mean() - published.mean()) <= 4 * standard_error
+    assert max_group == 2 or sizes.max() == max_group
+
+
+@pytest.mark.parametrize("max_group", [8, 32])
+def test_half_of_the_groups_that_fit_in_one_map_are_split_into_a_scan_and_a_map(max_group: int) -> None:
+    config = training_preset("paper")
+    layouts = [layout for layout in drawn_layouts(config, max_group) if 3 < sum(layout[:2]) <= config.sampling.max_side]
+    # Half against all others; else uniform, of whose splits the first and the last are such groups, too.
+    expected = np.mean([0.5 + 0.5 * 2 / (sum(layout[:2]) - 1) for layout in layouts])
+    found = np.mean([layout.num_source == 1 for layout in layouts])
+    assert abs(found - expected) < 4 * np.sqrt(0.25 / len(layouts))
+
+
+@pytest.mark.parametrize("num_scans", [16, 32, 96])
+@pytest.mark.parametrize("max_group", [2, 4, 16])
+def test_a_step_is_full_and_its_capacity_holds_it(max_group: int, num_scans: int) -> None:
+    config = replace(training_preset("small"), sampling=SamplingConfig(num_scans))
+    capacities = set()
+    for layout in drawn_layouts(config, max_group, 300):
+        source, target, num_groups, total = layout
+        assert 1 <= source <= target <= config.sampling.max_side
+        assert 2 <= source + target <= max_group
+        assert num_groups == num_scans // (source + target)
+        assert total == num_groups * (source + target)
+        capacity = layout_capacity(layout, config.sampling)
+        assert all(size <= room for size, room in zip(layout, capacity, strict=True))
+        assert capacity.num_source < 2 * source
+        assert capacity.num_target < 2 * target
+        assert capacity.num_scans <= num_scans
+        capacities.add(capacity)
+    # Each compiles one step: those of two maps with up to 1, 2, 4, 8 or 16 scans.
+    assert len(capacities) <= {2: 1, 4: 4, 16: 14}[max_group]
+
+
+@pytest.mark.parametrize("layout", [Layout(1, 1, 16, 32), Layout(3, 5, 4, 32)])
+def test_groups_hold_scans_of_one_place(layout: Layout) -> None:
     scans, config = table(), SamplingConfig()
-    layout = stage_layouts(max_group, config)[0]
     for seed in range(20):
         groups = draw_groups(scans, 5, layout, config, np.random.default_rng(seed))
+        assert len(groups) == layout.num_groups
         assert any(5 in group.rows for group in groups)
-        for group, shape in zip(groups, layout, strict=True):
-            assert (len(group.source), len(group.target)) == shape
+        for group in groups:
+            assert (len(group.source), len(group.target)) == layout[:2]
             assert len(set(group.rows)) == len(group.rows)
             assert len(set(scans.scene[group.rows])) == 1
             assert np.ptp(scans.positions[group.rows, 0]) <= 2 * config.max_distance_m
 
 
 def test_groups_are_smaller_where_scans_are_rare() -> None:
-    (group,) = draw_groups(table(step_m=15.0), 4, ((3, 5),), SamplingConfig(), np.random.default_rng(0))
+    layout = Layout(3, 5, 1, 8)
+    (group,) = draw_groups(table(step_m=15.0), 4, layout, SamplingConfig(), np.random.default_rng(0))
     assert 4 in group.rows
     assert len(group.rows) <= 3
     assert len(group.target) >= 1
-    (batch,) = arrange_groups([group], ((3, 5),), placed(table(step_m=15.0).T_world_lidar[group.rows]))
+    batch = arrange_groups([group], layout, placed(table(step_m=15.0).T_world_lidar[group.rows]))
     assert batch.source.rows.shape == (1, 3)
     assert batch.target.mask.any(-1).sum() + batch.source.mask.any(-1).sum() == len(group.rows)
 
 
-def test_groups_of_one_shape_stand_together_with_their_true_motions() -> None:
-    layout, scans = ((1, 1), (1, 2), (1, 1)), table()
+def test_groups_keep_their_true_motions_and_missing_ones_are_masked() -> None:
+    scans = table()
     groups = [Group(np.array([3]), np.array([5])), None, Group(np.array([8]), np.array([4]))]
     rows = np.concatenate([group.rows for group in groups if group is not None])
-    pairs, others = arrange_groups(groups, layout, placed(scans.T_world_lidar[rows]))
-    np.testing.assert_array_equal(pairs.mask, [True, True])
-    np.testing.assert_array_equal(others.mask, [False])
-    np.testing.assert_array_equal(rows[pairs.source.rows[:, 0]], [3, 8])
-    np.testing.assert_array_equal(pairs.T_target_source[:, 0, 3], [-4, 8])
+    batch = arrange_groups(groups, Layout(1, 2, 4, 12), placed(scans.T_world_lidar[rows]))
+    np.testing.assert_array_equal(batch.mask, [True, False, True, False])
+    np.testing.assert_array_equal(rows[batch.source.rows[:, 0][batch.mask]], [3, 8])
+    np.testing.assert_array_equal(batch.T_target_source[:, 0, 3], [-4, 0, 8, 0])
+    np.testing.assert_array_equal(batch.target.mask.any(-1), [[True, False], [False, False]] * 2)
 
 
 def test_the_scan_nearest_to_the_other_map_stands_first() -> None:
     scans = table()
     for seed in range(10):
-        (group,) = draw_groups(scans, 20, ((2, 6),), SamplingConfig(), np.random.default_rng(seed))
+        (group,) = draw_groups(scans, 20, Layout(2, 6, 1, 8), SamplingConfig(), np.random.default_rng(seed))
         x = scans.positions[:, 0]
         assert np.all(np.diff(np.abs(x[group.source] - x[group.target[0]])) >= 0)
         assert np.ptp(x[group.rows]) > np.abs(x[group.source[0]] - x[group.target[0]])
@@ -90,18 +136,18 @@ def test_a_map_describes_no_place_twice() -> None:
     """As the map that a scan is matched against in use: a copy of a place of a nearer scan is left out."""
     T = np.tile(np.eye(4), (4, 1, 1))
     T[:, 0, 3] = [0.0, 0.1, 0.2, 5.0]
-    (batch,) = arrange_groups([Group(np.array([0]), np.array([1, 2, 3]))], ((1, 3),), placed(T))
+    batch = arrange_groups([Group(np.array([0]), np.array([1, 2, 3]))], Layout(1, 3, 1, 4), placed(T))
     np.testing.assert_array_equal(batch.target.mask[0].sum(1), [4, 0, 4])
     np.testing.assert_array_equal(batch.source.mask[0].sum(1), [4])
 
 
 def test_a_lonely_scan_has_no_group() -> None:
     with pytest.raises(ValueError, match="none in"):
-        draw_groups(table(step_m=100.0), 0, ((1, 1),), SamplingConfig(), np.random.default_rng(0))
+        draw_groups(table(step_m=100.0), 0, Layout(1, 1, 16, 32), SamplingConfig(), np.random.default_rng(0))
 
 
 def test_draws_depend_on_the_generator_alone() -> None:
-    layout = ((1, 1), (2, 4))
+    layout = Layout(2, 4, 5, 30)
     first, second = (draw_groups(table(), 3, layout, SamplingConfig(), np.random.default_rng(4)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a.rows, b.rows)
@@ -128,6 +174,9 @@ def test_presets_double_the_groups(name) -> None:
         (lambda: TrainingConfig(sampling=SamplingConfig(num_scans=16)), "num_scans"),
         (lambda: TrainingConfig(sampling=SamplingConfig(max_side=8)), "max_side"),
         (lambda: TrainingConfig(learning_rate=0.0), "learning_rate"),
+        (lambda: TrainingConfig(max_gradient_norm=0.0), "max_gradient_norm"),
+        (lambda: TrainingConfig(num_epochs=0.0), "num_epochs"),
+        (lambda: TrainingConfig(initialization="zero"), "initialization"),
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),
     ],
 )
@@ -136,9 +185,42 @@ def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
         make()
 
 
-def test_layouts_of_a_stage_take_turns() -> None:
-    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(8, 9)))
-    layouts = stage_layouts(8, config.sampling)
-    assert len(layouts) > 1
-    assert [config.layout_at(step) for step in range(3, 12)] == [layouts[step % len(layouts)] for step in range(3, 12)]
-    assert config.layout_at(0) == stage_layouts(2, config.sampling)[0]
+def test_the_layout_of_a_step_depends_on_the_seed_and_its_stage_alone() -> None:
+    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(8, 40)))
+    first, again, other = ([config.layout_at(step, seed=seed) for step in range(43)] for seed in (0, 0, 1))
+    assert first == again != other
+    assert first[:3] == [Layout(1, 1, 16, 32)] * 3
+
+
+def test_an_epoch_is_every_scan_once_as_anchor_by_all_devices_together() -> None:
+    paper = training_preset("paper")
+    assert paper.num_epochs == 12
+    steps = paper.for_scans(14_169)
+    assert abs(steps.num_steps - 12 * 14_169) <= 5
+    # K doubles at epochs 2, 4, 7 and 10.
+    ends = np.cumsum([stage.num_steps for stage in steps.curriculum])
+    np.testing.assert_allclose(ends / 14_169, [2, 4, 7, 10, 12], atol=1e-3)
+    assert abs(paper.for_scans(14_169, num_samples=6).num_steps - 2 * 14_169) <= 5
+    assert steps.num_epochs is None
+    assert steps.for_scans(7) is steps
+    assert paper.with_steps(60).for_scans(1000).num_steps == 60
+
+
+def test_a_map_of_the_paper_keeps_all_its_descriptors() -> None:
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, 0, 3] = [0.0, 0.1, 0.2, 5.0]
+    group = [Group(np.array([0]), np.array([1, 2, 3]))]
+    batch = arrange_groups(group, Layout(1, 4, 1, 4), placed(T), thins=training_preset("paper").thins_maps)
+    np.testing.assert_array_equal(batch.target.mask[0].sum(1), [4, 4, 4, 0])
+
+
+def test_the_paper_preset_is_as_published() -> None:
+    """The points of section 3.3 and of the published configuration that presets may differ in."""
+    paper = training_preset("paper")
+    assert (paper.learning_rate, paper.final_learning_rate, paper.warmup_steps) == (1e-3, 1e-5, 0)
+    assert [stage.max_group for stage in paper.curriculum] == [2, 4, 8, 16, 32]
+    assert (paper.num_variants, paper.thins_as_in_use, paper.thins_maps) == (0, False, False)
+    assert paper.max_gradient_norm == np.inf
+    assert paper.initialization == "uniform"
+    assert not paper.refines_labels
+    assert (paper.objective.coarse_weight, paper.objective.positive_radius_m) == (0.1, 1.0)

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import ScanStore, init_model, prepare_drive
+from dpmjax.deeppointmap import SampleMaker, ScanStore, init_model, prepare_drive, stored_bytes, training_preset
+from dpmjax.deeppointmap.training.preparation import varied_record
 from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError
@@ -71,3 +72,44 @@ def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
     np.testing.assert_array_equal(clouds.mask, placed.mask)
     found = rigid.transform_points(placed.T_world_scan, np.asarray(clouds.positions))
     np.testing.assert_allclose(found[placed.mask], placed.positions_world[placed.mask], atol=1e-3)
+
+
+FRESH = replace(toy.TRAINING, num_variants=0, thins_as_in_use=False)
+
+
+def test_scans_that_are_prepared_anew_need_no_file_and_depend_on_seed_and_step_alone(tmp_path) -> None:
+    calls: list[int] = []
+    prepared = prepare_drive(short(bad=2), FRESH, folder=tmp_path, on_scan=lambda: calls.append(0))
+    assert not calls
+    assert not list(tmp_path.iterdir())
+    assert stored_bytes(FRESH) == 0
+    makers = [SampleMaker(ScanStore([prepared]), FRESH, seed=0) for _ in range(2)]
+    toy.assert_trees_equal(makers[0](1), makers[1](1))
+    store = ScanStore([prepared])
+    rng = np.random.default_rng(0)
+    stored = [store.read(np.arange(4), FRESH, rng)[0].pyramids for _ in range(6)]
+    assert store.bad == {"2": "cut off; leave it out."}
+    assert all(pyramids.num_points[2] == 0 for pyramids in stored)
+    # Other points are dropped each time.
+    assert len({pyramids.points[0].tobytes() for pyramids in stored}) == 6
+
+
+def test_shuffled_points_are_another_choice_of_each_voxel_and_drops_come_before_the_capacity() -> None:
+    """As published: all points in range have a chance, and the capacity is full where enough remain."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-20, 20, (4000, 3)).astype(np.float32)
+    still = replace(toy.TRAINING.augment, max_drop_ratio=0.5, sector_probability=0.0, box_probability=0.0)
+    config = replace(FRESH, augment=still)
+    records = [varied_record(points, config, (0, number)) for number in range(5)]
+    assert [int(record["num_points"]) for record in records] == [config.model.preprocess.capacity] * 5
+    first, second = (record["points"][: record["num_points"]] * record["unit"] for record in records[:2])
+    assert not np.array_equal(np.sort(first, axis=0), np.sort(second, axis=0))
+    again = varied_record(points, config, (0, 0))
+    np.testing.assert_array_equal(again, records[0])
+
+
+def test_the_size_of_prepared_scans_is_that_of_their_files(tmp_path) -> None:
+    path = prepare_drive(short(), toy.TRAINING, folder=tmp_path).pyramids
+    assert 0 <= path.stat().st_size - 4 * stored_bytes(toy.TRAINING) < 16_384  # the header of the file
+    assert round(stored_bytes(replace(training_preset("paper"), num_variants=4)) / 1e6, 2) == 3.29
+    assert round(stored_bytes(training_preset("small")) / 1e6, 2) == 0.51

@@ -17,6 +17,7 @@ from dpmjax.deeppointmap import (
     CurriculumStage,
     Model,
     SampleMaker,
+    TrainingConfig,
     finish,
     init_training,
     make_step,
@@ -24,6 +25,7 @@ from dpmjax.deeppointmap import (
     without,
 )
 from dpmjax.deeppointmap.model import predict_offsets
+from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.deeppointmap.training.sampling import RegistrationSample
 from dpmjax.deeppointmap.training.step import WEIGHT_DECAY, TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
@@ -45,6 +47,10 @@ def step():
 @pytest.fixture(scope="module")
 def start() -> TrainingState:
     return init_training(jax.random.key(0), toy.TRAINING)
+
+
+def capacity_of(step: int, seed: int) -> Layout:
+    return layout_capacity(toy.TRAINING.layout_at(step, seed=seed), toy.TRAINING.sampling)
 
 
 def changed(before: TrainingState, after: TrainingState) -> dict[str, bool]:
@@ -99,12 +105,15 @@ def test_parts_of_the_training_can_be_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_a_step_compiles_once_for_each_layout(maker, start, assert_compiles_nothing) -> None:
+def test_a_step_compiles_once_for_each_capacity(maker, start, assert_compiles_nothing) -> None:
     step, other = make_step(toy.TRAINING), SampleMaker(toy.store(), toy.TRAINING, seed=1)
     state = start
-    for number in (0, 3):
+    capacities = [[capacity_of(number, seed) for number in range(5)] for seed in (0, 1)]
+    for number, capacity in enumerate(capacities[0]):
+        if capacity not in capacities[1]:
+            continue
         state, _ = step(state, maker(number))
-        following = other(number)
+        following = other(capacities[1].index(capacity))
         with assert_compiles_nothing():
             state, _ = step(state, following)
 
@@ -112,20 +121,20 @@ def test_a_step_compiles_once_for_each_layout(maker, start, assert_compiles_noth
 @pytest.mark.slow
 def test_places_without_a_group_change_nothing(maker, start) -> None:
     batch = maker(0)
-    (pairs,) = batch.groups
+    pairs = batch.groups
     # That what is masked reaches no gradient either is a law of each term (test_objective).
     loss = jax.jit(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0])
-    masked = replace(batch, groups=(replace(pairs, mask=np.array([[True, False, True]])),))
+    masked = replace(batch, groups=replace(pairs, mask=np.array([[True, False, True]])))
     kept = jax.tree.map(lambda leaf: leaf[:, [0, 2]], pairs)
-    expected = loss(start.params, replace(batch, groups=(kept,)))
+    expected = loss(start.params, replace(batch, groups=kept))
     np.testing.assert_allclose(loss(start.params, masked), expected, **ACCUMULATED)
 
 
 @pytest.mark.slow
 def test_a_map_without_the_rows_that_thinning_removes_has_the_same_loss(maker, start, monkeypatch) -> None:
     """Down to as many rows as there are descriptors."""
-    batch = maker(3)
-    masks = [side.mask for group in batch.groups for side in (group.source, group.target)]
+    batch = maker(next(number for number in range(3, 20) if capacity_of(number, 0).num_target > 1))
+    masks = [side.mask for side in (batch.groups.source, batch.groups.target)]
     most = max(int(mask.sum(axis=(-1, -2)).max()) for mask in masks)
     assert most < max(mask[0, 0].size for mask in masks)
     whole = jax.jit(lambda params, batch: batch_loss(params, batch, toy.TRAINING))(start.params, batch)
@@ -150,30 +159,43 @@ def test_a_sample_depends_on_seed_and_step_alone(maker) -> None:
     assert np.any(fresh(4).scans.T_augmented_lidar[:, 0] != fresh(3).scans.T_augmented_lidar[:, 0])
 
 
-def test_devices_begin_with_different_anchors(maker) -> None:
+def test_devices_share_the_anchors_of_an_epoch(maker) -> None:
     both = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=2)
     toy.assert_trees_equal(jax.tree.map(lambda leaf: leaf[:1], both(0)), maker(0))
-    anchors = {both._anchor(0, number) for number in range(8)}
-    assert len(anchors) > 1
     num = len(toy.store().table)
-    assert {both._anchor(step, 1) for step in range(num)} == set(range(num))
+    alone = [maker._anchor(step, 0) for step in range(num)]
+    assert sorted(alone) == list(range(num))
+    # Two devices share the scans of an epoch, so that it takes half the steps.
+    assert [both._anchor(step, number) for step in range(num // 2) for number in range(2)] == alone
 
 
-def test_the_learning_rate_falls_at_the_end_or_when_it_is_asked_to(start) -> None:
+def test_the_learning_rate_is_a_cosine_over_the_whole_training(start) -> None:
     config = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 100),), warmup_steps=4)
     state = init_training(jax.random.key(0), config)
-    assert (int(state.decay_start), int(state.end)) == (80, 100)
+    found = [rate(state, step, config) for step in range(101)]
+    cosine = 1e-5 + (1e-3 - 1e-5) * (1 + np.cos(np.pi * np.arange(101) / 100)) / 2
+    np.testing.assert_allclose(found[4:], cosine[4:], rtol=1e-4)
+    np.testing.assert_allclose(found[:4], cosine[:4] * np.arange(1, 5) / 4, rtol=1e-4)
+    np.testing.assert_allclose([found[50], found[80]], [5.05e-4, 1.045e-4], rtol=1e-3)
+    assert training_preset("paper").warmup_steps == 0
 
-    def rate(state: TrainingState, step: int) -> float:
-        return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config))
 
-    np.testing.assert_allclose([rate(state, step) for step in (0, 3, 50, 80)], [2.5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-5)
-    np.testing.assert_allclose([rate(state, 90), rate(state, 100)], [5.05e-4, 1e-5], rtol=1e-4)
-    early = finish(replace(state, step=jax.numpy.asarray(40)), config)
-    assert (int(early.decay_start), int(early.end)) == (40, 50)
-    np.testing.assert_allclose([rate(early, 40), rate(early, 50)], [1e-3, 1e-5], rtol=1e-4)
-    late = replace(state, step=jax.numpy.asarray(85))
-    assert finish(late, config) is late
+def test_a_training_that_finishes_early_passes_through_the_rest_of_the_cosine(start) -> None:
+    config = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 100),), warmup_steps=0)
+    state = replace(init_training(jax.random.key(0), config), step=jax.numpy.asarray(40))
+    early = finish(state, 10)
+    assert (int(early.planned_at), int(early.end)) == (40, 50)
+    np.testing.assert_allclose(rate(early, 40, config), rate(state, 40, config), rtol=1e-5)
+    np.testing.assert_allclose(rate(early, 45, config), rate(state, 70, config), rtol=1e-4)
+    np.testing.assert_allclose(rate(early, 50, config), 1e-5, rtol=1e-4)
+    again = finish(replace(early, step=jax.numpy.asarray(45)), 30)
+    np.testing.assert_allclose(rate(again, 60, config), rate(state, 85, config), rtol=1e-4)
+    with pytest.raises(ValueError, match="^num_steps: expected at least 1, got 0"):
+        finish(state, 0)
+
+
+def rate(state: TrainingState, step: int, config: TrainingConfig) -> float:
+    return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config))
 
 
 EIGHT_DEVICES = """
@@ -189,7 +211,7 @@ gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.
 alone = gradient(params, batch)
 mesh = device_mesh()
 spread = place(batch, mesh, is_batch=True)
-mask = spread.groups[0].mask
+mask = spread.groups.mask
 assert len(mask.sharding.device_set) == 8 and mask.addressable_shards[0].data.shape[0] == 1
 together = gradient(place(params, mesh), spread)
 for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):

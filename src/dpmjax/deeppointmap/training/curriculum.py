@@ -1,9 +1,8 @@
 """Settings of training: the stages of the curriculum, and the sizes of the maps in their samples.
 
-The sizes are a few fixed layouts for each stage, so that no step computes on empty rows. With groups
-of up to 4 scans, attention over padded maps costs 5 times as much as over the valid scans alone, and 13 times with up
-to 16. So the sizes of the groups are not drawn for each step. All layouts of a stage together have the proportions of
-the published draw, and the steps take the layouts in turn. Each layout compiles one step.
+Each step draws one size for all of its groups, and how it is split into two maps (DeepPointMap's published program).
+The arrays of a step have the capacity of the next powers of two, so that all sizes of a training need few compiled
+steps: up to 15 for maps of up to 16 scans.
 """
 
 from __future__ import annotations
@@ -11,39 +10,48 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
+from dpmjax.deeppointmap.model import Initialization
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
-# Probability that a group is one pair of scans, in every stage.
+# Probability that all groups of a step are pairs of scans, whatever the stage; other steps may draw pairs, too.
 PAIR_PROBABILITY = 0.34
 
 # Smallest distance of a scan from its anchor, metres; nearer ones are too similar (published configuration).
 MIN_DISTANCE_M = 0.25
 
-# Share of the steps in which the learning rate falls, at the end (DeepPointMap's published configuration).
-DECAY_RATIO = 0.2
+# Capacity of the pairs within 2 m of a descriptor, of which the published loss takes all. More need more memory. In a
+# simulated street a descriptor had up to 9 in a map of 8 scans, and 2 in a scan; 4 would leave out a seventh of them.
+MAX_CLOSE = 32
 
-# Number of scans in the first and in the second map of a group.
-GroupShape = tuple[int, int]
+LAYOUT_STREAM = 3105
 
-# The groups of one sample, small ones first.
-Layout = tuple[GroupShape, ...]
 
-# Largest number of layouts of a stage, and of their scans together: a large sample has room for all sizes of groups.
-NUM_LAYOUTS, LAYOUT_SCANS = 4, 128
-# Golden ratio: any number of its multiples modulo 1 are spread evenly.
-GOLDEN = 0.6180339887498949
+class Layout(NamedTuple):
+    """Sizes of the groups of one sample, or their capacities.
+
+    Attributes:
+        num_source: number of scans in the first map of each group, at most that of the second.
+        num_target: number of scans in the second map of each group.
+        num_groups: number of groups.
+        num_scans: number of scans of all groups.
+    """
+
+    num_source: int
+    num_target: int
+    num_groups: int
+    num_scans: int
 
 
 @dataclass(frozen=True)
 class CurriculumStage:
-    """A part of training with one size of groups. Each stage compiles one step for each of its layouts.
+    """A part of training with one largest size of groups.
 
     Attributes:
         max_group: largest number of scans in both maps of a group together; the published curriculum doubles it from 2
@@ -66,8 +74,8 @@ class SamplingConfig:
     Attributes:
         num_scans: capacity of one sample, all groups together.
         max_distance_m: largest distance of a scan of a group from its anchor, above `MIN_DISTANCE_M`.
-        max_side: largest number of scans of one map. Half of the groups in which one scan can stand against all others
-            are split so.
+        max_side: largest number of scans of one map. Half of the groups of at most this size are split into one scan
+            against all others.
     """
 
     num_scans: int = 32
@@ -91,11 +99,20 @@ class TrainingConfig:
         sampling: choice of the scans of a sample.
         augment: augmentation of each scan. Each step draws a new motion for each scan.
         num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
+            0 prepares the scan anew at each use, which needs no disk and more processors.
+        thins_as_in_use: True: the points of a scan are thinned as for `encode`, in their order, and outliers are
+            removed. False: they are shuffled before the voxel filter, and outliers stay.
+        thins_maps: True: maps are thinned as in SLAM, to at most 1,024 descriptors. False: they keep all descriptors.
+        refines_labels: True: the scans of a group are aligned by ICP from their given poses (ours, as the published
+            program aligns pairs beforehand).
+        num_epochs: number of times that each scan is the first of a group; `train` computes the steps. None: the steps
+            are those of the curriculum.
+        initialization: random parameters before the first step, as for `init_model`.
         objective: losses.
-        learning_rate: learning rate after the warm-up and before the decay.
-        final_learning_rate: learning rate at the end of the decay.
-        warmup_steps: number of steps in which the learning rate rises from 0.
-        max_gradient_norm: longer gradients are scaled down to this norm.
+        learning_rate: first value of the learning rate, which falls by a cosine over the whole training.
+        final_learning_rate: learning rate at the end.
+        warmup_steps: number of steps in which a factor of the learning rate rises from 0 to 1.
+        max_gradient_norm: longer gradients are scaled down to this norm; infinity for none.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
     """
@@ -106,18 +123,28 @@ class TrainingConfig:
     )
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    num_variants: int = 4
-    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    num_variants: int = 0
+    thins_as_in_use: bool = False
+    thins_maps: bool = False
+    refines_labels: bool = False
+    num_epochs: float | None = None
+    initialization: Initialization = "uniform"
+    # The published loss takes all pairs within its radius.
+    objective: ObjectiveConfig = field(default_factory=lambda: ObjectiveConfig(max_close=MAX_CLOSE))
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-5
     warmup_steps: int = 0
-    max_gradient_norm: float = 35.0
+    max_gradient_norm: float = math.inf
     scans_at_once: int = 8
 
     def __post_init__(self) -> None:
-        require_positive_fields(self, "learning_rate", "final_learning_rate", "max_gradient_norm")
-        require_fields(self, "warmup_steps", low=0)
-        require_fields(self, "scans_at_once", "num_variants", low=1)
+        require_positive_fields(self, "learning_rate", "final_learning_rate")
+        require_fields(self, "warmup_steps", "num_variants", low=0)
+        require_fields(self, "scans_at_once", low=1)
+        require_one_of("initialization", self.initialization, get_args(Initialization))
+        for name, value in (("max_gradient_norm", self.max_gradient_norm), ("num_epochs", self.num_epochs)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: expected more than 0, got {value}")
         require_count("len(curriculum)", len(self.curriculum))
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:
@@ -149,17 +176,18 @@ class TrainingConfig:
             step -= stage.num_steps
         return self.curriculum[-1]
 
-    def layout_at(self, step: int) -> Layout:
-        """Finds the layout of a step; those of its stage take turns.
+    def layout_at(self, step: int, *, seed: int) -> Layout:
+        """Draws the sizes of the groups of a step, which all samples of its batch share.
 
         Args:
             step: number of the step, from 0.
+            seed: seed of the training.
 
         Returns:
-            The layout.
+            The layout, the same one every time.
         """
-        layouts = stage_layouts(self.stage_at(step).max_group, self.sampling)
-        return layouts[step % len(layouts)]
+        rng = np.random.default_rng([LAYOUT_STREAM, seed, step])
+        return draw_layout(self.stage_at(step).max_group, self.sampling, rng)
 
     def with_steps(self, num_steps: int) -> TrainingConfig:
         """Shortens or stretches all stages in proportion, none to less than one step.
@@ -168,12 +196,26 @@ class TrainingConfig:
             num_steps: about this many steps in all.
 
         Returns:
-            A new configuration.
+            A new configuration, whose steps no longer depend on the number of scans.
         """
         ratio = num_steps / self.num_steps
         stages = tuple(replace(stage, num_steps=max(1, round(stage.num_steps * ratio))) for stage in self.curriculum)
         warmup = min(round(self.warmup_steps * min(ratio, 1)), sum(stage.num_steps for stage in stages) - 1)
-        return replace(self, curriculum=stages, warmup_steps=warmup)
+        return replace(self, curriculum=stages, warmup_steps=warmup, num_epochs=None)
+
+    def for_scans(self, num_scans: int, *, num_samples: int = 1) -> TrainingConfig:
+        """Computes the steps of `num_epochs` for a data set.
+
+        Args:
+            num_scans: number of scans of all drives.
+            num_samples: number of samples of a step, one for each device.
+
+        Returns:
+            A configuration with fixed steps; the same one where `num_epochs` is None.
+        """
+        if self.num_epochs is None:
+            return self
+        return self.with_steps(math.ceil(self.num_epochs * num_scans / num_samples))
 
 
 # Parts that DeepPointMap's Table 2 leaves out.
@@ -233,6 +275,10 @@ PRESETS = {
         # Few steps need weaker augmentation, more positives, and a direct loss on the encoder.
         augment=replace(NEAR_THE_LIDAR, max_drop_ratio=0.3),
         objective=ObjectiveConfig(coarse_weight=1.0, positive_radius_m=1.5, max_close=4),
+        num_variants=2,
+        thins_as_in_use=True,
+        thins_maps=True,
+        initialization="normal",
         learning_rate=2e-3,
         warmup_steps=20,
         max_gradient_norm=5.0,
@@ -250,50 +296,52 @@ PRESETS = {
         warmup_steps=200,
         max_gradient_norm=10.0,
         num_variants=2,
+        thins_as_in_use=True,
+        thins_maps=True,
+        initialization="normal",
         scans_at_once=4,
     ),
-    "paper": TrainingConfig(),
+    # Steps of the curriculum: twelve epochs of 10,000 scans on one device.
+    "paper": TrainingConfig(num_epochs=12.0),
 }
 
 
-@functools.cache
-def stage_layouts(max_group: int, config: SamplingConfig) -> tuple[Layout, ...]:
-    """Makes the layouts of a stage.
+def draw_layout(max_group: int, config: SamplingConfig, rng: np.random.Generator) -> Layout:
+    """Draws the size of all groups of a step, and its split (DeepPointMap's published program).
 
-    The published draw of a group: two scans with `PAIR_PROBABILITY`, else 2 to `max_group`, each number equally likely.
-    One half of the groups is split into one scan against all others; the second half is split anywhere. The losses
-    are symmetric, so the smaller map of a group is always the first.
+    The size is 2 with `PAIR_PROBABILITY`, else 2 to `max_group`, each number equally likely. The losses are symmetric,
+    so the smaller map of a group is always the first.
 
     Args:
         max_group: largest number of scans in both maps of a group together.
-        config: capacity of a sample, and proportions.
+        config: capacity of a sample, and of a map.
+        rng: source of the draws.
 
     Returns:
-        From 1 to `NUM_LAYOUTS` different layouts of at most `config.num_scans` scans each.
+        As many groups as a sample has room for.
     """
-    num_layouts = max(1, min(NUM_LAYOUTS, LAYOUT_SCANS // config.num_scans))
-    sizes = np.arange(2, max_group + 1)
-    shares = np.full(len(sizes), (1 - PAIR_PROBABILITY) / len(sizes))
-    shares[0] += PAIR_PROBABILITY
-    num_groups = max(1, round(num_layouts * config.num_scans / float(sizes @ shares)))
-    drawn = np.searchsorted(np.cumsum(shares) / shares.sum(), (np.arange(num_groups) + 0.5) / num_groups)
-    layouts: list[list[GroupShape]] = [[] for _ in range(num_layouts)]
-    room = [config.num_scans] * num_layouts
-    for number, size in enumerate(sorted(sizes[drawn].tolist(), reverse=True)):
-        emptiest = int(np.argmax(room))
-        # Where the last large group does not fit, a smaller one takes its place.
-        size = min(size, room[emptiest])
-        if size >= 2:
-            layouts[emptiest].append(_split(size, (number * GOLDEN) % 1, config))
-            room[emptiest] -= size
-    for layout, left in zip(layouts, room, strict=True):
-        layout.extend([(1, 1)] * (left // 2))
-    return tuple(dict.fromkeys(tuple(sorted(layout)) for layout in layouts))
-
-
-def _split(size: int, draw: float, config: SamplingConfig) -> GroupShape:
+    size = 2 if rng.random() < PAIR_PROBABILITY else int(rng.integers(2, max_group + 1))
+    is_scan_to_map = size <= config.max_side and rng.random() < 0.5
     least, most = max(1, size - config.max_side), min(size - 1, config.max_side)
-    if least == 1 and draw < 0.5:
-        return 1, size - 1
-    first = least + int((2 * draw % 1) * (most - least + 1))
-    return min(first, size - first), max(first, size - first)
+    first = 1 if is_scan_to_map else int(rng.integers(least, most + 1))
+    num_groups = config.num_scans // size
+    return Layout(min(first, size - first), max(first, size - first), num_groups, num_groups * size)
+
+
+@functools.cache
+def layout_capacity(layout: Layout, config: SamplingConfig) -> Layout:
+    """Finds the capacity of the arrays for a layout; each capacity compiles one step.
+
+    Args:
+        layout: sizes from `draw_layout`.
+        config: capacity of a sample, and of a map.
+
+    Returns:
+        The next power of two of each map, and room for the groups and scans of all layouts with these.
+    """
+    sides = [1 << (num - 1).bit_length() for num in (layout.num_source, layout.num_target)]
+    ranges = [range(side // 2 + 1, min(side, config.max_side) + 1) for side in sides]
+    sizes = {source + target for source in ranges[0] for target in ranges[1] if source + target <= config.num_scans}
+    num_groups = {size: config.num_scans // size for size in sizes}
+    num_scans = max(size * num for size, num in num_groups.items())
+    return Layout(ranges[0][-1], ranges[1][-1], max(num_groups.values()), num_scans)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
-from typing import NamedTuple
+import operator
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,9 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.scan_registration import trace_match
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig, training_pairs
+from dpmjax.deeppointmap.training.preparation import prepare_drive
 from dpmjax.deeppointmap.training.sampling import SampleScans
-from dpmjax.deeppointmap.training.scan_store import ScanStore, prepare_drive
+from dpmjax.deeppointmap.training.scan_store import ScanStore
 from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
@@ -31,6 +33,8 @@ from dpmjax.types import AnyArray, DescriptorCloud, Poses, Registration
 TRAINED = ObjectiveConfig()
 
 PAIR_STREAM = 3103
+# Scans, maps or pairs that one compiled program evaluates in turn.
+CHUNK = 10
 # Largest distance of the scans of an evaluated map from its first scan.
 MAP_RADIUS_M = 10.0
 
@@ -157,7 +161,7 @@ def draw_evaluation_pairs(
     rng = np.random.default_rng([PAIR_STREAM, seed])
     thinned = drive.take(slice(None, None, -(-len(drive) // max_scans)))
     pairs = tuple(_draw(thinned, num_pairs, kind, rng) for kind in kinds)
-    settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1)
+    settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1, thins_as_in_use=True)
     store = ScanStore([prepare_drive(thinned, settings)])
     scans, placed = store.read(np.arange(len(thinned)), settings, rng)
     return EvaluationPairs(scans, placed.T_world_scan, pairs, config.scale_m)
@@ -189,13 +193,24 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
     Returns:
         Errors, registrations and descriptors.
     """
-    clouds = _encode_all(model, pairs.scans)
+    clouds = _in_chunks(functools.partial(_encode_all, model), pairs.scans)
     matches, recalls = [], []
     for some in pairs.pairs:
         sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
-        matches.append(jax.device_get(_register_all(model, *sides)))
+        matches.append(_in_chunks(functools.partial(_register_all, model), *sides))
         recalls.append(registration_recall(matches[-1].T_target_source, pairs.true_motions(some)))
     return Evaluation(tuple(recalls), tuple(matches), clouds)
+
+
+def _in_chunks(function: Callable[..., Any], *trees: Any) -> Any:
+    """Applies a function to so many entries at a time, so that no number of scans or pairs compiles it again."""
+    trees = jax.tree.map(np.asarray, trees)
+    num = len(jax.tree.leaves(trees)[0])
+    parts = []
+    for start in range(0, num, CHUNK):
+        rows = np.minimum(np.arange(start, start + CHUNK), num - 1)
+        parts.append(jax.device_get(function(*jax.tree.map(operator.itemgetter(rows), trees))))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
 
 
 @jax.jit
@@ -213,15 +228,16 @@ def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorClo
 
 def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Poses) -> DescriptorCloud:
     T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
-    merged = _merge_all(clouds, jnp.asarray(rows), jnp.asarray(T_map_scan, jnp.float32))
-    unions = zip(np.asarray(merged.positions), np.asarray(merged.mask), strict=True)
+    of_maps = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], clouds)
+    merged: DescriptorCloud = _in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
+    unions = zip(merged.positions, merged.mask, strict=True)
     masks = [thinned_mask(positions, mask, clouds.mask.shape[1]) for positions, mask in unions]
-    return merged.replace(mask=jnp.asarray(np.stack(masks)))
+    return merged.replace(mask=np.stack(masks))
 
 
 @jax.jit
-def _merge_all(clouds: DescriptorCloud, rows: Array, T_map_scan: Array) -> DescriptorCloud:
-    return jax.vmap(merge_clouds)(jax.tree.map(lambda leaf: leaf[rows], clouds), T_map_scan)
+def _merge_all(clouds: DescriptorCloud, T_map_scan: Array) -> DescriptorCloud:
+    return jax.vmap(merge_clouds)(clouds, T_map_scan)
 
 
 class OffsetQuality(NamedTuple):

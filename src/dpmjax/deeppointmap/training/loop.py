@@ -19,11 +19,12 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig, layout_capacity
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
@@ -56,14 +57,16 @@ class Speed(NamedTuple):
     """Seconds of steps.
 
     Attributes:
-        run_s: seconds of all steps but the first of each layout.
-        compile_s: seconds of the first step of each layout, which is compiled.
+        run_s: seconds of all steps that were compiled before.
+        compile_s: seconds of the first step of each capacity of a layout, which is compiled.
         num_scans: number of scans that the steps of `run_s` processed.
+        num_steps: number of the steps of `run_s`.
     """
 
     run_s: float = 0.0
     compile_s: float = 0.0
     num_scans: int = 0
+    num_steps: int = 0
 
     @property
     def scans_per_s(self) -> float:
@@ -98,16 +101,17 @@ class TrainingHooks:
         evaluate_every: number of steps from one evaluation to the next.
         on_report: gets the record and the progress after each step.
         stop: called before each step; any number but 0 ends training in all processes.
-        finish: called before each step until it returns True in any process; from then on the learning rate falls, as
-            `training.finish` describes.
+        steps_left: called before each step with the number of steps done; any number but 0 sets the end that many
+            steps ahead, at most at that of the curriculum, as `training.finish` does. Of several processes the largest
+            number counts.
     """
 
     evaluate: Callable[[Model], float] | None = None
     evaluate_every: int = 100
     on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
-    # int() is 0 and bool() is False: by default nothing ends training.
+    # int() is 0: by default nothing ends training.
     stop: Callable[[], int] = int
-    finish: Callable[[], bool] = bool
+    steps_left: Callable[[int], int] | None = None
 
     def __post_init__(self) -> None:
         require_fields(self, "evaluate_every", low=1)
@@ -185,13 +189,13 @@ def train(
 ) -> Trained:
     """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
-    Each scan is prepared once before the first step. With several processes (`join_processes`), each calls this
-    function with the same arguments; process 0 alone evaluates and reports.
+    Each scan is prepared before the first step, or at each use where `config.num_variants` is 0. With several processes
+    (`join_processes`), each calls this function with the same arguments; process 0 alone evaluates and reports.
 
     Args:
         drives: sequences with a true pose for each scan, such as `io.open_lidar_sequence` and
             `simulation.simulate_scenes` return; or scans that are prepared already.
-        config: settings of training; `training_preset` has three.
+        config: settings of training; `training_preset` has three. Its epochs are converted to steps.
         seed: seed of parameters, samples and augmentation.
         start: progress to continue from, of which that of process 0 counts; or a model with the first parameters;
             None begins with random ones.
@@ -211,10 +215,12 @@ def train(
         raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
     # Calibrations belong to the parameters that they were fitted for.
     config = replace(config, model=replace(config.model, calibration=None, overlap=None))
-    if not isinstance(start, TrainingProgress):
-        start = begin_training(config, seed=seed, start=start)
+    begun = start if isinstance(start, TrainingProgress) else begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
-    progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
+    config = config.for_scans(len(store.table), num_samples=jax.device_count())
+    if not isinstance(start, TrainingProgress):
+        begun = replace(begun, state=replace(begun.state, end=np.asarray(config.num_steps, np.int32)))
+    progress, stopped_by, speed = _run_steps(store, config, hooks, begun, seed=seed)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
     return Trained(_local(Model(params, config.model)), progress, stopped_by, speed)
 
@@ -226,31 +232,30 @@ def _run_steps(
     mesh, num_local = device_mesh(), jax.local_device_count()
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
-    speed, seen, stopped_by, is_finishing = Speed(), set[Layout](), 0, False
-    first_sample = jax.process_index() * num_local
+    speed, seen, stopped_by = Speed(), set[Layout](), 0
+    first_sample, num_in_step = jax.process_index() * num_local, jax.device_count()
     number, end = int(progress.state.step), int(progress.state.end)
-    with SampleMaker(store, config, seed=seed, num_samples=num_local, first_sample=first_sample) as maker:
-        batches = maker.batches(number, end)
+    with SampleMaker(
+        store, config, seed=seed, num_samples=num_local, first_sample=first_sample, num_in_step=num_in_step
+    ) as maker:
+        batches = maker.batches(number, max(end, config.num_steps))
         with together():
-            batch = next(batches, None)
+            batch = next(batches) if number < end else None
         while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
-            if not is_finishing and (is_finishing := bool(largest(int(hooks.finish())))):
-                progress = place(replace(progress, state=finish(progress.state, config)), mesh)
-                end = int(progress.state.end)
-            stage, layout = config.stage_at(number), config.layout_at(number)
+            left = largest(0 if hooks.steps_left is None else hooks.steps_left(number))
+            if left > 0 and (new_end := min(number + left, max(end, config.num_steps))) != end:
+                progress, end = replace(progress, state=_ended_at(progress.state, new_end, mesh)), new_end
+            stage, layout = config.stage_at(number), config.layout_at(number, seed=seed)
+            capacity = layout_capacity(layout, config.sampling)
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, is_batch=True))
             number += 1
             with together():  # the next batch is prepared while the device computes
-                batch = next(batches, None) if number < end else None
+                batch = next(batches) if number < end else None
             report = jax.device_get(report)
             seconds = time.perf_counter() - begun
-            if layout in seen:
-                num_scans = speed.num_scans + config.sampling.num_scans * jax.device_count()
-                speed = speed._replace(run_s=speed.run_s + seconds, num_scans=num_scans)
-            else:
-                seen.add(layout)
-                speed = speed._replace(compile_s=speed.compile_s + seconds)
+            speed = _timed(speed, seconds, 0 if capacity not in seen else layout.num_scans * jax.device_count())
+            seen.add(capacity)
             progress = replace(progress, state=state)
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
@@ -259,6 +264,23 @@ def _run_steps(
                 if hooks.on_report is not None and is_first():
                     hooks.on_report(StepRecord(number, stage, report, score, speed), progress)
     return progress, stopped_by, speed
+
+
+def _ended_at(state: TrainingState, end: int, mesh: Mesh) -> TrainingState:
+    planned = finish(state, end - int(state.step))
+    return replace(
+        state,
+        end=place(planned.end, mesh),
+        planned_at=place(planned.planned_at, mesh),
+        planned_progress=place(planned.planned_progress, mesh),
+    )
+
+
+def _timed(speed: Speed, seconds: float, num_scans: int) -> Speed:
+    """Adds the seconds of a step; without scans, it was compiled."""
+    if num_scans == 0:
+        return speed._replace(compile_s=speed.compile_s + seconds)
+    return Speed(speed.run_s + seconds, speed.compile_s, speed.num_scans + num_scans, speed.num_steps + 1)
 
 
 def _evaluate_when_due(

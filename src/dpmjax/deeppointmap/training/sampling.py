@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.matching import thinned_mask
-from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, GroupShape, Layout, SamplingConfig
+from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, Layout, SamplingConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 from dpmjax.types import AnyArray, Poses
@@ -91,22 +91,21 @@ def draw_groups(
     Args:
         table: the scans.
         first_anchor: anchor of one of the groups; all further anchors are random.
-        layout: sizes of the groups.
+        layout: number and size of the groups.
         config: distances.
         rng: source of the draws.
 
     Returns:
-        A group for each entry of the layout; smaller where there are fewer scans, None where no anchor with a
-        scan near it was found.
+        The groups; smaller where there are fewer scans, None where no anchor with a scan near it was found.
 
     Raises:
         ValueError: if all are None.
     """
-    groups: list[Group | None] = [None] * len(layout)
+    groups: list[Group | None] = [None] * layout.num_groups
     anchor, num_left = first_anchor, NUM_ATTEMPTS
-    for place in rng.permutation(len(layout)):
+    for place in range(layout.num_groups):
         while groups[place] is None and num_left > 0:
-            groups[place] = _group_at(table, anchor, layout[place], config, rng)
+            groups[place] = _group_at(table, anchor, layout, config, rng)
             num_left -= groups[place] is None
             anchor = int(rng.integers(len(table)))
     if not any(groups):
@@ -116,16 +115,16 @@ def draw_groups(
 
 
 def _group_at(
-    table: ScanTable, anchor: int, shape: GroupShape, config: SamplingConfig, rng: np.random.Generator
+    table: ScanTable, anchor: int, layout: Layout, config: SamplingConfig, rng: np.random.Generator
 ) -> Group | None:
     distances = table.distances_from(anchor)
     distances[anchor] = np.inf
     others = np.flatnonzero((distances >= MIN_DISTANCE_M) & (distances <= config.max_distance_m))
     if len(others) == 0:
         return None
-    chosen = rng.choice(others, min(sum(shape) - 1, len(others)), replace=False)
+    chosen = rng.choice(others, min(layout.num_source + layout.num_target - 1, len(others)), replace=False)
     members = rng.permutation(np.concatenate([[anchor], chosen]))
-    num_source = min(shape[0], len(members) - 1)
+    num_source = min(layout.num_source, len(members) - 1)
     # The scan nearest to the opposite map stands first, as the nearest keyframe does in SLAM. It is the frame of its
     # map, and thinning keeps all its descriptors.
     target = _nearest_first(table, members[num_source:], int(members[0]))
@@ -143,7 +142,7 @@ class MapOfScans:
 
     Attributes:
         rows: rows of its scans in the sample; 0 where a map has fewer scans.
-        mask: False where a map has fewer scans or descriptors, and where `matching.thinned_mask` removes one.
+        mask: False where a map has fewer scans or descriptors, and where thinning removes one.
         T_map_scan: poses of the scans in the frame of the map, metres.
     """
 
@@ -154,7 +153,7 @@ class MapOfScans:
 
 @flax.struct.dataclass
 class GroupBatch:
-    """Groups of one shape.
+    """The groups of a sample.
 
     Attributes:
         source: first map of each group.
@@ -202,23 +201,26 @@ class RegistrationSample:
 
     Attributes:
         scans: all scans.
-        groups: the groups, those of one shape together.
+        groups: the groups.
     """
 
     scans: SampleScans
-    groups: tuple[GroupBatch, ...]
+    groups: GroupBatch
 
 
-def arrange_groups(groups: Sequence[Group | None], layout: Layout, placed: PlacedScans) -> tuple[GroupBatch, ...]:
-    """Arranges groups as NumPy arrays, whose shapes depend on the layout only.
+def arrange_groups(
+    groups: Sequence[Group | None], capacity: Layout, placed: PlacedScans, *, thins: bool = True
+) -> GroupBatch:
+    """Arranges groups as NumPy arrays, whose shapes depend on the capacity only.
 
     Args:
         groups: groups from `draw_groups`.
-        layout: sizes of the groups.
+        capacity: capacity from `layout_capacity`.
         placed: the scans of all groups: the source of the first group, its target, the source of the second, ...
+        thins: True for maps without the descriptors that `matching.thinned_mask` removes.
 
     Returns:
-        One batch for each shape in the layout, in its order.
+        The groups.
 
     Raises:
         ValueError: if the number of poses is not that of the scans in the groups.
@@ -231,20 +233,16 @@ def arrange_groups(groups: Sequence[Group | None], layout: Layout, placed: Place
         None if group is None else Group(*np.split(np.arange(end - len(group.rows), end), [len(group.source)]))
         for group, end in zip(groups, ends, strict=True)
     ]
-    batches = []
-    for shape in dict.fromkeys(layout):
-        places = [rows for rows, its_shape in zip(rows_of, layout, strict=True) if its_shape == shape]
-        sides = [
-            _maps_of_scans([None if rows is None else rows[side] for rows in places], placed, shape[side])
-            for side in (0, 1)
-        ]
-        T = np.tile(np.eye(4), (len(places), 1, 1))
-        for number, rows in enumerate(places):
-            if rows is not None:
-                T[number] = rigid.inverse(T_world_scan[rows.target[0]]) @ T_world_scan[rows.source[0]]
-        mask = np.array([rows is not None for rows in places])
-        batches.append(GroupBatch(sides[0], sides[1], T.astype(np.float32), mask))
-    return tuple(batches)
+    rows_of += [None] * (capacity.num_groups - len(rows_of))
+    sources, targets = (
+        _maps_of_scans([None if rows is None else rows[side] for rows in rows_of], placed, capacity[side], thins)
+        for side in (0, 1)
+    )
+    T = np.tile(np.eye(4), (len(rows_of), 1, 1))
+    for number, rows in enumerate(rows_of):
+        if rows is not None:
+            T[number] = rigid.inverse(T_world_scan[rows.target[0]]) @ T_world_scan[rows.source[0]]
+    return GroupBatch(sources, targets, T.astype(np.float32), np.array([rows is not None for rows in rows_of]))
 
 
 def stack(trees: Sequence[TreeT]) -> TreeT:
@@ -259,7 +257,9 @@ def stack(trees: Sequence[TreeT]) -> TreeT:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def _maps_of_scans(rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedScans, capacity: int) -> MapOfScans:
+def _maps_of_scans(
+    rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedScans, capacity: int, thins: bool
+) -> MapOfScans:
     num_descriptors = placed.mask.shape[1]
     padded = np.zeros((len(rows), capacity), np.int32)
     mask = np.zeros((len(rows), capacity, num_descriptors), bool)
@@ -268,8 +268,8 @@ def _maps_of_scans(rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedS
         if scans is not None:
             padded[number, : len(scans)] = scans
             positions, is_there = placed.positions_world[scans].reshape(-1, 3), placed.mask[scans].reshape(-1)
-            thinned = thinned_mask(positions, is_there, num_descriptors)
-            mask[number, : len(scans)] = thinned.reshape(len(scans), -1)
+            kept = thinned_mask(positions, is_there, num_descriptors) if thins else is_there
+            mask[number, : len(scans)] = kept.reshape(len(scans), -1)
             T_world_first = placed.T_world_scan[scans[0]]
             T_map_scan[number, : len(scans)] = rigid.inverse(T_world_first) @ placed.T_world_scan[scans]
     return MapOfScans(padded, mask, T_map_scan)

@@ -11,7 +11,6 @@ overlap head: overlap is fitted afterwards (`deeppointmap.overlap_prediction`).
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -19,13 +18,15 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from dpmjax.checks import require_count
 from dpmjax.deeppointmap.matching import merge_clouds
 from dpmjax.deeppointmap.model import Model, correlate, decode, encode_pyramid, init_model, predict_offsets
-from dpmjax.deeppointmap.training.curriculum import DECAY_RATIO, TrainingConfig
+from dpmjax.deeppointmap.training.curriculum import TrainingConfig
 from dpmjax.deeppointmap.training.objective import (
     ObjectiveTerms,
     TrainingPairs,
@@ -42,8 +43,8 @@ from dpmjax.types import AnyArray, DescriptorCloud
 # Groups of about this many scans are decoded at the same time, or of as many scans as are encoded at the same time.
 GROUP_SCANS_AT_ONCE = 16
 
-# Largest number of descriptors of one map (ours): thinning leaves a fifth of a map of 16 scans, and attention over all
-# of them would cost twenty times as much.
+# Largest number of descriptors of a thinned map (ours). Thinning leaves a fifth of a map of 16 scans, and attention
+# over all of them would cost twenty times as much.
 MAX_DESCRIPTORS = 1024
 
 # Weight decay of AdamW.
@@ -58,15 +59,17 @@ class TrainingState:
         params: parameters of the model.
         optimizer: state of the optimiser.
         step: number of steps done.
-        decay_start: first step of the decay of the learning rate.
         end: step after the last.
+        planned_at: step at which this end was set.
+        planned_progress: progress of the learning rate at that step, from 0 to 1.
     """
 
     params: dict[str, Any]
     optimizer: optax.OptState
     step: Int[AnyArray, ""]
-    decay_start: Int[AnyArray, ""]
     end: Int[AnyArray, ""]
+    planned_at: Int[AnyArray, ""]
+    planned_progress: Float[AnyArray, ""]
 
 
 class TrainingReport(NamedTuple):
@@ -98,39 +101,38 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
     Returns:
         The state.
     """
-    params = init_model(key, config.model).params
-    num_steps = config.num_steps
+    params = init_model(key, config.model, distribution=config.initialization).params
     return TrainingState(
         params=params,
         optimizer=_optimizer(config).init(params),
         step=jnp.zeros((), jnp.int32),
-        decay_start=jnp.asarray(num_steps - round(DECAY_RATIO * num_steps), jnp.int32),
-        end=jnp.asarray(num_steps, jnp.int32),
+        end=jnp.asarray(config.num_steps, jnp.int32),
+        planned_at=jnp.zeros((), jnp.int32),
+        planned_progress=jnp.zeros((), jnp.float32),
     )
 
 
-def finish(state: TrainingState, config: TrainingConfig) -> TrainingState:
-    """Begins the decay of the learning rate at once, so that training ends early.
-
-    The decay still takes the share `DECAY_RATIO` of all steps.
+def finish(state: TrainingState, num_steps: int) -> TrainingState:
+    """Sets the number of steps that are left; in them the learning rate falls by the rest of its cosine.
 
     Args:
         state: state before any step.
-        config: settings of training.
+        num_steps: number of further steps, at least 1.
 
     Returns:
-        The state with its new end; the same state if its decay has begun, or would end no earlier.
+        The state with its new end.
     """
-    step = int(state.step)
-    num_decay = max(1, math.ceil(step * DECAY_RATIO / (1 - DECAY_RATIO)))
-    if step >= int(state.decay_start) or step + num_decay >= int(state.end):
-        return state
-    end = jnp.asarray(step + num_decay, jnp.int32)
-    return replace(state, decay_start=jnp.asarray(step, jnp.int32), end=end)
+    require_count("num_steps", num_steps)
+    plan: dict[str, Any] = {
+        name: np.asarray(getattr(state, name)) for name in ("step", "end", "planned_at", "planned_progress")
+    }
+    progress = np.asarray(_progress(replace(state, **plan)))
+    end = np.asarray(plan["step"] + num_steps, np.int32)
+    return replace(state, end=end, planned_at=plan["step"], planned_progress=progress)
 
 
 def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:
-    """Makes the jitted step, which compiles once for each layout of the curriculum.
+    """Makes the jitted step, which compiles once for each capacity of a layout.
 
     Batches carry samples along their first axis and may be spread over devices by `place`. The loss is the mean
     over all groups of all samples, so the number of devices changes the speed only.
@@ -178,26 +180,24 @@ def batch_loss(
     """
     model = Model(params, config.model)
 
-    def of_sample(sample: RegistrationSample) -> list[tuple[Array, ObjectiveTerms]]:
+    def of_sample(sample: RegistrationSample) -> tuple[Array, ObjectiveTerms]:
         clouds = _in_parts(functools.partial(encode_sample, model), sample.scans, config.scans_at_once)
+        merged = functools.partial(_merged, thins=config.thins_maps)
         in_groups = max(GROUP_SCANS_AT_ONCE, config.scans_at_once)
 
         def of_group(group: GroupBatch) -> tuple[Array, ObjectiveTerms]:
             # Applies the networks to two maps, and computes the losses (DeepPointMap eq. 4 to 7).
-            maps, T = (_merged(clouds, group.source), _merged(clouds, group.target)), group.T_target_source
+            maps, T = (merged(clouds, group.source), merged(clouds, group.target)), group.T_target_source
             correlated = correlate(model, *maps)
             close = training_pairs(*maps, T, config=config.objective)
             sides = zip(maps, correlated, correlated[::-1], close, strict=True)
             return matching_loss(*(_side(model, *side) for side in sides), T, config=config.objective)
 
-        return [
-            _in_parts(of_group, group, in_groups // (group.source.rows.shape[1] + group.target.rows.shape[1]))
-            for group in sample.groups
-        ]
+        num_scans = sample.groups.source.rows.shape[1] + sample.groups.target.rows.shape[1]
+        return _in_parts(of_group, sample.groups, in_groups // num_scans)
 
-    of_shapes = _over_samples(of_sample, batch)
-    mask = jnp.concatenate([group.mask for group in batch.groups], axis=1)
-    losses, terms = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *of_shapes)
+    losses, terms = _over_samples(of_sample, batch)
+    mask = batch.groups.mask
     count = jnp.maximum(jnp.sum(mask), 1)
     loss, terms = jax.tree.map(lambda x: jnp.sum(jnp.where(mask, x, 0)) / count, (losses, terms))
     return loss, terms
@@ -254,10 +254,10 @@ def _side(
     )
 
 
-def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
+def _merged(clouds: DescriptorCloud, scans: MapOfScans, *, thins: bool) -> DescriptorCloud:
     chosen: DescriptorCloud = jax.tree.map(lambda x: x[scans.rows], clouds)
     union = merge_clouds(replace(chosen, mask=chosen.mask & scans.mask), scans.T_map_scan)
-    if len(union.mask) <= MAX_DESCRIPTORS:
+    if not thins or len(union.mask) <= MAX_DESCRIPTORS:
         return union
     # Valid rows stand in front, those of the nearest scan first.
     order = jnp.argsort(~union.mask, stable=True)[:MAX_DESCRIPTORS]
@@ -265,11 +265,14 @@ def _merged(clouds: DescriptorCloud, scans: MapOfScans) -> DescriptorCloud:
     return compact
 
 
+def _progress(state: TrainingState) -> Float[Array, ""]:
+    length = jnp.maximum(state.end - state.planned_at, 1)
+    share = jnp.clip((state.step - state.planned_at) / length, 0, 1).astype(jnp.float32)
+    return jnp.asarray(state.planned_progress + (1 - state.planned_progress) * share)
+
+
 def _learning_rate(state: TrainingState, config: TrainingConfig) -> Float[Array, ""]:
-    # Warm-up, constant, half a cosine at the end.
-    length = state.end - state.decay_start
-    progress = jnp.clip((state.step - state.decay_start) / jnp.maximum(length, 1), 0, 1)
-    share = (1 + jnp.cos(jnp.pi * progress)) / 2
+    share = (1 + jnp.cos(jnp.pi * _progress(state))) / 2
     rate = config.final_learning_rate + share * (config.learning_rate - config.final_learning_rate)
     return rate * jnp.minimum(1, (state.step + 1) / max(1, config.warmup_steps))
 
@@ -278,7 +281,6 @@ def _optimizer(config: TrainingConfig) -> optax.GradientTransformation:
     # AdamW without its learning rate, which depends on the state.
     return optax.chain(
         optax.clip_by_global_norm(config.max_gradient_norm),
-        # The mean of gradients is stored in 16 bits: a sixth of a checkpoint less, and training does not need more.
-        optax.scale_by_adam(mu_dtype=jnp.bfloat16),
+        optax.scale_by_adam(),
         optax.add_decayed_weights(WEIGHT_DECAY),
     )
