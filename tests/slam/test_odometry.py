@@ -15,7 +15,7 @@ from dpmjax.scans.weak_directions import diagonal_information, sigma_along
 from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
 from dpmjax.slam.keyframe_map import Keyframe, add_keyframe
 from dpmjax.slam.local_map import local_map_of
-from dpmjax.slam.model_methods import CONTRADICTION_WEIGHT, MAX_ELEMENTS, SPREAD_M
+from dpmjax.slam.surface_geometry import CONTRADICTION_WEIGHT, MAX_ELEMENTS, SPREAD_M
 from dpmjax.types import SurfaceElements
 
 

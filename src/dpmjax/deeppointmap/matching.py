@@ -43,7 +43,7 @@ MIN_INLIER_SCORE = 0.5
 # A choice of fewer inliers is rejected (published configuration).
 MIN_NUM_INLIERS = 30
 
-# Largest number of pairs per direction. More pairs do not make a motion more exact, and the cost of the consensus is
+# Largest number of pairs per direction for a consensus. More pairs do not make a motion more exact, and its cost is
 # cubic.
 MAX_NUM_PAIRS = 512
 
@@ -170,7 +170,9 @@ def best_pairs(
     # floor(floor(ratio * (m + n)) / 2): the count of the published configuration.
     # In float32, as the number of valid pairs below: padding must not change it.
     wanted = int(np.float32(config.pair_ratio) * np.float32(num_source + num_target)) // 2
-    capacity = min(wanted, MAX_NUM_PAIRS, num_source * num_target)
+    capacity = min(wanted, num_source * num_target)
+    if config.consensus is not None:
+        capacity = min(capacity, MAX_NUM_PAIRS)
     is_pair = source_mask[:, None] & target_mask[None, :]
     scores = dual_softmax(similarity, is_pair)
     scores, flat = lax.top_k(jnp.where(is_pair, scores, -1).ravel(), capacity)

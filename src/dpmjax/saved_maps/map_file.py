@@ -39,7 +39,7 @@ ADVICE, RESUME_ADVICE = "save it again with dpmjax.save_map", "start the run aga
 MAP = "map."
 NOT_IN_LOOPS = ("loops",)
 # Fields that are stored separately, or computed from the map.
-NOT_IN_FRONT_END = ("local_map", "recent", "lost", "scores")
+NOT_IN_FRONT_END = ("local_map", "recent", "lost", "scores", "dropped")
 
 
 def save_map(path: str | Path, slam_map: KeyframeMap, precision: Precision = "float32") -> Path:
@@ -199,7 +199,7 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
         ValueError: if the map is empty, or the last scan is not the one of a keyframe.
     """
     front_end, slam_map, loops = state
-    if front_end.local_map is not None:
+    if front_end.local_map is not None or front_end.dropped:
         raise ValueError("state: expected the state after a keyframe, got scans since the last one")
     arrays = {f"{MAP}{name}": array for name, array in map_arrays(slam_map, "float32").items()}
     arrays |= to_columns(reports, "report") | to_columns(loops.loops, "loop")
@@ -233,7 +233,7 @@ def load_state(path: str | Path) -> RunState:
         (loops,) = from_columns(LoopState, arrays, "loops", without=NOT_IN_LOOPS)
         (front_end,) = from_columns(FrontEndState, arrays, "front_end", without=NOT_IN_FRONT_END)
         recent = tuple(from_columns(PlacedElements, arrays, "recent"))
-        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent, lost=())
+        front_end = front_end._replace(scores=tuple(arrays["scores"].tolist()), recent=recent, lost=(), dropped=())
         loops = loops._replace(loops=tuple(from_columns(Loop, arrays, "loop")))
         return RunState(SlamState(front_end, slam_map, loops), tuple(from_columns(ScanReport, arrays, "report")))
 

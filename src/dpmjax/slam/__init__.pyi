@@ -6,6 +6,7 @@ from .agents import join_agents as join_agents
 from .agents import merge_maps as merge_maps
 from .agents import run_agents as run_agents
 from .agents import take_component as take_component
+from .config import DescriptorConfig as DescriptorConfig
 from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig
 from .config import OdometryConfig as OdometryConfig
@@ -41,9 +42,9 @@ from .loops import Loop as Loop
 from .map_optimization import RefinedKeyframes as RefinedKeyframes
 from .map_optimization import refine_keyframes as refine_keyframes
 from .model_methods import NetworkMatcher as NetworkMatcher
-from .model_methods import SurfaceGeometry as SurfaceGeometry
 from .model_methods import make_methods as make_methods
 from .model_methods import pooled_vector as pooled_vector
+from .surface_geometry import SurfaceGeometry as SurfaceGeometry
 from .system import SlamResult as SlamResult
 from .system import SlamState as SlamState
 from .system import corrected_points as corrected_points

@@ -27,10 +27,10 @@ from dpmjax.slam.keyframe_map import (
     take_keyframes,
     with_origin,
 )
-from dpmjax.slam.loop_closure import examine_candidates, is_resting, similar_keyframes
-from dpmjax.slam.loops import Loop, LoopState, loops_of_map, num_accepted
+from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods, methods_for
+from dpmjax.slam.procedure import procedure_of
 from dpmjax.slam.system import SlamResult, place_scans, run_slam
 from dpmjax.types import Pose, Poses
 
@@ -228,12 +228,10 @@ def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe:
         (row, place) for place in range(1, len(maps)) for row in np.flatnonzero(map_of_row == order[place]).tolist()
     ]
     for number, (row, place) in enumerate(compared, start=1):
-        if not is_resting(joined, loops, row):
-            is_other = np.isin(map_of_row, order[:place])
-            candidates = similar_keyframes(joined, row, is_other, methods.config.loops)
-            loops = examine_candidates(methods, joined, loops, candidates)
+        is_other = np.isin(map_of_row, order[:place])
+        joined, loops = procedure_of(methods.config).join_keyframe(methods, joined, loops, row, is_other)
         on_keyframe(number, len(compared))
-    if num_accepted(loops):
+    if has_new_loops(joined, (*inner, *loops)):
         joined, state = optimize_map(joined, LoopState((*inner, *loops)))
         loops = state.loops[len(inner) :]
     between = [map_of_row[list(loop[:2])].tolist() for loop in loops if loop.status == "accepted"]

@@ -13,6 +13,7 @@ from dpmjax.checks import require_fields, require_one_of, require_positive_field
 from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
 
 Proposer = Literal["prediction", "network"]
+SlamMethod = Literal["surfaces", "descriptors"]
 
 NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1)))
 WIDE = AlignmentConfig(levels=(AlignmentLevel(3.0, 300, 10),))
@@ -102,18 +103,54 @@ class LoopClosureConfig:
 
 
 @dataclass(frozen=True)
+class DescriptorConfig:
+    """SLAM by descriptors alone (DeepPointMap section 4; defaults: published configuration).
+
+    Attributes:
+        keyframe_m: distance of keyframes at the start of a drive; small errors of registrations enlarge it, large ones
+            reduce it (published: 10 for KITTI, 7 for KITTI-360, 3 for MulRan).
+        min_confidence: smallest mean score of the best pairs of an accepted registration.
+        max_rmse_m: largest root mean square error of the pairs of an accepted registration, also the unit of errors
+            in the rule of keyframes. A decoder whose offsets are not exact needs more: 2.5 for `dpm_small`.
+        min_overlap: overlap probability above which the best candidate of a loop is registered.
+    """
+
+    keyframe_m: float = 10.0
+    min_confidence: float = 0.6
+    max_rmse_m: float = 0.5
+    min_overlap: float = 0.7
+
+    def __post_init__(self) -> None:
+        require_positive_fields(self, "keyframe_m", "max_rmse_m")
+        require_fields(self, "min_confidence", "min_overlap", low=0, high=1)
+
+
+@dataclass(frozen=True)
 class SlamConfig:
     """Settings of `run_slam`.
 
     Attributes:
-        odometry: registration against the local map.
-        front_end: acceptance of poses, and keyframes.
-        loops: loop closure and optimisation.
+        method: "surfaces" aligns surface elements; the decoder proposes motions. With "descriptors" the decoder alone
+            registers scans and maps (DeepPointMap section 4).
+        odometry: registration against the local map, for "surfaces".
+        front_end: acceptance of poses, and keyframes, for "surfaces".
+        loops: loop closure and optimisation, for "surfaces"; `is_on` counts for both.
+        descriptors: settings of "descriptors".
     """
 
+    method: SlamMethod = "surfaces"
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
     loops: LoopClosureConfig = field(default_factory=LoopClosureConfig)
+    descriptors: DescriptorConfig = field(default_factory=DescriptorConfig)
+
+    def __post_init__(self) -> None:
+        require_one_of("method", self.method, get_args(SlamMethod))
+
+    @property
+    def encodes_each_scan(self) -> bool:
+        """True where each scan is encoded, not keyframes alone."""
+        return self.method == "descriptors" or self.odometry.proposer == "network"
 
 
 SlamPreset = Literal["default", "paper"]
@@ -123,9 +160,8 @@ def slam_preset(name: SlamPreset) -> SlamConfig:
     """Returns named settings of SLAM.
 
     Args:
-        name: "default", or "paper" for the thresholds of DeepPointMap's published configuration. There the decoder
-            registers every scan, and keyframes are up to 10 m apart. One loop candidate by distance is registered from
-            an overlap probability of 0.7 on and accepted alone.
+        name: "default", or "paper" for section 4 of DeepPointMap by its own method, with the published thresholds: the
+            decoder's motion is the pose, and no surfaces are aligned. Our weights need a larger `max_rmse_m`.
 
     Returns:
         The settings.
@@ -134,20 +170,4 @@ def slam_preset(name: SlamPreset) -> SlamConfig:
         ValueError: if the name is unknown.
     """
     require_one_of("name", name, get_args(SlamPreset))
-    if name == "default":
-        return SlamConfig()
-    return SlamConfig(
-        odometry=OdometryConfig(proposer="network", num_keyframes=16),
-        front_end=FrontEndConfig(
-            min_probability=0.6, num_submap=16, num_lost=5, keyframe_share=1.0, max_keyframe_m=10.0, min_keyframe_m=1.0
-        ),
-        loops=LoopClosureConfig(
-            num_near=16,
-            num_similar=0,
-            min_overlap=0.7,
-            num_asked=16,
-            num_registered=1,
-            min_probability=0.6,
-            min_support=1,
-        ),
-    )
+    return SlamConfig() if name == "default" else SlamConfig(method="descriptors")

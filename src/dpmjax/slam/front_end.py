@@ -15,8 +15,8 @@ from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.scans.weak_directions import diagonal_information, sigma_along
-from dpmjax.slam.interfaces import Alignment, PreparedInput, Proposal, SlamMethods, ThinnedScan
-from dpmjax.slam.keyframe_map import Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
+from dpmjax.slam.interfaces import Alignment, Match, PreparedInput, Proposal, SlamMethods, ThinnedScan
+from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
 from dpmjax.types import Information, Pose
 
@@ -63,9 +63,9 @@ UNKNOWN_M = 1000.0
 
 
 # Source of a pose. "first": first scan of the map, or of a new part of a loaded one. "tracked": aligned from the
-# predicted pose. "network": aligned from the decoder's pose, or confirmed by it at a low score. "predicted": no
-# alignment was accepted; the pose is a guess. "empty": too few points. "restarted": first scan of a new part at a
-# guessed pose, after several rejected scans; loops may join the part.
+# predicted pose, or registered by the decoder where the method is "descriptors". "network": aligned from the decoder's
+# pose, or confirmed by it at a low score. "predicted": no alignment was accepted; the pose is a guess. "empty": too few
+# points. "restarted": first scan of a new part at a guessed pose, after several rejected scans; loops may join it.
 ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
 
 
@@ -79,7 +79,7 @@ class ScanReport(NamedTuple):
         keyframe: row of the keyframe that the pose is relative to; its own row if it is one.
         T_keyframe_scan: relative pose; loops move the keyframe only.
         is_keyframe: True if it became a keyframe.
-        score: agreement of the scan with the local map.
+        score: agreement of the scan with the local map; where the method is "descriptors", confidence of the decoder.
         probability: P(correct) of the network; None where it did not run.
         num_accepted: number of loops that were accepted at this scan.
         num_points: number of points of the scan.
@@ -106,6 +106,24 @@ class ScanReport(NamedTuple):
         return self.weak_sigma_m is not None and self.weak_sigma_m > GUESS_M
 
 
+class RegisteredScan(NamedTuple):
+    """A scan that the decoder has registered with a keyframe.
+
+    Attributes:
+        scan: its number.
+        extent_m: median range of its points.
+        compact: the encoded scan.
+        target: row of the keyframe.
+        match: the registration.
+    """
+
+    scan: int
+    extent_m: float
+    compact: CompactScan
+    target: int
+    match: Match
+
+
 class FrontEndState(NamedTuple):
     """State of odometry after a scan. The frame is that of the last keyframe.
 
@@ -117,6 +135,8 @@ class FrontEndState(NamedTuple):
         T_before_last: motion of the last scan since the scan before.
         scores: of recent scans that were accepted.
         lost: the scans since one was accepted, at their predicted poses.
+        dropped: the same where the method is "descriptors", with their registrations; None for an empty scan.
+        keyframe_ratio: factor of the distance of keyframes where the method is "descriptors"; None before the first.
     """
 
     num_scans: int = 0
@@ -126,6 +146,8 @@ class FrontEndState(NamedTuple):
     T_before_last: Pose = np.eye(4)
     scores: tuple[float, ...] = ()
     lost: tuple[PlacedElements, ...] = ()
+    dropped: tuple[RegisteredScan | None, ...] = ()
+    keyframe_ratio: float | None = None
 
     @property
     def predicted(self) -> Pose:
@@ -313,17 +335,9 @@ def _make_keyframe(
     report, row = located.report, len(slam_map)
     T, is_guess = report.T_keyframe_scan, row > 0 and report.status in ("first", "restarted")
     compact = methods.matcher.encode(scan) if located.compact is None else located.compact
-    keyframe, T_world, edge = Keyframe(state.num_scans, T, 0.0, 0, scan.extent_m, compact), T, None
-    if row:
-        last, T_world = slam_map.keyframes[-1], slam_map.T_world_keyframe[-1] @ T
-        keyframe = keyframe._replace(
-            T_odometry_keyframe=last.T_odometry_keyframe @ T,
-            path_m=last.path_m + float(np.linalg.norm(T[:3, 3])),
-            segment=last.segment + is_guess,
-        )
-        edge = MapEdge(row, row - 1, T, located.information, "guess" if is_guess else "odometry")
-    slam_map = with_origin(slam_map, methods.origin)
-    slam_map = add_keyframe(slam_map, keyframe, T_world, methods.matcher.vector(compact), edge)
+    kind: EdgeKind = "guess" if is_guess else "odometry"
+    edge = MapEdge(row, row - 1, T, located.information, kind) if row else None
+    slam_map = with_keyframe(methods, slam_map, Keyframe(state.num_scans, T, 0.0, 0, scan.extent_m, compact), edge)
     # In the frame of the new keyframe; the scans of another segment have no place in it, but the lost ones begin it.
     T_new_old, before = rigid.inverse(T), state.lost if is_guess else state.recent
     moved = tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in before)
@@ -331,6 +345,33 @@ def _make_keyframe(
     recent = with_scan(moved, placed, scan.extent_m)
     after = _advanced(state, report)._replace(recent=recent, local_map=None, T_keyframe_last=np.eye(4))
     return after, slam_map, report._replace(keyframe=row, T_keyframe_scan=np.eye(4), is_keyframe=True)
+
+
+def with_keyframe(methods: SlamMethods, slam_map: KeyframeMap, keyframe: Keyframe, edge: MapEdge | None) -> KeyframeMap:
+    """Adds a keyframe at the pose that its edge gives.
+
+    Args:
+        methods: matcher and settings.
+        slam_map: the map before.
+        keyframe: the keyframe as the first of a map; with an edge, its pose, path and segment follow from the edge.
+        edge: edge from the keyframe to an earlier one; a "guess" begins a segment. None for the first of a map.
+
+    Returns:
+        The map after.
+    """
+    T_world_keyframe = keyframe.T_odometry_keyframe
+    if edge is not None:
+        last, T = slam_map.keyframes[-1], edge.T_target_source
+        T_world_keyframe = slam_map.T_world_keyframe[edge.target] @ T
+        T_odometry_keyframe = slam_map.keyframes[edge.target].T_odometry_keyframe @ T
+        step_m = float(np.linalg.norm(T_odometry_keyframe[:3, 3] - last.T_odometry_keyframe[:3, 3]))
+        keyframe = keyframe._replace(
+            T_odometry_keyframe=T_odometry_keyframe,
+            path_m=last.path_m + step_m,
+            segment=last.segment + (edge.kind == "guess"),
+        )
+    vector = methods.matcher.vector(keyframe.compact)
+    return add_keyframe(with_origin(slam_map, methods.origin), keyframe, T_world_keyframe, vector, edge)
 
 
 def _advanced(state: FrontEndState, report: ScanReport) -> FrontEndState:

@@ -112,7 +112,7 @@ class Match(NamedTuple):
         rmse: root mean square error of the inlier pairs, metres.
         verification: agreement of the scans under the motion; None where the matcher has no scans.
         information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
-            first; None where it is unknown.
+            first; None where it is unknown. `Matcher.match` gives one by the pairs of points.
     """
 
     T_target_source: Pose
@@ -150,7 +150,7 @@ class Matcher(Protocol):
     def encode(self, scan: ThinnedScan) -> CompactScan:
         """Prepares a scan for any number of registrations.
 
-        With the proposer "network" it runs one scan ahead, in the thread of `Geometry.thin`.
+        Where each scan is encoded it runs one scan ahead, in the thread of `Geometry.thin`.
 
         Args:
             scan: the scan.
@@ -189,6 +189,17 @@ class Matcher(Protocol):
 
         Returns:
             One match a pair, between the frames of the two submaps.
+        """
+
+    def match(self, source: Submap, target: Submap) -> Match:
+        """Registers two submaps by descriptors alone (DeepPointMap section 3.2).
+
+        Args:
+            source: submap; a single scan is a submap of one.
+            target: the second submap.
+
+        Returns:
+            The motion between the frames of the two; `probability` is the mean score of the best pairs.
         """
 
     def overlaps(self, source: CompactScan, targets: Sequence[CompactScan]) -> Float[np.ndarray, " n"]:

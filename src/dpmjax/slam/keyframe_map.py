@@ -236,14 +236,43 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, *, radius
     Returns:
         The submap, in the frame of the central keyframe; the others follow it, nearest first.
     """
-    source, target = _ends(slam_map.edges_of("odometry", "loop"))
-    joined = sp.coo_array((np.ones(len(source)), (source, target)), (len(slam_map), len(slam_map))).tocsr()
-    steps = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=num_keyframes)[0]
+    steps = steps_from(slam_map, row, num_keyframes)
     apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
     rows = np.flatnonzero(np.isfinite(steps) & (apart_m <= radius_m))
     rows = rows[np.lexsort((apart_m[rows], rows != row))][:num_keyframes]
-    T_submap_world = rigid.inverse(slam_map.T_world_keyframe[row])
-    return Submap(tuple(slam_map.keyframes[i].compact for i in rows), T_submap_world @ slam_map.T_world_keyframe[rows])
+    return submap_of(slam_map, rows.tolist())
+
+
+def steps_from(slam_map: KeyframeMap, row: int, most: float = np.inf) -> Float[np.ndarray, " k"]:
+    """Counts the measured edges between a keyframe and each other one.
+
+    Args:
+        slam_map: the map.
+        row: row of the keyframe.
+        most: largest number of edges that is counted.
+
+    Returns:
+        The least number of edges; infinite beyond `most` and where no edges join the two.
+    """
+    source, target = _ends(slam_map.edges_of("odometry", "loop"))
+    joined = sp.coo_array((np.ones(len(source)), (source, target)), (len(slam_map), len(slam_map))).tocsr()
+    found = sp.csgraph.dijkstra(joined, directed=False, indices=[row], unweighted=True, limit=most)
+    return np.asarray(found[0])
+
+
+def submap_of(slam_map: KeyframeMap, rows: Sequence[int]) -> Submap:
+    """Gathers keyframes in the frame of the first of them.
+
+    Args:
+        slam_map: the map.
+        rows: rows of the keyframes; at least one.
+
+    Returns:
+        The submap.
+    """
+    T_world_keyframe = slam_map.T_world_keyframe[list(rows)]
+    scans = tuple(slam_map.keyframes[row].compact for row in rows)
+    return Submap(scans, rigid.inverse(T_world_keyframe[0]) @ T_world_keyframe)
 
 
 def keyframe_points(slam_map: KeyframeMap, row: int) -> Float[np.ndarray, "n 3"]:

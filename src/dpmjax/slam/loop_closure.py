@@ -76,6 +76,27 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     return slam_map, state
 
 
+def join_keyframe(
+    methods: SlamMethods, slam_map: KeyframeMap, loops: tuple[Loop, ...], row: int, is_allowed: Bool[np.ndarray, " k"]
+) -> tuple[KeyframeMap, tuple[Loop, ...]]:
+    """Looks for loops from a keyframe to those of other maps, by retrieval.
+
+    Args:
+        methods: matcher and settings.
+        slam_map: several maps in one record.
+        loops: loops so far.
+        row: row of the keyframe.
+        is_allowed: False for keyframes that are no candidates.
+
+    Returns:
+        The map, unchanged, and the loops after.
+    """
+    if is_resting(slam_map, loops, row):
+        return slam_map, loops
+    candidates = similar_keyframes(slam_map, row, is_allowed, methods.config.loops)
+    return slam_map, examine_candidates(methods, slam_map, loops, candidates)
+
+
 def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> LoopState:
     """Registers keyframes with earlier ones that the optimisation has brought near.
 

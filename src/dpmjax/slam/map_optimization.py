@@ -50,7 +50,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     measured, guesses = slam_map.edges_of("odometry"), slam_map.edges_of("guess")
     accepted = [number for number, loop in enumerate(state.loops) if loop.status == "accepted"]
     edges = [state.loops[number].edge for number in accepted]
-    T_world_keyframe = _joined_poses(slam_map.T_world_keyframe, measured_parts(slam_map), edges)
+    T_world_keyframe = join_parts(slam_map.T_world_keyframe, measured_parts(slam_map), edges)
     graph = as_pose_graph(replace(slam_map, T_world_keyframe=T_world_keyframe, edges=(*edges, *measured, *guesses)))
     trust = np.full(len(graph.edges.source), CERTAIN)
     trust[: len(edges)] = 1.0
@@ -64,8 +64,17 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     return slam_map, LoopState(tuple(loops), len(slam_map))
 
 
-def _joined_poses(T_world_keyframe: Poses, parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]) -> Poses:
-    """Moves whole parts, so that one edge between two parts holds exactly: a start near the solution."""
+def join_parts(T_world_keyframe: Poses, parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]) -> Poses:
+    """Moves whole parts, so that one edge between two parts holds exactly: a start near the solution.
+
+    Args:
+        T_world_keyframe: poses of the keyframes.
+        parts: number of the part of each keyframe.
+        edges: edges of which some join parts.
+
+    Returns:
+        The poses after.
+    """
     T_world, parts = T_world_keyframe.copy(), parts.copy()
     for edge in edges:
         into, moved = parts[edge.target], parts[edge.source]

@@ -18,15 +18,14 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.scans.corrections import deskew
-from dpmjax.slam import front_end
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
-from dpmjax.slam.loop_closure import close_loops
 from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods
+from dpmjax.slam.procedure import procedure_of
 from dpmjax.types import Pose, Poses
 
 Item = TypeVar("Item")
@@ -115,10 +114,10 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedIn
     if not isinstance(scan, PreparedInput):
         T_turn = state.front_end.T_before_last if isinstance(scan, TimedScan) else None
         scan = prepare_input(methods, scan, T_turn)
-    front, slam_map, report = front_end.place_scan(methods, state.front_end, state.slam_map, scan)
-    loops = state.loops
+    procedure, loops = procedure_of(methods.config), state.loops
+    front, slam_map, report = procedure.place_scan(methods, state.front_end, state.slam_map, scan)
     if report.is_keyframe:
-        slam_map, loops = close_loops(methods, slam_map, loops)
+        slam_map, loops = procedure.close_loops(methods, slam_map, loops)
     num_new = num_accepted(loops.loops) - num_accepted(state.loops.loops)
     return SlamState(front, slam_map, loops), report._replace(num_accepted=num_new)
 
@@ -213,7 +212,7 @@ def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = Non
         ValueError: if the shape is not (n, 3).
     """
     thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
-    if thinned is not None and methods.config.odometry.proposer == "network":
+    if thinned is not None and methods.config.encodes_each_scan:
         compact = methods.matcher.encode(thinned)
     return PreparedInput(len(scan.points if isinstance(scan, TimedScan) else scan), thinned, T_turn, compact)
 
