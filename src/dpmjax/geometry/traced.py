@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from dpmjax.types import AnyArray
+
 # Sums of ten million squares of such numbers stay below the largest float32, 3.4e38.
 LARGEST_COORDINATE = 1e15
 
 
-def is_usable(points: Float[Array, "*n d"]) -> Bool[Array, "*n"]:
+def is_usable(points: Float[AnyArray, "*n d"]) -> Bool[Array, "*n"]:
     """Returns True for points that count: all coordinates are numbers between -1e15 and 1e15.
 
     Args:

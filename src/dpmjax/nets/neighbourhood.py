@@ -63,8 +63,10 @@ def _maximum_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[j
     winner, normalised, inverse = _winners(of_points, offsets, kernel, jnp.asarray(neighbours), scale)
     won = jnp.arange(len(winner))[:, None], winner
     # Parts of x . dx that are one number for each point, that are one vector for each point, and of pairs.
-    products, vectors, of_pairs = [], [], []
-    change = []
+    products: list[jax.Array] = []
+    vectors: list[jax.Array] = []
+    of_pairs: list[jax.Array] = []
+    change: list[jax.Array] = []
     if to_points is not None:
         products.append(jnp.sum(of_points * to_points, axis=1))
         vectors.append(_product(to_points, kernel.T))
@@ -78,18 +80,22 @@ def _maximum_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[j
         of_pairs.append(_dots(x_kernel, to_offsets))
         change += [to_offsets[*won, axis] * kernel[axis] for axis in range(3)]
     if products:
-        of_pairs.append(sum(products)[neighbours])
+        of_pairs.append(_sum(products)[neighbours])
     if vectors:
-        of_pairs.append(_dots(offsets, sum(vectors)[neighbours]))
+        of_pairs.append(_dots(offsets, _sum(vectors)[neighbours]))
     tangent = jnp.zeros_like(normalised) if to_scale is None else normalised * to_scale
     if change:
-        shrink = inverse**2 * sum(of_pairs) / winner.shape[1]
-        tangent = tangent + scale * (inverse[won] * sum(change) - normalised * shrink[won])
+        shrink = inverse**2 * _sum(of_pairs) / winner.shape[1]
+        tangent = tangent + scale * (inverse[won] * _sum(change) - normalised * shrink[won])
     return normalised * scale, tangent
 
 
 def _is_zero(tangent: Any) -> bool:
     return isinstance(tangent, SymbolicZero)
+
+
+def _sum(parts: list[jax.Array]) -> jax.Array:
+    return functools.reduce(jnp.add, parts)
 
 
 def _dots(first: Float[Array, "m k 3"], second: Float[Array, "m k 3"]) -> Float[Array, "m k"]:
@@ -122,8 +128,9 @@ def _winners(
     num, shape = neighbours.shape[1], (len(neighbours), of_points.shape[1])
     dtype = jnp.result_type(of_points, offsets, kernel)
     zeros = with_axes_of((of_points, offsets, kernel, neighbours, scale), jnp.zeros(shape, dtype))
-    start = zeros.astype(jnp.result_type(dtype, scale)) - jnp.inf, zeros.astype(jnp.int32), zeros
-    start = *start, zeros[:, :1] * jnp.ones(num, dtype)
+    lowest = zeros.astype(jnp.result_type(dtype, scale)) - jnp.inf
+    inverses = jnp.broadcast_to(zeros[:, :1], (len(neighbours), num))
+    start: tuple[jax.Array, ...] = lowest, zeros.astype(jnp.int32), zeros, inverses
     # A while loop, because checkpointing splits a loop of known length, and stores values of every iteration.
     at_once = max(size for size in range(1, _UNROLL + 1) if num % size == 0)
 

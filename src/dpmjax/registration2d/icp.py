@@ -179,8 +179,8 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
         change = jnp.linalg.norm(rigid.transform_points(T_new, source.points) - pairs.points, axis=-1)
         return T_new, jnp.where(source.mask, change, 0.0).max(), count + 1
 
-    begin = start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0)
-    begin = tuple(with_axes_of((source, target, normals, start), x) for x in begin)
+    varying = partial(with_axes_of, (source, target, normals, start))
+    begin = varying(start), varying(jnp.asarray(jnp.inf, start.dtype)), varying(jnp.asarray(0))
     T, change, _ = jax.lax.while_loop(lambda c: (c[1] > resolution) & (c[2] < _MAX_ITERATIONS), iterate, begin)
     return T, change <= resolution
 
