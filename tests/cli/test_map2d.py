@@ -15,7 +15,7 @@ import pytest
 from evo.tools import file_interface
 
 from dpmjax.cli.command import Interrupted, run_command
-from dpmjax.cli.map2d import NAME, Config, main
+from dpmjax.cli.map2d import NAME, Config, fit_settings, main
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
@@ -40,6 +40,13 @@ def scans_npz(walk, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("scans") / "scans.npz"
     np.savez(path, points=np.where(walk.mask[..., None], walk.points, 0.0), poses=walk.reference_poses)
     return path
+
+
+@pytest.mark.parametrize(
+    ("preset", "unit", "expected"), [("paper", "px", 512.0), ("paper", "m", None), ("fast", "px", None)]
+)
+def test_unit_of_the_fit_is_that_of_the_worlds_of_the_paper(walk, preset, unit, expected) -> None:
+    assert fit_settings(Config(preset=preset), replace(walk, unit=unit)).unit == expected
 
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:

@@ -70,6 +70,32 @@ def test_planar_motions_turn_about_the_vertical_axis() -> None:
 
 
 @pytest.mark.slow
+def test_published_batches_of_images_follow_each_other_in_time(walk) -> None:
+    config = dm.preset("paper", "depth")
+    phase = replace(config.cold_phases[0], scans_per_step=3, num_free=2)
+    config = replace(
+        config,
+        cold_phases=(phase,),
+        localization=replace(config.localization, features=(4, 8), strides=(1, 1), hidden=(8,)),
+        occupancy=replace(config.occupancy, features=(8,)),
+    )
+
+    def data_of(rows: slice) -> MappingData:
+        return dm.mapping_data(as_depth_scans(walk.points[rows], walk.mask[rows]), unit=config.unit)[0]
+
+    whole = data_of(slice(None))
+    problem = mapping_problem(config, whole)
+    assert problem.phases[0].num_steps == 6000  # two batches of 3,000 epochs
+    params = init(problem, whole, key=KEY).params
+    for rows, step in ((slice(0, 3), 0), (slice(3, 4), 1)):
+        some, own = data_of(rows), replace(params, start=params.start[rows])
+        expected, terms = problem.loss(config, problem.phases[0], own, some, jnp.int32(0), KEY)
+        found, _ = problem.loss(config, problem.phases[0], params, whole, jnp.int32(step), KEY)
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+        assert (float(terms.chamfer) > 0.0) == (step == 0)  # one image has no neighbour
+
+
+@pytest.mark.slow
 def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans) -> None:
     fitted = dm.fit_deepmapping(scans, small("planar"), key=KEY)
     assert_rigid(fitted.T_world_scan)

@@ -27,7 +27,7 @@ NUM_NODES = 513
 _SEEN = 0.3
 # Largest share of unobserved nodes along a rendered beam.
 _MAX_UNSEEN = 0.1
-# Distance from a scan that the raster of an MLP covers, in typical ranges.
+# Distance from a scan that the raster of an MLP covers, in units of the fit.
 _REACH = 1.5
 # Longest rendered beam in nodes.
 _MAX_NODES = 400
@@ -37,7 +37,7 @@ _LEAST_BEAMS = 0.5
 _LEARNING_RATE = 2e-3
 # Largest random heading of a scan; `relocalize` tries all turns, so L-Net needs only a range of headings.
 _MAX_TURN_DEG = 20.0
-# Largest distance, in typical ranges, to which scans are re-projected (`shift_scan`), so that L-Net learns the
+# Largest distance, in units of the fit, to which scans are re-projected (`shift_scan`), so that L-Net learns the
 # surroundings of the trajectory.
 _MAX_SHIFT = 0.2
 # Number of scans of a step, drawn with replacement. Number of scans rendered from the map at random free positions;
@@ -60,7 +60,7 @@ class MapRaster(NamedTuple):
 
     @property
     def spacing(self) -> Float[Array, ""]:
-        """Distance of two nodes, in typical ranges."""
+        """Distance of two nodes, in units of the fit."""
         return 2.0 * self.frame.half_side / (NUM_NODES - 1)
 
 
@@ -112,7 +112,7 @@ def render_scans(
 
     Args:
         raster: raster of the map.
-        scans: (n, b, 2) in typical ranges; rendered scans have the same bearings.
+        scans: (n, b, 2) in units of the fit; rendered scans have the same bearings.
         count: number of positions that are tried.
         key: key of the positions.
 

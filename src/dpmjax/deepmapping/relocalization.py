@@ -33,7 +33,7 @@ from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
 
-# Step of the coarsest grid of poses, along x and y in typical ranges, and in radians of heading; each level halves it.
+# Step of the coarsest grid of poses, along x and y in units of the fit, and in radians; each level halves it.
 _FIRST_STEP, _NUM_LEVELS = 0.08, 5
 # Number of hypotheses that are kept after the first level, and largest number of beams that are compared.
 _NUM_KEPT, _NUM_BEAMS = 6, 64
@@ -120,12 +120,12 @@ def search_map(
     """Searches the poses of scans around proposals, coarse to fine.
 
     Args:
-        scans: (m, b, 2) in typical ranges.
+        scans: (m, b, 2) in units of the fit.
         proposals: initial poses.
         fields: costs of hits and free samples in the map.
 
     Returns:
-        x, y, heading of each scan, in typical ranges and radians. And the mean cost of a beam in nats: cost of the hit
+        x, y, heading of each scan, in units of the fit and radians. The mean cost of a beam in nats: cost of the hit
         plus mean cost of the free samples; log 4 where the map is unknown. Beams are weighted by the root of the
         range, because near beams end on some surface everywhere.
     """
@@ -221,12 +221,12 @@ def propose_poses(
 
     Args:
         params: weights of L-Net.
-        scans: (m, b, 2) in typical ranges.
+        scans: (m, b, 2) in units of the fit.
         num_turns: number of evenly spaced turns; the first is zero.
         fit_config: settings of the fit.
 
     Returns:
-        x, y, heading of the scans before the turn, in typical ranges and radians.
+        x, y, heading of the scans before the turn, in units of the fit and radians.
     """
     beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
     mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns
