@@ -229,10 +229,11 @@ def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorClo
 def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Poses) -> DescriptorCloud:
     T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
     of_maps = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], clouds)
-    merged: DescriptorCloud = _in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
+    merged = _in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
     unions = zip(merged.positions, merged.mask, strict=True)
     masks = [thinned_mask(positions, mask, clouds.mask.shape[1]) for positions, mask in unions]
-    return merged.replace(mask=np.stack(masks))
+    thinned: DescriptorCloud = merged.replace(mask=np.stack(masks))
+    return thinned
 
 
 @jax.jit
