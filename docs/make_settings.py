@@ -101,6 +101,12 @@ SLAM = Group("SLAM", (
         "min_probability": ("probability", "higher if wrong loops occur"),
         "min_support": ("registrations", "1: a loop needs no second one; risky in places that look alike"),
     }),
+    Section("DescriptorConfig", "dpmjax.slam", "`SlamConfig(method=\"descriptors\", descriptors=...)`", {
+        "keyframe_m": ("m", "fewer keyframes; the paper has 10 for KITTI, 7 for KITTI-360, 3 for MulRan"),
+        "min_confidence": ("score", "lower: fewer scans are dropped, more of their poses are wrong"),
+        "max_rmse_m": ("m", "2.5 for `dpm_small`, whose offsets are not exact: with 0.5 nearly every scan is dropped"),
+        "min_overlap": ("probability", "lower for more loops"),
+    }),
     Section("LocalizationConfig", "dpmjax.slam", "`localize(model, slam_map, scan, config)`", {
         "num_similar": ("keyframes", "more for large maps"),
         "num_registered": ("keyframes", "more: more scans are found, slower"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 import dpmjax
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
-from dpmjax.slam import Submap, init_slam, local_map_of, step_slam
+from dpmjax.slam import init_slam, slam_preset, step_slam
 from experiments import dpm_slam_ablations as ablations
 from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
@@ -34,16 +36,17 @@ def model() -> dpmjax.Model:
 
 @pytest.mark.slow
 def test_every_setting_gets_a_row_and_a_resumed_run_computes_nothing_again(model, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(ablations, "SETTINGS", (ablations.WHOLE, ablations.DECODER, "16 elements"))
+    settings = (ablations.WHOLE, ablations.PAPER, "16 elements")
     dpmjax.save_model(model, tmp_path / "model.safetensors")
     folder = write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(1, num_scans=NUM_SCANS))
     out = tmp_path / "out"
-    assert run(folder.parents[1], "--weights", tmp_path / "model.safetensors", "-o", out) == EXIT_OK
+    options = ("--weights", tmp_path / "model.safetensors", "--settings", *settings)
+    assert run(folder.parents[1], *options, "-o", out) == EXIT_OK
     rows = load_json(out / "metrics.json")["rows"]
-    assert [row["setting"] for row in rows] == list(ablations.SETTINGS)
+    assert [row["setting"] for row in rows] == list(settings)
     assert all(row["num_scans"] == NUM_SCANS for row in rows)
-    # The decoder of random weights proposes the pose of every scan after the first, and nothing refuses it.
-    assert rows[1]["scan_statuses"] == {"first": 1, "network": NUM_SCANS - 1}
+    # The pairs of random weights have large errors, so that no registration is accepted.
+    assert rows[1]["scan_statuses"] == {"first": 1, "predicted": NUM_SCANS - 1}
     assert (out / "table.md").read_text().count("\n") == 2 + len(rows)
     monkeypatch.setattr(ablations, "evaluate", pytest.fail)
     assert run("--resume", "-o", out) == EXIT_OK
@@ -74,18 +77,11 @@ def test_the_first_elements_of_a_scan_keep_their_normals(model) -> None:
     np.testing.assert_array_equal(few.samples, [row for row in whole.samples if row < 16])
 
 
-def test_without_elements_poses_and_loops_stay_as_they_are_proposed(model) -> None:
-    drive, methods = toy.drive(1, num_scans=2), ablations.ablated(model, ablations.DECODER)
-    slam_map, scan = step_slam(methods, init_slam(), drive[0])[0].slam_map, methods.geometry.thin(drive[1])
-    local_map = local_map_of(slam_map, (), methods.config.odometry)
-    T = np.tile(np.eye(4), (2, 1, 1))
-    T[:, :3, 3] = [0.1, -0.2, 0.05], [3.0, 0.0, 0.0]
-    for found in (methods.geometry.search(local_map, scan, T), methods.geometry.align(local_map, scan, T[0])):
-        np.testing.assert_array_equal(found.T_map_scan, T[0])
-    source, target = methods.matcher.encode(scan), slam_map.keyframes[0].compact
-    (match,) = methods.matcher.register([tuple(Submap((one,), np.eye(4)[None]) for one in (source, target))])
-    np.testing.assert_array_equal(match.T_target_source, methods.matcher.propose(source, target, 1).T_target_source[0])
-    assert match.verification is None
+def test_the_settings_of_the_paper_differ_in_the_limit_of_the_error_alone(model) -> None:
+    paper, wide = (ablations.ablated(model, setting).config for setting in (ablations.PAPER, ablations.PAPER_WIDE))
+    assert paper == slam_preset("paper")
+    assert replace(wide, descriptors=paper.descriptors) == paper
+    assert wide.descriptors.max_rmse_m == 2.5
 
 
 def test_other_settings_change_one_thing(model) -> None:
@@ -99,7 +95,7 @@ def test_other_settings_change_one_thing(model) -> None:
 def test_the_offset_head_is_off_only_where_a_setting_says_so(model) -> None:
     drive = toy.drive(1, num_scans=2)
     motions = []
-    for setting in (ablations.DECODER, ablations.DECODER + ablations.NO_OFFSETS):
+    for setting in (ablations.NETWORK, ablations.NETWORK + ablations.NO_OFFSETS):
         methods = ablations.ablated(model, setting)
         source, target = (methods.matcher.encode(methods.geometry.thin(scan)) for scan in drive)
         motions.append(methods.matcher.propose(source, target, 1).T_target_source)

@@ -11,11 +11,26 @@ import dpmjax
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.slam import AgentsResult, LoopClosureConfig, SlamConfig, SlamMethods, run_agents, run_slam, take_component
+from dpmjax.slam import (
+    AgentsResult,
+    LoopClosureConfig,
+    OdometryConfig,
+    SlamConfig,
+    SlamMethods,
+    run_agents,
+    run_slam,
+    slam_preset,
+    take_component,
+)
 from dpmjax.slam.agents import join_agents
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, pose, scans_of
 
 CONFIG = SlamConfig()
+PRESETS = {
+    "default": slam_preset("default"),
+    "paper": slam_preset("paper"),
+    "network": SlamConfig(odometry=OdometryConfig(proposer="network")),
+}
 TRUTH = laps(1, side_m=80.0, step_m=2.0)
 """160 poses along a square."""
 PARTS = (range(70), range(55, 120), [*range(105, 160), *range(15)])
@@ -48,6 +63,17 @@ def joint_error_m(result: AgentsResult, parts, agents, truth: np.ndarray = TRUTH
     found = np.concatenate([result.T_world_scan[agent][:, :3, 3] for agent in agents])
     expected = np.concatenate([truth[list(parts[agent])][:, :3, 3] for agent in agents])
     return absolute_trajectory_error(found, expected)
+
+
+@pytest.mark.parametrize("config", PRESETS.values(), ids=PRESETS)
+def test_three_agents_and_their_maps_are_joined_under_every_preset(config) -> None:
+    methods = methods_of(TRUTH, TruthMatcher(TRUTH, gross_share=0.0))._replace(config=config)
+    result = run_agents(methods, [scans_of(part) for part in PARTS])
+    assert result.component == (0, 0, 0)
+    assert joint_error_m(result, PARTS, (0, 1, 2)) < 1.0
+    merged = dpmjax.merge_maps(methods, *(agent.map for agent in result.agents))
+    assert merged.is_joined
+    assert merged.component == (0, 0, 0)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

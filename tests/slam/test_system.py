@@ -533,19 +533,6 @@ def test_a_sure_decoder_whose_pose_is_turned_confirms_nothing(turn_rad: float, i
     assert ("predicted" not in {report.status for report in result.reports}) == is_placed
 
 
-def test_the_settings_of_the_paper_ask_the_network_for_every_scan() -> None:
-    paper = slam_preset("paper")
-    assert slam_preset("default") == SlamConfig()
-    assert paper.odometry.proposer == "network"
-    assert paper.loops.min_overlap == 0.7
-    truth = laps(1, 20.0)
-    methods = SlamMethods(TruthMatcher(truth, gross_share=0.0), TruthGeometry(truth), paper)
-    result = run_slam(methods, scans_of(range(30)))
-    assert "tracked" not in {report.status for report in result.reports}
-    # The extent of a scan is 10 m.
-    assert len(result.keyframes) <= 5
-
-
 def test_unknown_settings_are_refused(as_user) -> None:
     with pytest.raises(ValueError, match="name: expected one of"):
         slam_preset("fast")

@@ -139,6 +139,9 @@ class TruthMatcher:
     def register(self, pairs: list[tuple[Submap, Submap]]) -> list[Match]:
         return [self._match(number_of(source.scans[0]), number_of(target.scans[0])) for source, target in pairs]
 
+    def match(self, source: Submap, target: Submap) -> Match:
+        return self._match(number_of(source.scans[0]), number_of(target.scans[0]))
+
     def overlaps(self, source: CompactScan, targets: list[CompactScan]) -> np.ndarray:
         rows = [number_of(target) for target in targets]
         apart = self.T_world_scan[rows][:, :2, 3] - self.T_world_scan[number_of(source)][:2, 3]

@@ -47,7 +47,7 @@ class Config(cli.DriveOptions):
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
     preset: Literal["default", "paper"] = "default"
-    """Settings of SLAM: the default ones, or the thresholds of the paper."""
+    """Settings of SLAM: the default ones, or the paper's own method, by the decoder alone."""
     odometry: Literal["prediction", "network"] | None = None
     """Source of the first guess of a pose: the motion of before, or the network for every scan; without it, the preset
     decides."""
@@ -64,6 +64,8 @@ class Config(cli.DriveOptions):
         """Checks ranges."""
         super().__post_init__()
         self.check_data(self.data, self.sequence)
+        if self.preset == "paper" and self.odometry is not None:
+            raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
 
 
 def main(config: Config) -> None:

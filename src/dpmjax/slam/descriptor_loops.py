@@ -5,6 +5,7 @@ The numbers are those of the published configuration. Each accepted loop becomes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -33,10 +34,10 @@ RADIUS_M = 100.0
 # A candidate is more edges away than the first number. Up to the second one, it must differ by a turn and a distance,
 # and this distance must lie between two loops, so that a straight drive closes none with itself.
 MIN_STEPS, NUM_NEAR_STEPS = 2, 30
-NEAR_RAD, NEAR_M = np.deg2rad(30.0), 10.0
+NEAR_RAD, NEAR_M = math.radians(30.0), 10.0
 
 # Standard deviations of odometry in one step, and their number within which a loop agrees with it.
-STEP_SIGMA_M, STEP_SIGMA_RAD, NUM_SIGMAS = 0.4, np.deg2rad(0.5), 3.0
+STEP_SIGMA_M, STEP_SIGMA_RAD, NUM_SIGMAS = 0.4, math.radians(0.5), 3.0
 
 # Numbers of edges from which on the translation and the rotation are not compared.
 NUM_TRANSLATION_STEPS, NUM_ROTATION_STEPS = 100, 5000
@@ -81,14 +82,14 @@ def join_keyframe(
         return slam_map, loops
     compact = [slam_map.keyframes[target].compact for target in targets]
     overlaps = methods.matcher.overlaps(slam_map.keyframes[row].compact, compact)
-    best, target = int(np.argmax(overlaps)), int(targets[np.argmax(overlaps)])
-    loop = Loop(row, target, "distance", "no overlap", float(overlaps[best]))
+    best = int(np.argmax(overlaps))
+    loop = Loop(row, int(targets[best]), "distance", "no overlap", float(overlaps[best]))
     if overlaps[best] > methods.config.descriptors.min_overlap:
-        source_rows, target_rows = disjoint_neighbours(slam_map, row, target)
+        source_rows, target_rows = disjoint_neighbours(slam_map, row, loop.target)
         match = methods.matcher.match(submap_of(slam_map, source_rows), submap_of(slam_map, target_rows))
-        status = verify_match(methods, slam_map, loop, match, float(steps[target]))
+        status = verify_match(methods, slam_map, loop, match, float(steps[loop.target]))
         measured = match.probability, match.rmse, match.T_target_source
-        loop = Loop(row, target, "distance", status, loop.overlap, *measured, information_of(match))
+        loop = Loop(*loop[:3], status, loop.overlap, *measured, information_of(match))
     if loop.status == "accepted":
         slam_map = optimize_with_loop(slam_map, loop)
     return slam_map, (*loops, loop)
@@ -167,9 +168,9 @@ def verify_match(methods: SlamMethods, slam_map: KeyframeMap, loop: Loop, match:
         return "improbable"
     T_world = slam_map.T_world_keyframe
     predicted = rigid.inverse(T_world[loop.target]) @ T_world[loop.source]
-    most_m, most_rad = (NUM_SIGMAS * sigma * np.sqrt(num_steps) for sigma in (STEP_SIGMA_M, STEP_SIGMA_RAD))
-    most_m = most_m if num_steps < NUM_TRANSLATION_STEPS else np.inf
-    most_rad = most_rad if num_steps < NUM_ROTATION_STEPS else np.inf
+    most_m, most_rad = (NUM_SIGMAS * sigma * math.sqrt(num_steps) for sigma in (STEP_SIGMA_M, STEP_SIGMA_RAD))
+    most_m = most_m if num_steps < NUM_TRANSLATION_STEPS else math.inf
+    most_rad = most_rad if num_steps < NUM_ROTATION_STEPS else math.inf
     return "accepted" if are_near(predicted, match.T_target_source, most_m, most_rad) else "against odometry"
 
 
