@@ -39,8 +39,10 @@ from .motion_choice import choose_motion as choose_motion
 from .motion_choice import refine_motion as refine_motion
 from .overlap_prediction import OVERLAP_M as OVERLAP_M
 from .overlap_prediction import evidence_pairs as evidence_pairs
+from .overlap_prediction import head_probability as head_probability
 from .overlap_prediction import overlap as overlap
 from .overlap_prediction import overlap_pairs as overlap_pairs
+from .overlap_prediction import require_overlap as require_overlap
 from .prepared_scans import PreparedScan as PreparedScan
 from .prepared_scans import prepare_scan as prepare_scan
 from .scan_evaluation import NO_OVERLAP_M as NO_OVERLAP_M

@@ -23,7 +23,7 @@ from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.motion_choice import ELEMENT_RADIUS_M, REFINEMENT
-from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
+from dpmjax.deeppointmap.overlap_prediction import overlap_pairs, require_overlap
 from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
 from dpmjax.deeppointmap.verification import MeasuredScan
@@ -222,13 +222,14 @@ def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan:
 
 
 class NetworkMatcher:
-    """The matcher of a trained model.
+    """The matcher of a trained model; a `ValueError` refuses one that cannot predict overlap.
 
     Args:
         model: encoder, decoder and, at best, a calibration of its confidence.
     """
 
     def __init__(self, model: Model) -> None:
+        require_overlap(model)
         # Other keyframes and the map confirm a motion, so no other place needs to be tried for it.
         verification = replace(model.config.verification, plane_radius_m=ELEMENT_RADIUS_M, num_lookalikes=0)
         self._model = replace(model, config=replace(model.config, verification=verification))
