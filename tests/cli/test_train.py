@@ -16,7 +16,7 @@ from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
 from dpmjax.cli.train import NAME, Config, main, training_settings
-from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
+from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
@@ -49,7 +49,7 @@ class StopAfter:
 def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float = math.inf):
     folder.mkdir(exist_ok=True)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
-    records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)
+    records = Records(RunFolder(folder, is_resumed), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, plateau_s=plateau_s)
 
@@ -156,12 +156,12 @@ def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPa
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
     weights = load_model("dpm_small")
     settings = training_settings(Config(weights="dpm_small"), weights)
-    assert settings.model == replace(weights.config, calibration=None, overlap=None)
+    assert settings.model == replace(weights.config, calibration=None, overlap=None, trained=())
     assert settings.learning_rate == pytest.approx(0.2 * training_settings(Config()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
-    sets = EvaluationSets((pairs,), (), pairs)
+    sets = Selection(pairs, "a toy")
     with Records(RunFolder(tmp_path, False), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)
         toy.assert_trees_equal(records.untrained.params, some.params)
@@ -254,7 +254,7 @@ def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_run.draw_sets(TRAINING, 2, [], length_m=100.0, on_wait=stop)
+        train_run.draw_selection(TRAINING, 2, [toy.drive], "a toy", on_wait=stop)
 
 
 @pytest.mark.parametrize("num_drives", [1, 2])

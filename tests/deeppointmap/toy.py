@@ -13,6 +13,7 @@ from dpmjax.deeppointmap import (
     MatchConfig,
     ModelConfig,
     ObjectiveConfig,
+    OverlapConfig,
     SamplingConfig,
     ScanStore,
     TrainingConfig,
@@ -47,6 +48,8 @@ TRAINING = TrainingConfig(
     curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)),
     sampling=SamplingConfig(num_scans=6, max_side=2),
     objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
+    stages=("registration",),
+    overlap=OverlapConfig(num_epochs=2, batch_pairs=4),
 )
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.checks import require_type
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import pyramid_of_cloud, thin_scan
+from dpmjax.deeppointmap.encoding import pooled_vector, pyramid_of_cloud, thin_scan
 from dpmjax.deeppointmap.matching import merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.model_config import ModelConfig
@@ -42,7 +42,7 @@ from dpmjax.slam.config import OdometryConfig, SlamConfig
 from dpmjax.slam.interfaces import Alignment, Match, Proposal, SlamMethods, ThinnedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap
 from dpmjax.slam.local_map import LocalMap, joined_surface, placed_keyframes
-from dpmjax.types import DescriptorCloud, Pose, Poses, Registration
+from dpmjax.types import Pose, Poses, Registration
 
 # Turns about the x and y axes among the further starts.
 TILTS_DEG = (-8.0, 8.0)
@@ -324,26 +324,6 @@ def _merged(submap: Submap) -> PreparedScan:
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *clouds)
     merged = merge_clouds(stacked, jnp.asarray(T_submap_scan, jnp.float32))
     return PreparedScan(thin_merged(merged, len(clouds[0].mask)), first.measured)
-
-
-def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
-    """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
-
-    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
-    where the scan turns about the vertical.
-
-    Args:
-        cloud: descriptors of a scan.
-
-    Returns:
-        (2 c,) float32; zero for an empty cloud.
-    """
-    features = np.asarray(cloud.features, np.float32)[np.asarray(cloud.mask)]
-    if len(features) == 0:
-        return np.zeros(2 * cloud.features.shape[-1], np.float32)
-    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
-    pooled = np.concatenate([features.mean(axis=0), features.std(axis=0)])
-    return np.asarray(pooled / max(float(np.linalg.norm(pooled)), 1e-12), np.float32)
 
 
 def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:

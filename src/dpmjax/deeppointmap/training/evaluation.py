@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -31,6 +31,8 @@ from dpmjax.types import AnyArray, DescriptorCloud, Poses, Registration
 TRAINED = ObjectiveConfig()
 
 PAIR_STREAM = 3103
+# Largest number of scans that are encoded at the same time.
+MAX_AT_ONCE = 8
 # Largest distance of the scans of an evaluated map from its first scan.
 MAP_RADIUS_M = 10.0
 
@@ -163,6 +165,45 @@ def draw_evaluation_pairs(
     return EvaluationPairs(scans, placed.T_world_scan, pairs, config.scale_m)
 
 
+def join_evaluation_pairs(parts: Sequence[EvaluationPairs]) -> EvaluationPairs:
+    """Joins the pairs of several drives, those of one kind together.
+
+    Args:
+        parts: at least one; pairs of one configuration.
+
+    Returns:
+        The pairs of all drives.
+    """
+    starts = np.cumsum([0, *(len(part.T_world_scan) for part in parts)])
+    found: dict[PairKind, list[Pairs]] = {}
+    for start, part in zip(starts, parts, strict=False):
+        for some in part.pairs:
+            found.setdefault(some.kind, []).append(Pairs(some.kind, some.sources + start, some.targets + start))
+    joined = tuple(
+        Pairs(kind, *(np.concatenate([getattr(one, side) for one in some]) for side in ("sources", "targets")))
+        for kind, some in found.items()
+    )
+    scans = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(part.scans for part in parts))
+    poses = np.concatenate([part.T_world_scan for part in parts])
+    return EvaluationPairs(scans, poses, joined, parts[0].scale_m)
+
+
+def pair_kinds(drive: LidarSequence, kinds: Sequence[PairKind]) -> tuple[PairKind, ...]:
+    """Finds the kinds of which a drive has pairs.
+
+    Args:
+        drive: scans with true poses.
+        kinds: kinds of pairs.
+
+    Returns:
+        Some of the kinds, in order.
+    """
+    distances = scan_distances(drive)
+    return tuple(
+        kind for kind in kinds if np.any((distances >= kind.min_distance_m) & (distances <= kind.max_distance_m))
+    )
+
+
 def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
     distances = scan_distances(drive)
     pairs = draw_rows_apart(distances, kind.min_distance_m, kind.max_distance_m, num_pairs, rng)
@@ -190,17 +231,31 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
         Errors, registrations and descriptors.
     """
     clouds = _encode_all(model, pairs.scans)
-    matches, recalls = [], []
-    for some in pairs.pairs:
-        sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
-        matches.append(jax.device_get(_register_all(model, *sides)))
-        recalls.append(registration_recall(matches[-1].T_target_source, pairs.true_motions(some)))
-    return Evaluation(tuple(recalls), tuple(matches), clouds)
+    matches: list[Registration | None] = [None] * len(pairs.pairs)
+    # All pairs of maps of one size are registered by one compiled program.
+    for num_scans in dict.fromkeys(some.kind.num_scans for some in pairs.pairs):
+        numbers = [number for number, some in enumerate(pairs.pairs) if some.kind.num_scans == num_scans]
+        of_size = [pairs.pairs[number] for number in numbers]
+        sides = [np.concatenate([getattr(some, side) for some in of_size]) for side in ("sources", "targets")]
+        maps = (_maps(clouds, rows, pairs.T_world_scan) for rows in sides)
+        found = jax.device_get(_register_all(model, *maps))
+        ends = np.cumsum([0, *(len(some.sources) for some in of_size)])
+        for number, first, last in zip(numbers, ends, ends[1:], strict=False):
+            matches[number] = jax.tree.map(lambda leaf, part=slice(first, last): leaf[part], found)
+    whole = tuple(match for match in matches if match is not None)
+    recalls = tuple(
+        registration_recall(match.T_target_source, pairs.true_motions(some))
+        for match, some in zip(whole, pairs.pairs, strict=True)
+    )
+    return Evaluation(recalls, whole, clouds)
 
 
 @jax.jit
 def _encode_all(model: Model, scans: SampleScans) -> DescriptorCloud:
-    return jax.lax.map(functools.partial(encode_sample, model), scans)
+    num = len(scans.T_augmented_lidar)
+    # A divisor, because a last part of another size would be compiled separately.
+    size = max(size for size in range(1, MAX_AT_ONCE + 1) if num % size == 0)
+    return jax.lax.map(functools.partial(encode_sample, model), scans, batch_size=size)
 
 
 @jax.jit

@@ -24,6 +24,14 @@ from jaxtyping import Float, Int
 from dpmjax.checks import require_fields
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig
+from dpmjax.deeppointmap.training.overlap_stage import (
+    OverlapHooks,
+    OverlapState,
+    init_overlap,
+    train_overlap,
+    why_no_overlap,
+    with_head,
+)
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
@@ -117,16 +125,19 @@ class Trained(NamedTuple):
     """Result of training.
 
     Attributes:
-        model: the model with the best score; the last one without an evaluation.
-        progress: progress after the last step.
+        model: the model with the best score; the last one without an evaluation. Its `config.trained` lists the stages
+            that came to their end.
+        progress: progress after the last step of registration.
         stopped_by: the number that `stop` returned; 0 after the last step.
         speed: seconds of the steps of this call.
+        overlap: state of the second stage; None where it was not begun.
     """
 
     model: Model
     progress: TrainingProgress
     stopped_by: int
     speed: Speed
+    overlap: OverlapState | None = None
 
 
 def begin_training(config: TrainingConfig, *, seed: int = 0, start: Model | None = None) -> TrainingProgress:
@@ -184,8 +195,9 @@ def train(
 ) -> Trained:
     """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
-    Each scan is prepared once before the first step. With several processes (`join_processes`), each calls this
-    function with the same arguments; process 0 alone evaluates and reports.
+    The first stage trains everything but the overlap head, and the second stage this head alone; `config.stages` may
+    leave one out. Each scan is prepared once before the first step. With several processes (`join_processes`), each
+    calls this function with the same arguments; process 0 alone evaluates, reports and trains the head.
 
     Args:
         drives: sequences with a true pose for each scan, such as `io.open_lidar_sequence` and
@@ -202,20 +214,36 @@ def train(
 
     Raises:
         ValueError: if there is no drive, or `start` is a model of another network. Also if a drive has no poses, no
-            readable scan, or no two scans at a distance of `config.sampling`, and if `cache` is given with prepared
-            scans.
+            readable scan, or no two scans at a distance of `config.sampling`, if all scans overlap or none do, and if
+            `cache` is given with prepared scans.
         TrainingLostError: if the loss is not finite.
     """
     if cache is not None and isinstance(drives, ScanStore):
         raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
     # Calibrations belong to the parameters that they were fitted for.
-    config = replace(config, model=replace(config.model, calibration=None, overlap=None))
+    before = start.config.trained if isinstance(start, Model) else ()
+    config = replace(config, model=replace(config.model, calibration=None, overlap=None, trained=()))
     if not isinstance(start, TrainingProgress):
         start = begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
-    progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
+    if "overlap" in config.stages and (reason := why_no_overlap(store.table)) is not None:
+        raise ValueError(f"drives: {reason}; leave the stage overlap out")
+    progress, stopped_by, speed = start, 0, Speed()
+    if "registration" in config.stages:
+        progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
+        before = () if stopped_by else ("registration",)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
-    return Trained(_local(Model(params, config.model)), progress, stopped_by, speed)
+    model = _local(Model(params, replace(config.model, trained=before)))
+    if "overlap" not in config.stages or stopped_by:
+        return Trained(model, progress, stopped_by, speed)
+    state = init_overlap(model)
+    with together():
+        if is_first():
+            _, state = train_overlap(store, model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
+    state = from_first(state)
+    is_whole = int(state.step) >= config.overlap.num_steps(len(store.table))
+    model = _local(with_head(model, state.head, is_trained=is_whole))
+    return Trained(model, progress, 0 if is_whole else 1, speed, state)
 
 
 def _run_steps(
