@@ -340,7 +340,11 @@ def _correlated(model: Model, sources: DescriptorCloud, targets: DescriptorCloud
 
 @jax.jit
 def _step(
-    state: OverlapState, model: Model, batch: PairFeatures, learning_rate: float, weight_decay: float
+    state: OverlapState,
+    model: Model,
+    batch: PairFeatures,
+    learning_rate: Float[AnyArray, ""] | float,
+    weight_decay: Float[AnyArray, ""] | float,
 ) -> tuple[OverlapState, Array, Array]:
     def loss_of(head: dict[str, Any]) -> tuple[Array, Array]:
         logits = head_logits(with_head(model, head, is_trained=False), batch)
