@@ -19,6 +19,7 @@ from dpmjax.cli.train import NAME, Config, main, training_settings
 from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
+    OverlapConfig,
     SampleMaker,
     TrainingHooks,
     begin_training,
@@ -44,6 +45,16 @@ class StopAfter:
     def __call__(self) -> int:
         self._left -= 1
         return int(self._left < 0)
+
+
+BOTH = replace(TRAINING, stages=("registration", "overlap"), overlap=OverlapConfig(num_epochs=1, batch_pairs=6))
+"""Four steps of each stage."""
+
+
+def train_both(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
+    folder.mkdir(exist_ok=True)
+    records = Records(RunFolder(folder, is_resumed), BOTH, Selection(None, "the last step"), seed=0)
+    return run_training(records, toy.store(), BOTH, TrainingHooks(stop=StopAfter(stop_after)), seed=0)
 
 
 def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, plateau_s: float = math.inf):
@@ -81,6 +92,33 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
     assert num_steps(whole[0]) == TRAINING.num_steps
     assert num_steps(train(tmp_path, stop_after=num_before)) == num_before
     assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_the_second_stage_goes_on_where_it_was_broken_off_and_has_rows_of_its_own(tmp_path: Path) -> None:
+    whole = train_both(tmp_path / "whole")
+    assert whole.model.config.trained == ("registration", "overlap")
+    rows = read_history(tmp_path / "whole" / HISTORY)
+    assert [(row["step"], row["stage"]) for row in rows[3:5]] == [("4", "K=2"), ("5", "overlap")]
+    assert len(rows) == 8
+    assert all(float(row["overlap_loss"]) > 0 for row in rows[4:])
+    broken = train_both(tmp_path / "parts", stop_after=6)
+    assert (broken.stopped_by, broken.model.config.trained) == (1, ("registration",))
+    assert len(read_history(tmp_path / "parts" / HISTORY)) == 6
+    resumed = train_both(tmp_path / "parts", is_resumed=True)
+    assert resumed.stopped_by == 0
+    assert_same_run(resumed, tmp_path / "parts", (whole, tmp_path / "whole"))
+
+
+@pytest.mark.slow
+def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_path: Path) -> None:
+    nothing = train_run.draw_selection(TRAINING, 2, [lambda: toy.drive(num_scans=1)], "the drives")
+    assert nothing == Selection(None, "the last step: no drive has held-out places")
+    some = train_run.draw_selection(TRAINING, 4, [toy.drive, lambda: toy.drive(1)], "the drives")
+    assert some.chosen_by == "the drives"
+    assert [pairs.kind for pairs in some.of_scans.pairs] == list(KINDS[:2])
+    assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 4
+    assert max(pairs.sources.max() for pairs in some.pairs.pairs) >= 24  # of the second drive
 
 
 @pytest.mark.slow
@@ -126,6 +164,8 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
         ({"num_towns": 0}, "--num-towns"),
         ({"town_length_m": 5.0}, "--town-length-m"),
         ({"weights": "dpm_small", "frame": "local"}, "--frame"),
+        ({"stages": ("overlap",)}, "--stages overlap trains the head of a model"),
+        ({"stages": ()}, "--stages: expected registration, overlap, or both"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message: str) -> None:

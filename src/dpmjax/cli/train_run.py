@@ -184,7 +184,10 @@ class Records:
         begun = dpm.begin_training(settings, seed=seed, start=weights)
         self.takes_last = takes_last
         trained = () if weights is None else weights.config.trained
-        self.untrained = dpm.Model(begun.state.params, replace(settings.model, trained=trained))
+        before = replace(settings.model, trained=trained)
+        # A calibration stays where the head alone is trained.
+        is_head_alone = weights is not None and "registration" not in settings.stages
+        self.untrained = dpm.Model(begun.state.params, weights.config if is_head_alone else before)
         self.start = self._restored(begun)
         self.overlap_start = self._overlap_checkpoints.restore_latest(dpm.init_overlap(self.untrained), fallback=None)
         first = int(self.start.state.step)
@@ -297,13 +300,13 @@ def run_training(
     After `plateau_s` seconds of steps, compilation and evaluation, those of earlier calls included, the decay of the
     learning rate begins.
     """
-    is_first_stage, with_head = ("registration" in settings.stages), ("overlap" in settings.stages)
+    trains_first, trains_head = "registration" in settings.stages, "overlap" in settings.stages
     settings = replace(settings, stages=("registration",))
     if records is None:
         return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
         stop = hooks.stop
-        if not is_first_stage:
+        if not trains_first:
             return records.train_head(dpm.Trained(records.untrained, records.start, 0, dpm.Speed()), store, stop, seed)
         if records.selection.pairs is not None:
             hooks = replace(hooks, evaluate=records.evaluate)
@@ -313,7 +316,7 @@ def run_training(
         records.save(trained.progress)
         if records.takes_last:
             trained = trained._replace(model=last_model(trained))
-        return trained if trained.stopped_by or not with_head else records.train_head(trained, store, stop, seed)
+        return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, stop, seed)
 
 
 def last_model(trained: dpm.Trained) -> dpm.Model:

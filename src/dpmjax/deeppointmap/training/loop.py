@@ -220,30 +220,39 @@ def train(
     """
     if cache is not None and isinstance(drives, ScanStore):
         raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
-    # Calibrations belong to the parameters that they were fitted for.
-    before = start.config.trained if isinstance(start, Model) else ()
+    is_head_alone = "registration" not in config.stages
+    # Calibrations belong to the parameters that they were fitted for; the head is not among them.
+    kept = start.config if is_head_alone and isinstance(start, Model) else None
     config = replace(config, model=replace(config.model, calibration=None, overlap=None, trained=()))
     if not isinstance(start, TrainingProgress):
         start = begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
     if "overlap" in config.stages and (reason := why_no_overlap(store.table)) is not None:
         raise ValueError(f"drives: {reason}; leave the stage overlap out")
-    progress, stopped_by, speed = start, 0, Speed()
-    if "registration" in config.stages:
-        progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
-        before = () if stopped_by else ("registration",)
+    if is_head_alone:
+        first = Trained(Model(start.state.params, kept or config.model), start, 0, Speed())
+        return _with_trained_head(first, store, config, hooks, seed=seed)
+    progress, stopped_by, speed = _run_steps(store, config, hooks, start, seed=seed)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
-    model = _local(Model(params, replace(config.model, trained=before)))
-    if "overlap" not in config.stages or stopped_by:
-        return Trained(model, progress, stopped_by, speed)
-    state = init_overlap(model)
+    ended = replace(config.model, trained=() if stopped_by else ("registration",))
+    first = Trained(_local(Model(params, ended)), progress, stopped_by, speed)
+    if stopped_by or "overlap" not in config.stages:
+        return first
+    return _with_trained_head(first, store, config, hooks, seed=seed)
+
+
+def _with_trained_head(
+    first: Trained, store: ScanStore, config: TrainingConfig, hooks: TrainingHooks, *, seed: int
+) -> Trained:
+    """Does the second stage, in process 0."""
+    state = init_overlap(first.model)
     with together():
         if is_first():
-            _, state = train_overlap(store, model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
+            _, state = train_overlap(store, first.model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
     state = from_first(state)
     is_whole = int(state.step) >= config.overlap.num_steps(len(store.table))
-    model = _local(with_head(model, state.head, is_trained=is_whole))
-    return Trained(model, progress, 0 if is_whole else 1, speed, state)
+    model = _local(with_head(first.model, state.head, is_trained=is_whole))
+    return first._replace(model=model, stopped_by=0 if is_whole else 1, overlap=state)
 
 
 def _run_steps(
