@@ -148,7 +148,7 @@ def measure_overlap(
         "is_overlap": (is_one_drive & (apart_m < dpm.OVERLAP_M)).tolist(),
     }
     if "overlap" in model.config.trained:
-        by_head = model.replace(config=replace(model.config, overlap=None))
+        by_head = replace(model, config=replace(model.config, overlap=None))
         found["head"] = np.asarray(dpm.overlap_pairs(by_head, *sides), float).tolist()
     return found
 
@@ -221,7 +221,7 @@ def calibrate(model: dpm.Model, measured: MeasuredDrives) -> tuple[dpm.Model, Ro
         numbers["num_overlap_pairs"] = len(labels)
         if (tested := measured.tested_overlap) is not None:
             numbers |= overlap_numbers(overlap, tested)
-    return model.replace(config=replace(model.config, calibration=calibration, overlap=overlap)), numbers
+    return replace(model, config=replace(model.config, calibration=calibration, overlap=overlap)), numbers
 
 
 def overlap_numbers(fitted: dpm.LogisticModel, tested: Row) -> Row:

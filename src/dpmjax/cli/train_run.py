@@ -184,10 +184,10 @@ class Records:
         begun = dpm.begin_training(settings, seed=seed, start=weights)
         self.takes_last = takes_last
         trained = () if weights is None else weights.config.trained
-        before = replace(settings.model, trained=trained)
-        # A calibration stays where the head alone is trained.
-        is_head_alone = weights is not None and "registration" not in settings.stages
-        self.untrained = dpm.Model(begun.state.params, weights.config if is_head_alone else before)
+        config = replace(settings.model, trained=trained)
+        if weights is not None and "registration" not in settings.stages:
+            config = weights.config  # a calibration stays where the head alone is trained
+        self.untrained = dpm.Model(begun.state.params, config)
         self.start = self._restored(begun)
         self.overlap_start = self._overlap_checkpoints.restore_latest(dpm.init_overlap(self.untrained), fallback=None)
         first = int(self.start.state.step)

@@ -71,8 +71,9 @@ def split_places(drive: LidarSequence) -> PlaceSplit:
     rows = np.flatnonzero(drive.has_reference)
     poses = true_poses(drive)[rows]
     path = path_lengths(poses)
-    is_held_out = path > (1 - HELD_OUT_SHARE) * path[-1] if len(path) else np.zeros(0, bool)
-    margin_m = min(HELD_OUT_MARGIN_M, HELD_OUT_SHARE * path[-1]) if len(path) else 0.0
+    length_m = float(path.max(initial=0.0))
+    is_held_out = path > (1 - HELD_OUT_SHARE) * length_m
+    margin_m = min(HELD_OUT_MARGIN_M, HELD_OUT_SHARE * length_m)
     positions = poses[:, :3, 3]
     is_near = np.zeros(len(rows), bool)
     if is_held_out.any():

@@ -317,7 +317,8 @@ def _new_pairs(store: ScanStore, model: Model, config: TrainingConfig, seeds: tu
     scans, _ = store.read(pairs.ravel(), config, rng)
     clouds = _encode(model, scans)
     sides = (jax.tree.map(lambda leaf, side=side: leaf[side::2], clouds) for side in (0, 1))
-    return PairFeatures(*_correlated(model, *sides), _labels(store.table, pairs))
+    features, mask = _correlated(model, *sides)
+    return PairFeatures(features, mask, _labels(store.table, pairs))
 
 
 def _labels(table: ScanTable, pairs: Int[np.ndarray, "p 2"]) -> Bool[np.ndarray, " p"]:
