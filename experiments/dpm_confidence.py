@@ -22,7 +22,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, load_model, metrics
 from dpmjax import deeppointmap as dpm
-from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive, draw_pairs, lookalike_gap, measure_pairs
+from experiments.dpm_calibrate import ambiguous_case, ambiguous_drive
 
 EXPERIMENT = "dpm_confidence"
 # Apart from the seeds of the calibration.
@@ -70,7 +70,8 @@ def main(config: Config) -> list[cli.Row]:
 
     def work(run: cli.TableRun, place: int, kind: str, beams: int) -> cli.Row:
         drive = ambiguous_drive(place, kind, beams)
-        return measure_pairs(first, run.until_stopped(draw_pairs(drive, BANDS_M, config.pairs, config.seed)))
+        pairs = cli.draw_calibration_pairs(drive, BANDS_M, config.pairs, config.seed)
+        return cli.measure_pairs(first, run.until_stopped(pairs))
 
     def report(rows: list[cli.Row]) -> cli.Summary:
         numbers = [
@@ -94,7 +95,7 @@ def rate(rows: list[cli.Row], calibration: dpm.Calibration, rated: str) -> cli.R
             names = ("of_elements",) if rated == "clouds" else ("of_scans", "of_weak_scans")
             arrays = {name: row[name][number] for name in names}
             evidence = evidence._replace(**{name: np.asarray(some) for name, some in arrays.items() if some})
-            gap = lookalike_gap(row, number, "of_elements" if rated == "clouds" else "of_scans")
+            gap = cli.lookalike_gap(row, number, "of_elements" if rated == "clouds" else "of_scans")
             evidence = evidence._replace(lookalike_gap=gap)
             confidence.append(dpm.calibrated_probability(calibration, evidence))
         is_right += row[RATED[rated]]

@@ -18,9 +18,10 @@ from dpmjax.cli.command import run_command
 from dpmjax.cli.result_files import read_history
 from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
 from dpmjax.cli.train import NAME, Config, for_devices, main, training_settings
-from dpmjax.cli.train_run import KINDS, EvaluationSets, Records, run_training
+from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
+    OverlapConfig,
     SampleMaker,
     TrainingHooks,
     begin_training,
@@ -48,10 +49,20 @@ class StopAfter:
         return int(self._left < 0)
 
 
+BOTH = replace(TRAINING, stages=("registration", "overlap"), overlap=OverlapConfig(num_epochs=1, batch_pairs=6))
+"""Four steps of each stage."""
+
+
+def train_both(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
+    folder.mkdir(exist_ok=True)
+    records = Records(RunFolder(folder, is_resumed), BOTH, Selection(None, "the last step"), seed=0)
+    return run_training(records, toy.store(), BOTH, TrainingHooks(stop=StopAfter(stop_after)), seed=0)
+
+
 def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, total_s: float = math.inf):
     folder.mkdir(exist_ok=True)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
-    records = Records(RunFolder(folder, is_resumed), TRAINING, EvaluationSets((pairs,), (), pairs), seed=0)
+    records = Records(RunFolder(folder, is_resumed), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
 
@@ -83,6 +94,33 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
     assert num_steps(whole[0]) == TRAINING.num_steps
     assert num_steps(train(tmp_path, stop_after=num_before)) == num_before
     assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_the_second_stage_goes_on_where_it_was_broken_off_and_has_rows_of_its_own(tmp_path: Path) -> None:
+    whole = train_both(tmp_path / "whole")
+    assert whole.model.config.trained == ("registration", "overlap")
+    rows = read_history(tmp_path / "whole" / HISTORY)
+    assert [(row["step"], row["stage"]) for row in rows[3:5]] == [("4", "K=2"), ("5", "overlap")]
+    assert len(rows) == 8
+    assert all(float(row["overlap_loss"]) > 0 for row in rows[4:])
+    broken = train_both(tmp_path / "parts", stop_after=6)
+    assert (broken.stopped_by, broken.model.config.trained) == (1, ("registration",))
+    assert len(read_history(tmp_path / "parts" / HISTORY)) == 6
+    resumed = train_both(tmp_path / "parts", is_resumed=True)
+    assert resumed.stopped_by == 0
+    assert_same_run(resumed, tmp_path / "parts", (whole, tmp_path / "whole"))
+
+
+@pytest.mark.slow
+def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_path: Path) -> None:
+    nothing = train_run.draw_selection(TRAINING, 2, [lambda: toy.drive(num_scans=1)], "the drives")
+    assert nothing == Selection(None, "the last step: no drive has held-out places")
+    some = train_run.draw_selection(TRAINING, 4, [toy.drive, lambda: toy.drive(1)], "the drives")
+    assert some.chosen_by == "the drives"
+    assert [pairs.kind for pairs in some.of_scans.pairs] == list(KINDS[:2])
+    assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 4
+    assert max(pairs.sources.max() for pairs in some.pairs.pairs) >= 24  # of the second drive
 
 
 @pytest.mark.slow
@@ -131,6 +169,8 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
         ({"variants": -1}, "--variants"),
         ({"town_length_m": 5.0}, "--town-length-m"),
         ({"weights": "dpm_small", "frame": "local"}, "--frame"),
+        ({"stages": ("overlap",)}, "--stages overlap trains the head of a model"),
+        ({"stages": ()}, "--stages: expected registration, overlap, or both"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message: str) -> None:
@@ -170,12 +210,12 @@ def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPa
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
     weights = load_model("dpm_small")
     settings = training_settings(Config(weights="dpm_small"), weights)
-    assert settings.model == replace(weights.config, calibration=None, overlap=None)
+    assert settings.model == replace(weights.config, calibration=None, overlap=None, trained=())
     assert settings.learning_rate == pytest.approx(0.2 * training_settings(Config()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
-    sets = EvaluationSets((pairs,), (), pairs)
+    sets = Selection(pairs, "a toy")
     with Records(RunFolder(tmp_path, False), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)
         toy.assert_trees_equal(records.untrained.params, some.params)
@@ -280,7 +320,7 @@ def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_run.draw_sets(TRAINING, 2, [], length_m=100.0, on_wait=stop)
+        train_run.draw_selection(TRAINING, 2, [toy.drive], "a toy", on_wait=stop)
 
 
 def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tmp_path, monkeypatch, capsys) -> None:

@@ -38,7 +38,7 @@ coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
 from dpmjax.deeppointmap import TrainingHooks, draw_evaluation_pairs
-from dpmjax.cli.train_run import KINDS, EvaluationSets
+from dpmjax.cli.train_run import KINDS, Selection
 from dpmjax.cli.train_run import Records, run_training
 from dpmjax.cli.run_folder import RunFolder
 from dpmjax.cli.command import Interrupted, StopFlag
@@ -59,7 +59,7 @@ assert is_first() == (number == 0)
 try:
     with StopFlag() as stop:
         pairs = draw_evaluation_pairs(toy.drive(seed=9), 1, toy.MODEL, kinds=KINDS)
-        sets = EvaluationSets((pairs,), (), pairs)
+        sets = Selection(pairs, "a toy")
         records = Records(RunFolder(Path(folder), False), TRAINING, sets, seed=0) if is_first() else None
         store = toy.store()
         hooks = TrainingHooks(evaluate_every=1, stop=stop_requested)

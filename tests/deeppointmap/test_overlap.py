@@ -17,9 +17,11 @@ from dpmjax.deeppointmap.model import overlap_logit, similarity_features
 from dpmjax.deeppointmap.overlap_prediction import (
     HIGH,
     OverlapEvidence,
+    head_probability,
     overlap_evidence,
     overlap_probability,
 )
+from dpmjax.slam import KeyframeMap
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -121,10 +123,31 @@ def test_the_probability_is_the_logistic_function_of_the_evidence(fitted, assert
         overlap_probability(fitted, b, cloud(3))
 
 
-def test_a_model_without_a_fit_answers_with_the_published_head(model) -> None:
+def test_a_model_without_a_fit_answers_with_its_trained_head(model, fitted) -> None:
     a, b = cloud(1), cloud(2)
     expected = jax.nn.sigmoid(overlap_logit(model, *correlate(model, a, b)))
     np.testing.assert_allclose(overlap_probability(model, a, b), expected, **ACCUMULATED)
+    np.testing.assert_array_equal(head_probability(fitted, a, b), head_probability(model, a, b))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda model: dpmjax.overlap(model, cloud(1), cloud(2)),
+        lambda model: dpmjax.overlap_pairs(model, [cloud(1)], [cloud(2)]),
+        lambda model: overlap_probability(model, cloud(1), cloud(2)),
+        lambda model: head_probability(model, cloud(1), cloud(2)),
+        lambda model: dpmjax.run_slam(model, []),
+        lambda model: dpmjax.run_agents(model, [[], []]),
+        lambda model: dpmjax.merge_maps(model, *[KeyframeMap()] * 2),
+        lambda model: dpmjax.localize(model, KeyframeMap(), np.zeros((0, 3))),
+    ],
+    ids=["overlap", "overlap_pairs", "overlap_probability", "head", "run_slam", "run_agents", "merge_maps", "localize"],
+)
+def test_overlap_that_was_never_trained_is_refused_by_the_name_of_the_command(model, call) -> None:
+    untrained = model.replace(config=replace(model.config, trained=("registration",)))
+    with pytest.raises(ValueError, match="dpmjax train --stages overlap --weights FILE"):
+        call(untrained)
 
 
 def test_the_fit_is_stored_with_the_model(fitted, tmp_path) -> None:

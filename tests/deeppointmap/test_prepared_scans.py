@@ -108,6 +108,13 @@ def test_other_parameters_have_another_fingerprint() -> None:
     assert len(model_fingerprint(first)) == 16
 
 
+@pytest.mark.slow
+def test_a_map_stays_readable_when_the_overlap_head_is_trained() -> None:
+    first, other = (init_model(jax.random.key(seed), model_preset("tiny")) for seed in (0, 1))
+    decoder = {**first.params["decoder"], "overlap_head": other.params["decoder"]["overlap_head"]}
+    assert model_fingerprint(first.replace(params={**first.params, "decoder": decoder})) == model_fingerprint(first)
+
+
 def test_a_scan_is_prepared_for_each_use_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a cloud it needs surface elements, with another scan its measured surface."""
     model = Model({}, model_preset("tiny"))

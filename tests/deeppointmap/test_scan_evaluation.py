@@ -10,6 +10,8 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap import (
+    OVERLAP_FEATURES,
+    LogisticModel,
     draw_scan_pairs,
     evaluate_overlap,
     evaluate_scan_pairs,
@@ -46,6 +48,16 @@ def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(m
         monkeypatch.setattr(scan_evaluation, "overlap_pairs", probability)
         found = evaluate_overlap(model, drive, 10)
         assert (found.area_under_curve, len(found.is_overlap), known["num"]) == (expected, 20, 20)
+
+
+@pytest.mark.slow
+def test_head_and_regression_answer_for_the_same_pairs(model) -> None:
+    always = LogisticModel(OVERLAP_FEATURES, (0.0,) * len(OVERLAP_FEATURES), 1.0)
+    both = model.replace(config=replace(model.config, overlap=always))
+    found, alone = evaluate_overlap(both, toy.drive(), 4), evaluate_overlap(model, toy.drive(), 4)
+    np.testing.assert_allclose(found.probability, 1 / (1 + np.exp(-1)), rtol=1e-5)
+    np.testing.assert_array_equal(found.by_head, alone.probability)
+    assert alone.by_head is None
 
 
 def test_a_scan_without_a_reference_hides_no_revisit() -> None:

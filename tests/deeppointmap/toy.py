@@ -13,6 +13,7 @@ from dpmjax.deeppointmap import (
     MatchConfig,
     ModelConfig,
     ObjectiveConfig,
+    OverlapConfig,
     SamplingConfig,
     ScanStore,
     TrainingConfig,
@@ -31,7 +32,9 @@ MODEL = ModelConfig(
     encoder=EncoderConfig(stem_channels=4, expansion=2, output_channels=8),
     decoder=DecoderConfig(input_channels=8, model_channels=12, num_layers=1, num_heads=2),
     preprocess=PreprocessConfig(capacity=128, num_outlier_neighbours=0, voxel_size_m=0.5),
+    trained=("registration", "overlap"),
 )
+"""Random parameters answer as trained ones would, so that overlap and SLAM accept them."""
 
 SLAM_MODEL = replace(
     MODEL,
@@ -49,6 +52,8 @@ TRAINING = TrainingConfig(
     thins_maps=True,
     initialization="normal",
     objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
+    stages=("registration",),
+    overlap=OverlapConfig(num_epochs=2, batch_pairs=4),
 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax import deeppointmap, simulation
+from dpmjax import cli, deeppointmap, simulation
 from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
 from dpmjax.cli.result_files import load_json
 from dpmjax.deeppointmap import (
@@ -87,7 +87,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         return toy.drive(seed)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(dpm_calibrate, "encode", lambda model, points, num_elements: points)
+    monkeypatch.setattr(deeppointmap, "encode", lambda model, points, num_elements: points)
     rng = np.random.default_rng(0)
 
     def found(model, pair):
@@ -172,8 +172,8 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
 
 
 @pytest.mark.slow
-def test_half_of_the_overlap_pairs_of_a_town_overlap(weights) -> None:
+def test_half_of_the_overlap_pairs_of_drives_overlap(weights) -> None:
     drives = [toy.drive(1), toy.drive(2)]
-    row = dpm_calibrate.measure_town(dpmjax.load_model(weights), drives, 32, 0)
+    row = cli.measure_overlap(dpmjax.load_model(weights), drives, 32, 0)
     assert sum(row["is_overlap"]) == 16
     assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dpmjax.deeppointmap import pooled_vector
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph import optimize_pose_graph
@@ -24,7 +25,6 @@ from dpmjax.slam.loop_closure import (
 )
 from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted
 from dpmjax.slam.map_optimization import optimize_map, with_motions
-from dpmjax.slam.model_methods import pooled_vector
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 

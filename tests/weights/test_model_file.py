@@ -45,6 +45,7 @@ def test_saved_model_is_the_loaded_one(model: Model, tmp_path: Path) -> None:
     save_model(model, tmp_path / "m.safetensors", card="trained on a town")
     assert_same(load_model(tmp_path / "m.safetensors"), model)
     assert read_card(tmp_path / "m.safetensors") == "trained on a town"
+    assert load_model(tmp_path / "m.safetensors").config.trained == ("registration", "overlap")
 
 
 def test_a_model_is_read_by_whom_the_folder_lets(model: Model, tmp_path: Path) -> None:

@@ -1,3 +1,14 @@
+from .calibrate import Bands as Bands
+from .calibrate import HeldOut as HeldOut
+from .calibrate import MeasuredDrives as MeasuredDrives
+from .calibrate import calibrate as calibrate
+from .calibrate import draw_calibration_pairs as draw_calibration_pairs
+from .calibrate import fit_confidence as fit_confidence
+from .calibrate import fit_overlap as fit_overlap
+from .calibrate import lookalike_gap as lookalike_gap
+from .calibrate import measure_drives as measure_drives
+from .calibrate import measure_overlap as measure_overlap
+from .calibrate import measure_pairs as measure_pairs
 from .command import EXIT_BAD_INPUT as EXIT_BAD_INPUT
 from .command import StopFlag as StopFlag
 from .command import check_least as check_least

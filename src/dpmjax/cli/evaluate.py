@@ -10,7 +10,7 @@ within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (lates
 recall of the network alone, after the verification by the scans, and after the final alignment. metrics.json has every
 pair. reliability.png shows the share of right registrations for each confidence, pairs more than 60 m apart included.
 failures.png shows wrong registrations from above. The AUC of overlap compares pairs less than 20 m apart (revisits
-where the drive has some) with pairs more than 40 m apart.
+where the drive has some) with pairs more than 40 m apart; metrics.json has that of the overlap head on the same pairs.
 """
 
 from __future__ import annotations
@@ -146,6 +146,10 @@ def overlap_row(
     if len(found.is_overlap):
         row |= {"auc": found.area_under_curve, "brier": found.brier_score}
         row |= {"probability": found.probability.tolist(), "is_overlap": found.is_overlap.tolist()}
+        if found.by_head is not None:
+            of_head = found._replace(probability=found.by_head)
+            row |= {"auc_head": of_head.area_under_curve, "brier_head": of_head.brier_score}
+            row["probability_head"] = found.by_head.tolist()
     return row
 
 

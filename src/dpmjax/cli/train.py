@@ -1,26 +1,29 @@
-"""Trains the networks of DeepPointMap: descriptors of lidar scans, and how two clouds of them are registered.
+"""Trains the networks of DeepPointMap: descriptors of lidar scans, their registration, and their overlap.
 
     dpmjax train                                                  tiny network, simulated towns, two cores
     dpmjax train --preset small --num-towns 20 --hours 8          two cores, over night
     dpmjax train --data kitti town --preset paper                 drives from files, and towns
     dpmjax train --data kitti --preset small --weights dpm_small  tune trained weights
+    dpmjax train --stages overlap --weights FILE --data kitti     train the overlap head of weights, and calibrate them
     dpmjax train --preset small --scans 96 --num-towns 200        one GPU
     dpmjax train --resume                                         continue the latest run
     dpmjax train --resume --finish                                end it now: the learning rate falls
     dpmjax train --coordinator host0:8476 --num-processes 2 --process-id 0
                                                                   on two hosts; --process-id 1 on the other
 
-Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model, metrics.csv,
-metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of pairs of a held-out town, turned
-by any yaw, that are registered within 2 m and 5 degrees. The pairs are of scans and of maps, 2 to 10 and 10 to 20 m
-apart. The model is the one of the step with the best mean recall on other towns (metrics.json: best_step). Afterwards
-`python -m experiments.dpm_calibrate MODEL` calibrates its overlap and its confidence.
+Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
+last.safetensors, metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of
+pairs of held-out places, turned by any yaw, that are registered within 2 m and 5 degrees. Held out is the last tenth
+of the path of each drive, with all scans near it. The model is the one of the step with the best mean recall
+(metrics.json: best_step, chosen_by); `paper` takes the last one, as published. Then the overlap head is trained, and
+confidence and overlap are calibrated, so that SLAM can use the model.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,19 +34,15 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import cli, deeppointmap, io, simulation, viz, weights
+from dpmjax import cli, deeppointmap, io, simulation, weights
 from dpmjax.sequences import LidarSequence
 
 if TYPE_CHECKING:
-    from dpmjax.cli.train_run import Records
+    from dpmjax.cli.train_run import Records, Selection
 
 NAME = "train"
-MODEL = "model.safetensors"
-# Largest number of listed damaged scans; further ones are only counted.
-MAX_LISTED = 10
 # Share of the learning rate at which trained weights are tuned: at the full rate they forget pairs far apart.
 TUNING_SHARE = 0.2
-SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "real_recall")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +61,7 @@ class ProcessOptions(cli.RunOptions):
 class Config(ProcessOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "validate"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "calibrate"})
 
     data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
     """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
@@ -71,6 +70,11 @@ class Config(ProcessOptions):
     weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
     """Go on from these weights at a fifth of the learning rate; their network takes the place of that of the preset.
     Without it, begin from random ones."""
+    stages: tuple[Literal["registration", "overlap"], ...] = ("registration", "overlap")
+    """Stages of the training: all networks but the overlap head, then this head alone. overlap alone trains the head of
+    --weights."""
+    calibrate: bool = True
+    """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2)."""
     frame: Literal["lidar", "bearing", "local"] | None = None
@@ -104,10 +108,10 @@ class Config(ProcessOptions):
     variants: Annotated[int | None, arg(metavar="N")] = None
     """Prepare each scan N times and choose among these; fewer need less disk, 0.8 MB for each of `paper`. 0: prepare it
     anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
-    held_out_pairs: Annotated[int, arg(metavar="N")] = 60
-    """Pairs of each kind of the held-out town that recall is reported on."""
+    held_out_pairs: Annotated[int, arg(metavar="N")] = 32
+    """Pairs of scans at each distance that choose the model, all drives together."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
-    """Folders of real scans with poses: their recall is drawn beside that of the towns, and chooses nothing."""
+    """Folders of scans with poses whose pairs choose the model, instead of held-out places of --data."""
     recall_every: Annotated[int, arg(metavar="N")] = 200
     """Measure recall every N steps, and at the end."""
 
@@ -126,6 +130,10 @@ class Config(ProcessOptions):
             raise ValueError("--data: expected town or a folder of scans")
         if self.weights is not None and self.frame is not None:
             raise ValueError("--frame: --weights has a frame already; give one of the two")
+        if not self.stages:
+            raise ValueError("--stages: expected registration, overlap, or both")
+        if "registration" not in self.stages and self.weights is None:
+            raise ValueError("--stages overlap trains the head of a model: give it by --weights")
 
 
 def main(config: Config) -> None:
@@ -137,7 +145,7 @@ def main(config: Config) -> None:
     if config.coordinator is not None:  # not before the processes have found each other
         cli.select_device(config.device)
     from dpmjax.cli.train_preparation import prepare_sources
-    from dpmjax.cli.train_run import Records, draw_sets, run_training
+    from dpmjax.cli.train_run import Records, run_training, training_part
 
     with together():
         first = None if config.weights is None else weights.load_model(config.weights)
@@ -148,15 +156,17 @@ def main(config: Config) -> None:
         with together():
             # Of several processes, none may end alone.
             on_wait = stop.end_if_requested if config.coordinator is None else lambda: None
-            drives = prepare_sources(sources, settings, config.cache, seed=config.seed, on_wait=on_wait)
+            parts = [partial(training_part, source) for source in sources]
+            drives = prepare_sources(parts, settings, config.cache, seed=config.seed, on_wait=on_wait)
             store = deeppointmap.ScanStore(drives)
             settings = for_devices(settings, len(store.table))
             records = None
             if folder is not None:
                 print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
-                length_m = config.town_length_m
-                sets = draw_sets(settings, config.held_out_pairs, config.validate, length_m=length_m, on_wait=on_wait)
-                records = Records(folder, settings, sets, seed=config.seed, weights=first)
+                settings = without_impossible_stage(settings, store)
+                selection = select_pairs(config, settings, sources, on_wait)
+                is_last = config.preset == "paper"
+                records = Records(folder, settings, selection, seed=config.seed, weights=first, takes_last=is_last)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
         total_s = 0.0 if config.finish else 3600 * (config.hours or math.inf)
         trained = run_training(records, store, settings, hooks, seed=config.seed, total_s=total_s)
@@ -167,22 +177,30 @@ def main(config: Config) -> None:
             return
         # The evaluation takes minutes, which a stopped run does not have.
         evaluation = None if stop.is_requested else evaluate(trained, records)
+        calibrated, numbers = trained.model, dict[str, Any]()
+        if config.calibrate and not stop.is_requested:
+            calibrated, numbers = calibrate(trained.model, chosen_sources(config, sources), config.seed)
         metrics = {
             **training_numbers(trained, records),
             **({} if evaluation is None else evaluation.numbers),
+            "calibration": numbers,
             "num_scans": len(store.table),
             "bad_scans": bad,
             "wall_s": time.perf_counter() - started,
             "status": stop.status,
             "seed": config.seed,
         }
+        from dpmjax.cli import train_files
+
         # Numbers first, so that they are written even if a picture fails.
         cli.write_metrics(folder, metrics)
-        write_model(folder, trained.model, metrics, origin=f"{config.preset}, trained on {', '.join(config.data)}")
-        draw_curves(folder)
-        if evaluation is not None:
-            draw_matches(folder, evaluation.trained, records.sets.held_out)
-        print_summary(folder, metrics)
+        origin = f"{config.preset}, trained on {', '.join(config.data)}"
+        train_files.write_model(folder / train_files.MODEL, calibrated, metrics, origin=origin)
+        train_files.write_other_model(folder, trained, records, metrics, origin=origin)
+        train_files.draw_curves(folder)
+        if evaluation is not None and evaluation.trained is not None and records.selection.pairs is not None:
+            train_files.draw_matches(folder, evaluation.trained, records.selection.pairs)
+        train_files.print_summary(folder, metrics)
 
 
 def training_sources(config: Config, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
@@ -211,14 +229,84 @@ def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppo
     return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
+def chosen_sources(config: Config, sources: Sequence[cli.Source]) -> list[cli.Source]:
+    """Returns the drives by which models are chosen and calibrated: those of the user, or else the towns."""
+    own = [source for source in sources if not is_town(source)]
+    return own or list(sources)
+
+
+def is_town(source: cli.Source) -> bool:
+    """Returns True for a simulated town of the seeds of the run."""
+    return isinstance(source, partial) and source.func in (simulation.simulate_drive, kept_drive)
+
+
+def select_pairs(
+    config: Config, settings: deeppointmap.TrainingConfig, sources: Sequence[cli.Source], on_wait: Callable[[], object]
+) -> Selection:
+    """Returns the pairs that choose the model: of --validate, else of held-out places of the drives or of the towns."""
+    from dpmjax.cli.train_run import Selection, draw_selection, held_out_part
+
+    if "registration" not in config.stages:
+        return Selection(None, "given weights")
+    if config.validate:
+        drives: list[cli.Source] = [partial(io.open_lidar_sequence, path) for path in config.validate]
+        name = "drives of --validate"
+    else:
+        chosen = chosen_sources(config, sources)
+        drives = [partial(held_out_part, source) for source in chosen]
+        name = f"held-out places of the {'towns' if is_town(chosen[0]) else 'drives'}"
+    return draw_selection(settings, config.held_out_pairs, drives, name, on_wait=on_wait)
+
+
+def without_impossible_stage(
+    settings: deeppointmap.TrainingConfig, store: deeppointmap.ScanStore
+) -> deeppointmap.TrainingConfig:
+    """Leaves out the stage of overlap, with a line, where the scans cannot teach it.
+
+    Args:
+        settings: settings of training.
+        store: the scans.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ValueError: if no other stage remains.
+    """
+    reason = deeppointmap.why_no_overlap(store.table)
+    if reason is None or "overlap" not in settings.stages:
+        return settings
+    if "registration" not in settings.stages:
+        raise ValueError(f"--data: {reason}")
+    print(f"the overlap head is not trained: {reason}; give more drives, or town too")
+    return replace(settings, stages=("registration",))
+
+
+def calibrate(
+    model: deeppointmap.Model, sources: Sequence[cli.Source], seed: int
+) -> tuple[deeppointmap.Model, dict[str, Any]]:
+    """Returns the model with regressions of confidence and overlap, and their numbers on held-out places."""
+    print("calibrating confidence and overlap ...", flush=True)
+    calibrated, numbers = cli.calibrate(model, cli.measure_drives(model, [source() for source in sources], seed))
+    if calibrated.config.calibration is None:
+        print("the confidence is not calibrated: all registrations of the data are right, or all are wrong")
+    if calibrated.config.overlap is None:
+        print("the overlap is not calibrated: pairs with overlap or without are missing; give more drives, or town too")
+    return calibrated, numbers
+
+
 def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
     """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
     import jax
 
     settings = deeppointmap.training_preset(config.preset)
     if first is not None:
-        model = replace(first.config, calibration=None, overlap=None)
+        model = replace(first.config, calibration=None, overlap=None, trained=())
         settings = replace(settings, model=model, learning_rate=TUNING_SHARE * settings.learning_rate)
+        if "overlap" not in first.config.trained:  # this head begins, whatever is tuned
+            rate_share = settings.overlap.rate_share / TUNING_SHARE
+            settings = replace(settings, overlap=replace(settings.overlap, rate_share=rate_share))
+    settings = replace(settings, stages=config.stages)
     if config.frame is not None:
         encoder = replace(settings.model.encoder, frame=config.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
@@ -241,9 +329,9 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
 
 
 class Measured(NamedTuple):
-    """Evaluation of the trained network, and the numbers of both networks for `metrics.json`."""
+    """Evaluation of the trained network, None without pairs, and the numbers of both networks for `metrics.json`."""
 
-    trained: deeppointmap.Evaluation
+    trained: deeppointmap.Evaluation | None
     numbers: dict[str, Any]
 
 
@@ -253,6 +341,9 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[st
         "steps": int(trained.progress.state.step),
         "best_step": int(trained.progress.best_step) or None,
         "selection_score": float(trained.progress.best_score),
+        "chosen_by": "the last step, as published" if records.takes_last else records.selection.chosen_by,
+        "trained": trained.model.config.trained,
+        "overlap_steps": 0 if trained.overlap is None else int(trained.overlap.step),
         "train_s": records.run_s,
         "compile_s": trained.speed.compile_s,
         "scans_per_s": trained.speed.scans_per_s,
@@ -260,79 +351,20 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[st
 
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> Measured:
-    """Returns recall and errors of the trained and of the untrained network."""
+    """Returns recall and errors of the trained and of the untrained network, of the latter for pairs of scans alone."""
     from dpmjax.cli.train_run import KIND_NAMES
 
-    pairs = records.sets.held_out
-    models = {"": trained.model, "_untrained": records.untrained}
-    evaluations = {
-        suffix: deeppointmap.evaluate_registration(model, pairs)
-        for suffix, model in tqdm(models.items(), desc="evaluate", unit=" networks", dynamic_ncols=True)
-    }
+    pairs, of_scans = records.selection.pairs, records.selection.of_scans
+    if pairs is None or of_scans is None:
+        return Measured(None, {})
+    models = {"": (trained.model, pairs), "_untrained": (records.untrained, of_scans)}
     metrics: dict[str, Any] = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
-    for suffix, evaluation in evaluations.items():
+    evaluations = {}
+    for suffix, (model, some) in tqdm(models.items(), desc="evaluate", unit=" networks", dynamic_ncols=True):
+        evaluation = evaluations[suffix] = deeppointmap.evaluate_registration(model, some)
         near = evaluation.recalls[0]
-        of_kinds = zip(KIND_NAMES, evaluation.recalls, strict=True)
-        metrics |= {f"{name}{suffix}": recall.recall for name, recall in of_kinds}
+        of_kinds = zip(some.pairs, evaluation.recalls, strict=True)
+        metrics |= {f"{KIND_NAMES[of_kind.kind]}{suffix}": recall.recall for of_kind, recall in of_kinds}
         metrics[f"translation_error_median{suffix}_m"] = float(np.median(near.translation_errors_m))
         metrics[f"rotation_error_median{suffix}_deg"] = float(np.median(near.rotation_errors_deg))
     return Measured(evaluations[""], metrics)
-
-
-def write_model(folder: cli.RunFolder, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
-    """Writes model.safetensors with a description of its training, which begins with the preset and the data."""
-    best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
-    card = f"{origin} ({metrics['num_scans']} scans), {metrics['steps']} steps{best}, seed {metrics['seed']}. "
-    if "recall" in metrics:
-        card += (
-            f"Held-out town, {metrics['num_held_out_pairs']} pairs 2-10 m apart, any yaw: recall (2 m, 5 deg) "
-            f"{metrics['recall']:.3f}, untrained {metrics['recall_untrained']:.3f}."
-        )
-    else:
-        card += "Stopped before its evaluation."
-    unfinished = folder / f".tmp_{MODEL}"
-    weights.save_model(model, unfinished, card=card)
-    unfinished.replace(folder / MODEL)
-
-
-def draw_curves(folder: cli.RunFolder) -> None:
-    """Draws loss.png: losses and recalls over the steps."""
-    rows = cli.read_history(folder / cli.HISTORY)
-    if rows:
-        curves = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SHOWN_CURVES}
-        curves = {name.replace("_", " "): curve for name, curve in curves.items() if np.isfinite(curve).any()}
-        viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), folder / "loss.png")
-
-
-def draw_matches(
-    folder: cli.RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs
-) -> None:
-    """Draws matches.png: of the pairs left out of the training, the one of the median error."""
-    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
-    number = int(np.argsort(errors)[len(errors) // 2])
-    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
-    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
-    is_inlier = matches.is_inlier[number]
-    p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
-    q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
-    distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
-    title = f"Pair of scans left out of the training, the one of the median error ({errors[number]:.2f} m)\n"
-    title += "right matches are less than 3 m apart under the true motion"
-    motions = {"source moved by the estimated motion": np.asarray(matches.T_target_source[number], np.float64)}
-    pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
-    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), folder / "matches.png")
-
-
-def print_summary(folder: cli.RunFolder, metrics: dict[str, Any]) -> None:
-    """Prints the recall, the scans that were left out, and the folder."""
-    at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
-    if "recall" in metrics:
-        print(f"recall on the held-out town {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
-    else:
-        print(f"stopped after step {metrics['steps']}{at}; not evaluated on the held-out town")
-    bad = metrics["bad_scans"]
-    if bad:
-        print(f"{len(bad)} scans left out, all of them in {folder / cli.METRICS}:")
-        for source, reason in list(bad.items())[:MAX_LISTED]:
-            print(f"  {source}: {reason}")
-    print(f"results in {folder.path}")

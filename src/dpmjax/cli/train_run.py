@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,67 +15,88 @@ from tqdm import tqdm
 from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.io import open_lidar_sequence
-from dpmjax.simulation import HDL32E, HDL64E, OS1_64, simulate_drive
+from dpmjax.sequences import LidarSequence
 
-# Far from the seeds of training towns, which count up from the seed of the run.
-HELD_OUT_SEED, SELECTION_SEED = 1_000_000, 2_000_000
-SELECTION_PAIRS, VALIDATION_PAIRS = 320, 60
-SELECTION_SCENES = (("suburb", HDL64E), ("canyon", OS1_64), ("country", HDL32E), ("campus", OS1_64))
-SELECTION_LENGTH_M = 250.0
+# Largest number of scans of an evaluation, all drives together.
+MAX_EVALUATED_SCANS = 96
 KINDS = (dpm.PairKind(2.0, 10.0), dpm.PairKind(10.0, 20.0), dpm.PairKind(2.0, 10.0, 4), dpm.PairKind(10.0, 20.0, 4))
-"""Pairs that models are selected and reported by: scans and maps of four scans, near and far."""
+"""Pairs of scans, near and far, which choose the model; pairs of maps of four scans, which the last model registers."""
 
-KIND_NAMES = ("recall", "recall_far", "recall_maps", "recall_maps_far")
+KIND_NAMES = dict(zip(KINDS, ("recall", "recall_far", "recall_maps", "recall_maps_far"), strict=True))
+OVERLAP_STAGE = "overlap"
+OVERLAP_CHECKPOINTS = "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
 SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
-RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
+RECALLS = ("recall", "recall_far")
+OVERLAP_MEASURES = ("overlap_loss", "overlap_accuracy")
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OVERLAP_MEASURES)
 
 
-class EvaluationSets(NamedTuple):
-    """Pairs of a run.
+class Selection(NamedTuple):
+    """Pairs that choose the model.
 
     Attributes:
-        selection: pairs of towns of their own, by which the best model is chosen.
-        real: pairs of each folder of real scans, which are measured but not used for selection.
-        held_out: pairs of another town, measured once at the end.
+        pairs: pairs of scans and of maps; None where no drive has held-out places: the last model is taken.
+        chosen_by: a name of the pairs, for `metrics.json`.
     """
 
-    selection: tuple[dpm.EvaluationPairs, ...]
-    real: tuple[dpm.EvaluationPairs, ...]
-    held_out: dpm.EvaluationPairs
+    pairs: dpm.EvaluationPairs | None
+    chosen_by: str
+
+    @property
+    def of_scans(self) -> dpm.EvaluationPairs | None:
+        """The pairs of scans alone, which are measured during the training."""
+        if self.pairs is None:
+            return None
+        return self.pairs._replace(pairs=tuple(some for some in self.pairs.pairs if some.kind.num_scans == 1))
 
 
-def draw_sets(
+def training_part(source: cli.Source) -> LidarSequence:
+    """Opens a drive without its held-out places, and without the scans near them."""
+    drive = source()
+    return drive.take(dpm.split_places(drive).training)
+
+
+def held_out_part(source: cli.Source) -> LidarSequence:
+    """Opens the held-out places of a drive."""
+    drive = source()
+    return drive.take(dpm.split_places(drive).held_out)
+
+
+def draw_selection(
     settings: dpm.TrainingConfig,
-    held_out_pairs: int,
-    validate: Sequence[Path],
+    num_pairs: int,
+    drives: Sequence[cli.Source],
+    chosen_by: str,
     *,
-    length_m: float,
     on_wait: Callable[[], object] = lambda: None,
-) -> EvaluationSets:
-    """Returns the pairs of a run; `validate` names folders of real scans, `length_m` is that of towns.
+) -> Selection:
+    """Draws the pairs that choose the model.
 
-    `on_wait` is called before each drive; an error of it ends the preparation.
+    Args:
+        settings: settings of training.
+        num_pairs: number of pairs of each kind, all drives together.
+        drives: held-out places, or drives of `--validate`.
+        chosen_by: a name of these.
+        on_wait: called before each drive; an error of it ends the preparation.
+
+    Returns:
+        The pairs; none where no drive has any.
     """
-    draw = partial(dpm.draw_evaluation_pairs, config=settings.model)
-    num = max(1, SELECTION_PAIRS // (len(KINDS) * len(SELECTION_SCENES)))
-    towns = [
-        simulate_drive(SELECTION_SEED + number, length_m=min(length_m, SELECTION_LENGTH_M), kind=kind, sensor=sensor)
-        for number, (kind, sensor) in enumerate(SELECTION_SCENES)
-    ]
-    held_out = simulate_drive(HELD_OUT_SEED, length_m=length_m, kind="suburb", sensor=HDL64E)
-    work = [partial(draw, town, num, kinds=KINDS, max_scans=64) for town in towns]
-    work += [partial(draw, open_lidar_sequence(path), VALIDATION_PAIRS, kinds=KINDS[:2]) for path in validate]
-    work += [partial(draw, held_out, held_out_pairs, kinds=KINDS)]
-    sets = []
-    for one in tqdm(work, desc="prepare evaluation", unit=" drives", dynamic_ncols=True):
+    parts = []
+    for source in tqdm(drives, desc="prepare evaluation", unit=" drives", dynamic_ncols=True):
         on_wait()
-        sets.append(one())
-    return EvaluationSets(tuple(sets[: len(towns)]), tuple(sets[len(towns) : -1]), sets[-1])
+        drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
+        drive = drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
+        if not (kinds := dpm.pair_kinds(drive, KINDS)) or kinds[0].num_scans > 1:
+            continue
+        num = max(1, num_pairs // len(drives))
+        parts.append(dpm.draw_evaluation_pairs(drive, num, settings.model, kinds=kinds, max_scans=max_scans))
+    if not parts:
+        return Selection(None, "the last step: no drive has held-out places")
+    return Selection(dpm.join_evaluation_pairs(parts), chosen_by)
 
 
 class Records:
@@ -84,30 +104,42 @@ class Records:
 
     Attributes:
         folder: folder of the run.
-        sets: pairs of evaluations.
+        selection: pairs that choose the model.
         untrained: the model before the first step.
         start: progress to start from: the latest checkpoint of a resumed run.
         earlier_s: run time of the steps of earlier calls of `train`.
+        overlap_start: state of the second stage to start from; None for its beginning.
+        takes_last: True to take the last model, as published, instead of the best.
     """
 
     def __init__(
         self,
         folder: cli.RunFolder,
         settings: dpm.TrainingConfig,
-        sets: EvaluationSets,
+        selection: Selection,
         *,
         seed: int,
         weights: dpm.Model | None = None,
+        takes_last: bool = False,
     ) -> None:
-        self.folder, self.sets, self._settings = folder, sets, settings
+        self.folder, self.selection, self._settings = folder, selection, settings
+        self._overlap_checkpoints = Checkpoints(folder / OVERLAP_CHECKPOINTS)
         self._checkpoints, self._best = Checkpoints(folder / cli.CHECKPOINTS), Checkpoints(folder / cli.BEST)
         begun = dpm.begin_training(settings, seed=seed, start=weights)
-        self.untrained = dpm.Model(begun.state.params, settings.model)
+        self.takes_last = takes_last
+        trained = () if weights is None else weights.config.trained
+        config = replace(settings.model, trained=trained)
+        if weights is not None and "registration" not in settings.stages:
+            config = weights.config  # a calibration stays where the head alone is trained
+        self.untrained = dpm.Model(begun.state.params, config)
         self.start = self._restored(begun)
+        self.overlap_start = self._overlap_checkpoints.restore_latest(dpm.init_overlap(self.untrained), fallback=None)
         first = int(self.start.state.step)
+        if self.overlap_start is not None:
+            first += int(self.overlap_start.step)
         self._history = cli.HistoryFile(folder / cli.HISTORY, COLUMNS, keep_until=first)
         self.earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
-        total = int(self.start.state.end)
+        total = int(self.start.state.end) if "registration" in settings.stages else 0
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
         self.run_s, self._pace_s = self.earlier_s, math.nan
@@ -115,16 +147,14 @@ class Records:
         self._tell_compilation(self.start.state)
 
     def evaluate(self, model: dpm.Model) -> float:
-        """Returns the mean recall on the selection pairs, and measures that on real pairs."""
-
-        def mean_recalls(sets: Sequence[dpm.EvaluationPairs]) -> list[float]:
-            found = (dpm.evaluate_registration(model, pairs).recalls for pairs in sets)
-            return np.mean([[recall.recall for recall in recalls] for recalls in found], axis=0).tolist()
-
-        of_kinds = mean_recalls(self.sets.selection)
-        of_real = mean_recalls(self.sets.real) if self.sets.real else [math.nan, math.nan]
-        self._recalls = dict(zip(RECALLS, (*of_kinds, *of_real), strict=True))
-        return float(np.mean(of_kinds))
+        """Returns the mean recall of the pairs of scans that choose the model."""
+        pairs = self.selection.of_scans
+        if pairs is None:
+            return math.nan
+        found = dpm.evaluate_registration(model, pairs)
+        named = zip(pairs.pairs, found.recalls, strict=True)
+        self._recalls |= {KIND_NAMES[some.kind]: recall.recall for some, recall in named}
+        return float(np.mean([recall.recall for recall in found.recalls]))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint every few minutes."""
@@ -154,6 +184,34 @@ class Records:
         if not math.isfinite(total_s) or math.isnan(self._pace_s):
             return 0
         return max(1, round((total_s - self.run_s) / self._pace_s))
+
+    def train_head(self, trained: dpm.Trained, store: dpm.ScanStore, stop: Callable[[], int], seed: int) -> dpm.Trained:
+        """Trains the overlap head, or continues; the rows follow those of the first stage, and checkpoints its own."""
+        before = int(trained.progress.state.step)
+        earlier_s, begun = self.run_s, time.perf_counter()
+        first = 0 if self.overlap_start is None else int(self.overlap_start.step)
+        total = self._settings.overlap.num_steps(len(store.table))
+        with tqdm(total=total, initial=first, desc="train overlap", unit=" steps", dynamic_ncols=True) as bar:
+
+            def on_report(record: dpm.OverlapRecord, state: dpm.OverlapState) -> None:
+                self.run_s = earlier_s + time.perf_counter() - begun
+                values = {"overlap_loss": record.loss, "overlap_accuracy": record.accuracy}
+                values |= {"learning_rate": record.learning_rate}
+                measured = {name: f"{value:.7g}" for name, value in values.items()}
+                run_s = round(self.run_s, 3)
+                self._history.append(step=before + record.step, stage=OVERLAP_STAGE, run_s=run_s, **measured)
+                bar.set_postfix_str(f"loss {record.loss:.3f}, right {record.accuracy:.2f}", refresh=False)
+                bar.update(1)
+                if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
+                    self._overlap_checkpoints.save(record.step, state)
+                    self._last_saved = time.perf_counter()
+
+            hooks = dpm.OverlapHooks(on_report, stop)
+            start = self.overlap_start
+            model, state = dpm.train_overlap(store, trained.model, self._settings, seed=seed, start=start, hooks=hooks)
+        self._overlap_checkpoints.save(int(state.step), state)
+        stopped_by = 0 if int(state.step) >= total else stop()
+        return trained._replace(model=model, overlap=state, stopped_by=stopped_by)
 
     def save(self, progress: dpm.TrainingProgress) -> None:
         """Writes a checkpoint, and the best parameters where they have changed since the last one."""
@@ -194,19 +252,40 @@ def run_training(
     seed: int,
     total_s: float = math.inf,
 ) -> dpm.Trained:
-    """Returns the result of training, after saving its last state; one process has records.
+    """Returns the result of both stages, after saving their last states; one process has records, and trains the head.
 
     Training ends after about `total_s` seconds of steps, compilation and evaluation, those of earlier calls included;
     with 0 it ends after a quarter of the steps that are done.
     """
+    trains_first, trains_head = "registration" in settings.stages, "overlap" in settings.stages
+    settings = replace(settings, stages=("registration",))
     if records is None:
         return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
-        hooks = replace(hooks, evaluate=records.evaluate, on_report=records.on_report)
+        stop = hooks.stop
+        if not trains_first:
+            return records.train_head(dpm.Trained(records.untrained, records.start, 0, dpm.Speed()), store, stop, seed)
+        if records.selection.pairs is not None:
+            hooks = replace(hooks, evaluate=records.evaluate)
+        hooks = replace(hooks, on_report=records.on_report)
         hooks = replace(hooks, steps_left=partial(records.steps_left, total_s=total_s))
         trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
-        return trained
+        if records.takes_last:
+            trained = trained._replace(model=last_model(trained))
+        return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, stop, seed)
+
+
+def last_model(trained: dpm.Trained) -> dpm.Model:
+    """Returns the model of the last step of the first stage."""
+    params = jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), trained.progress.state.params)
+    return dpm.Model(params, trained.model.config)
+
+
+def best_model(trained: dpm.Trained) -> dpm.Model:
+    """Returns the model of the best evaluation of the first stage."""
+    params = jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), trained.progress.best_params)
+    return dpm.Model(params, trained.model.config)
 
 
 def _stage_name(stage: dpm.CurriculumStage) -> str:

@@ -174,3 +174,23 @@ def stack_chunk(items: list[Any]) -> Any:
 def join_chunks(parts: Sequence[Any], num: int) -> Any:
     """Joins the results of chunks, on the host: there, another number of parts compiles nothing."""
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num]), *jax.device_get(parts))
+
+
+def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
+    """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
+
+    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
+    where the scan turns about the vertical.
+
+    Args:
+        cloud: descriptors of a scan.
+
+    Returns:
+        (2 c,) float32; zero for an empty cloud.
+    """
+    features = np.asarray(cloud.features, np.float32)[np.asarray(cloud.mask)]
+    if len(features) == 0:
+        return np.zeros(2 * cloud.features.shape[-1], np.float32)
+    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
+    pooled = np.concatenate([features.mean(axis=0), features.std(axis=0)])
+    return np.asarray(pooled / max(float(np.linalg.norm(pooled)), 1e-12), np.float32)

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.rigid import inverse
+from dpmjax.metrics.drives import path_lengths
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import Pose, Poses
 
@@ -17,6 +19,12 @@ from dpmjax.types import Pose, Poses
 DISTANCE_BANDS_M = {"near": (2.0, 10.0), "middle": (10.0, 20.0), "far": (60.0, np.inf)}
 
 PAIR_STREAM = 4127
+
+# Share of the path of a drive, at its end, that is held out of training.
+HELD_OUT_SHARE = 0.1
+
+# Scans within this distance of a held-out one see the same place, and are not trained on either.
+HELD_OUT_MARGIN_M = 20.0
 
 
 class ScanPair(NamedTuple):
@@ -31,6 +39,49 @@ class ScanPair(NamedTuple):
     source: Float[np.ndarray, "n 3"]
     target: Float[np.ndarray, "m 3"]
     T_target_source: Pose
+
+
+class PlaceSplit(NamedTuple):
+    """Numbers of the scans of a drive that are trained on, and of those of held-out places.
+
+    Attributes:
+        training: scans that are trained on.
+        held_out: scans of the last places; empty where too little would remain.
+    """
+
+    training: Int[np.ndarray, " n"]
+    held_out: Int[np.ndarray, " m"]
+
+
+def split_places(drive: LidarSequence) -> PlaceSplit:
+    """Holds out the last tenth of the path of a drive, and leaves out all scans near it, earlier passes included.
+
+    The margin is 20 m, or a tenth of the path if that is shorter. If less than half of the scans would remain, as in a
+    room, nothing is held out.
+
+    Args:
+        drive: scans with true poses.
+
+    Returns:
+        The numbers of the scans.
+
+    Raises:
+        ValueError: if the drive has no poses.
+    """
+    rows = np.flatnonzero(drive.has_reference)
+    poses = true_poses(drive)[rows]
+    path = path_lengths(poses)
+    length_m = float(path.max(initial=0.0))
+    is_held_out = path > (1 - HELD_OUT_SHARE) * length_m
+    margin_m = min(HELD_OUT_MARGIN_M, HELD_OUT_SHARE * length_m)
+    positions = poses[:, :3, 3]
+    is_near = np.zeros(len(rows), bool)
+    if is_held_out.any():
+        is_near = cKDTree(positions[is_held_out]).query(positions)[0] < margin_m
+    is_trained = ~is_held_out & ~is_near
+    if np.sum(is_trained) < len(rows) / 2 or np.sum(is_held_out) < 2:
+        return PlaceSplit(rows, rows[:0])
+    return PlaceSplit(rows[is_trained], rows[is_held_out])
 
 
 def draw_scan_pairs(drive: LidarSequence, band: str, num_pairs: int, *, seed: int = 0) -> Int[np.ndarray, "p 2"]:

@@ -93,16 +93,20 @@ def model_shapes(config: ModelConfig) -> dict[str, Any]:
 
 
 def model_fingerprint(model: Model) -> str:
-    """Identifies the parameters of a model.
+    """Identifies the parameters of a model that make and compare descriptors.
+
+    The overlap head is left out, so that a map stays readable when the head is trained later.
 
     Args:
         model: the model.
 
     Returns:
-        The first 16 hexadecimal digits of a hash of all parameters in float32, the same on every machine.
+        The first 16 hexadecimal digits of a hash of the parameters in float32, the same on every machine.
     """
     digest = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_leaves_with_path(jax.device_get(model.params)):
+    decoder = {name: part for name, part in model.params["decoder"].items() if name != "overlap_head"}
+    params = jax.device_get({**model.params, "decoder": decoder})
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         digest.update(jax.tree_util.keystr(path).encode())
         digest.update(np.ascontiguousarray(leaf, "<f4").tobytes())
     return digest.hexdigest()[:16]

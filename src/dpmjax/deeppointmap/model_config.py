@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from dpmjax.checks import require_one_of, require_positive
 from dpmjax.deeppointmap.confidence import Calibration, LogisticModel
@@ -17,6 +17,9 @@ from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans.preprocess import PreprocessConfig
 
 Preset = Literal["tiny", "small", "paper"]
+
+# Stages of training (DeepPointMap section 3.3): descriptors and registration, then the overlap head.
+Stage = Literal["registration", "overlap"]
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class ModelConfig:
         verification: verification of hypotheses by the scans, and the final alignment.
         calibration: calibration of the confidence; None where it was not fitted.
         overlap: model of the overlap probability; None where it was not fitted: the decoder's head predicts it.
+        trained: stages of training that the parameters went through; those of others are as they began.
     """
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
@@ -44,9 +48,12 @@ class ModelConfig:
     verification: VerificationConfig = field(default_factory=VerificationConfig)
     calibration: Calibration | None = None
     overlap: LogisticModel | None = None
+    trained: tuple[Stage, ...] = ()
 
     def __post_init__(self) -> None:
         require_positive("scale_m", self.scale_m)
+        for stage in self.trained:
+            require_one_of("trained", stage, get_args(Stage))
         if self.decoder.input_channels != self.encoder.output_channels:
             expected = f"expected the encoder's output_channels {self.encoder.output_channels}"
             raise ValueError(f"decoder.input_channels: {expected}, got {self.decoder.input_channels}")

@@ -2,8 +2,9 @@
 
 The published head sees the mean of the correlated features alone. Overlap shows in the match: in the
 similarity of the best pairs, and in the number of pairs that agree on one motion. These numbers, the evidence, come
-from descriptors only, so that thousands of candidates can be compared. A logistic regression, fitted by `python -m
-experiments.dpm_calibrate`, turns them into a probability. Published models have no regression and use their head.
+from descriptors only, so that thousands of candidates can be compared. A logistic regression, fitted by `dpmjax train`
+and `python -m experiments.dpm_calibrate`, turns them into a probability. Published models have no regression and use
+their head.
 """
 
 from __future__ import annotations
@@ -51,14 +52,13 @@ MAX_DISTANCE_M, MAX_DISAGREEMENT_M = 100.0, 5.0
 def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Array, ""]:
     """Predicts the probability that two scans or maps overlap: that their origins are less than 20 m apart.
 
-    A calibrated model (`model.config.overlap`, from `python -m experiments.dpm_calibrate`) predicts it from the match
-    of the descriptors. It is fitted on simulated towns and buildings. Half of the pairs overlapped, a quarter was 20 to
-    40 m apart, and a quarter was farther apart or of different places. Where overlap is rarer, the probability is too
-    high. A model without calibration uses the decoder's head (DeepPointMap section 3.2), which is right for published
-    weights only.
+    A calibrated model (`model.config.overlap`, from `dpmjax train`) predicts it from the match of the descriptors. Half
+    of the pairs of its fit overlapped, a quarter was 20 to 40 m apart, and a quarter was farther apart or of different
+    places. Where overlap is rarer, the probability is too high. A model without calibration uses the trained head of
+    its decoder, as published ones do (DeepPointMap section 3.2).
 
-    Raises a `ValueError` if the points are no real numbers (n, 3), if features have another width than the model, or if
-    the scans have different scales.
+    Raises a `ValueError` if the model has neither, if the points are no real numbers (n, 3), if features have another
+    width than the model, or if the scans have different scales.
 
     Args:
         model: encoder and decoder.
@@ -69,6 +69,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     Returns:
         The probability; 0 where a scan is empty or a feature is not finite.
     """
+    require_overlap(model)
     _require_one_scale(source, target)
     clouds = [
         descriptors_of(scan if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan))
@@ -81,7 +82,8 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 
-    Raises a `ValueError` if the lengths differ or are 0, or if the scans of a pair have different scales.
+    Raises a `ValueError` if the model has neither a fit nor a trained head, if the lengths differ or are 0, or if the
+    scans of a pair have different scales.
 
     Args:
         model: encoder and decoder.
@@ -91,7 +93,22 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
     Returns:
         The probabilities.
     """
+    require_overlap(model)
     return _apply_to_pairs(overlap_probability, model, sources, targets)
+
+
+def require_overlap(model: Model) -> None:
+    """Refuses a model that cannot predict overlap: its head would answer any pair with one number.
+
+    Args:
+        model: a model.
+
+    Raises:
+        ValueError: if the model has neither a fitted regression nor a trained head.
+    """
+    if model.config.overlap is None and "overlap" not in model.config.trained:
+        missing = "expected a regression of overlap or a trained overlap head, got neither"
+        raise ValueError(f"model: {missing}; run `dpmjax train --stages overlap --weights FILE --data ...`")
 
 
 def evidence_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, "n f"]:
@@ -148,9 +165,9 @@ def overlap_evidence(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Ov
 
 @jax.jit
 def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
-    """Predicts the probability that two clouds are less than 20 m apart.
+    """Predicts the probability that two clouds are less than 20 m apart, by the regression or else by the head.
 
-    Raises a `ValueError` if the features have another width than the model.
+    Raises a `ValueError` if the features have another width than the model, or if the model has neither.
 
     Args:
         model: encoder and decoder.
@@ -162,10 +179,36 @@ def overlap_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) ->
     """
     fitted = model.config.overlap
     if fitted is None:
-        logit = overlap_logit(model, *correlate(model, a, b))
-    else:
-        evidence = jnp.stack(overlap_evidence(model, a, b))
-        logit = jnp.sum(evidence * np.asarray(fitted.weights, np.float32)) + fitted.bias
+        return head_probability(model, a, b)
+    evidence = jnp.stack(overlap_evidence(model, a, b))
+    logit = jnp.sum(evidence * np.asarray(fitted.weights, np.float32)) + fitted.bias
+    return _probability(logit, a, b)
+
+
+@jax.jit
+def head_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
+    """Predicts the probability that two clouds are less than 20 m apart, by the head of the decoder alone.
+
+    This is the overlap of DeepPointMap (section 3.2, figure 2e).
+
+    Args:
+        model: encoder and decoder.
+        a: uncorrelated descriptors.
+        b: the same; the order matters a little.
+
+    Returns:
+        The probability. It is 0 where a cloud is empty or holds a feature that is not finite.
+
+    Raises:
+        ValueError: if the head is not trained, or if the features have another width than the model.
+    """
+    if "overlap" not in model.config.trained:
+        command = "run `dpmjax train --stages overlap --weights FILE --data ...`"
+        raise ValueError(f"model: expected a trained overlap head, got one as it began; {command}")
+    return _probability(overlap_logit(model, *correlate(model, a, b)), a, b)
+
+
+def _probability(logit: Float[Array, ""], a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
     is_known = jnp.any(a.mask) & jnp.any(b.mask) & jnp.isfinite(logit)
     return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
 

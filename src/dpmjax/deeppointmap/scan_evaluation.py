@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -185,11 +186,13 @@ class OverlapEvaluation(NamedTuple):
         probability: overlap probability of each pair.
         is_overlap: True for scans less than 20 m apart.
         has_revisits: True if the overlapping pairs are revisits, because the drive comes back to places.
+        by_head: probability by the overlap head of a model that has a regression, too; None for other models.
     """
 
     probability: Float[np.ndarray, " p"]
     is_overlap: Bool[np.ndarray, " p"]
     has_revisits: bool
+    by_head: Float[np.ndarray, " p"] | None = None
 
     @property
     def area_under_curve(self) -> float:
@@ -230,9 +233,12 @@ def evaluate_overlap(
     pairs = np.concatenate([near, far])
     rows, places = np.unique(pairs, return_inverse=True)
     clouds = encode_turned(model, drive, rows, rng=rng, on_scan=on_scan)
-    sides = ([clouds[place] for place in side] for side in places.reshape(pairs.shape).T)
-    probability = np.asarray(overlap_pairs(model, *sides), float)
-    return OverlapEvaluation(probability, np.arange(len(pairs)) < len(near), has_revisits)
+    sides = [[clouds[place] for place in side] for side in places.reshape(pairs.shape).T]
+    probability, by_head = np.asarray(overlap_pairs(model, *sides), float), None
+    if model.config.overlap is not None and "overlap" in model.config.trained:
+        head = replace(model, config=replace(model.config, overlap=None))
+        by_head = np.asarray(overlap_pairs(head, *sides), float)
+    return OverlapEvaluation(probability, np.arange(len(pairs)) < len(near), has_revisits, by_head)
 
 
 def encode_turned(

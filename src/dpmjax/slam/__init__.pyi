@@ -43,7 +43,6 @@ from .map_optimization import RefinedKeyframes as RefinedKeyframes
 from .map_optimization import refine_keyframes as refine_keyframes
 from .model_methods import NetworkMatcher as NetworkMatcher
 from .model_methods import make_methods as make_methods
-from .model_methods import pooled_vector as pooled_vector
 from .surface_geometry import SurfaceGeometry as SurfaceGeometry
 from .system import SlamResult as SlamResult
 from .system import SlamState as SlamState

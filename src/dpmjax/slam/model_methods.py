@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_type
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import pyramid_of_cloud
+from dpmjax.deeppointmap.encoding import pooled_vector, pyramid_of_cloud
 from dpmjax.deeppointmap.matching import MatchConfig, merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.motion_choice import ELEMENT_RADIUS_M, REFINEMENT
-from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
+from dpmjax.deeppointmap.overlap_prediction import overlap_pairs, require_overlap
 from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_elements, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
 from dpmjax.geometry.se3 import orthonormal
@@ -47,7 +47,7 @@ UNKNOWN = diagonal_information(1000.0, np.pi)
 
 
 class NetworkMatcher:
-    """The matcher of a trained model.
+    """The matcher of a trained model; a `ValueError` refuses one that cannot predict overlap.
 
     Args:
         model: encoder, decoder and, at best, a calibration of its confidence.
@@ -55,6 +55,7 @@ class NetworkMatcher:
     """
 
     def __init__(self, model: Model, *, by_head: bool = False) -> None:
+        require_overlap(model)
         # Other keyframes and the map confirm a motion, so no other place needs to be tried for it.
         verification = replace(model.config.verification, plane_radius_m=ELEMENT_RADIUS_M, num_lookalikes=0)
         self._model = replace(model, config=replace(model.config, verification=verification))
@@ -220,26 +221,6 @@ def point_information(
     for column, axis in enumerate(np.eye(3)):
         jacobian[:, :, 3 + column] = np.cross(axis, q)
     return np.einsum("nki,nkj->ij", jacobian, jacobian) + UNKNOWN
-
-
-def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:
-    """Pools the descriptors of a scan into one unit vector: their mean and their deviation in each channel.
-
-    Neither depends on the order of the descriptors. With features in frames that turn with the scan, neither changes
-    where the scan turns about the vertical.
-
-    Args:
-        cloud: descriptors of a scan.
-
-    Returns:
-        (2 c,) float32; zero for an empty cloud.
-    """
-    features = np.asarray(cloud.features, np.float32)[np.asarray(cloud.mask)]
-    if len(features) == 0:
-        return np.zeros(2 * cloud.features.shape[-1], np.float32)
-    features = features / np.maximum(np.linalg.norm(features, axis=1, keepdims=True), 1e-12)
-    pooled = np.concatenate([features.mean(axis=0), features.std(axis=0)])
-    return np.asarray(pooled / max(float(np.linalg.norm(pooled)), 1e-12), np.float32)
 
 
 def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str = "") -> SlamMethods:

@@ -49,7 +49,8 @@ def _mean(model: Model, other: Model) -> Model:
     if jax.tree.map(jnp.shape, model.params) != jax.tree.map(jnp.shape, other.params):
         raise ValueError("--mean-with: expected a network of the same shapes")
     # Regressions belong to the parameters that they were fitted for.
-    config = replace(model.config, calibration=None, overlap=None)
+    trained = tuple(stage for stage in model.config.trained if stage in other.config.trained)
+    config = replace(model.config, calibration=None, overlap=None, trained=trained)
     return Model(jax.tree.map(lambda one, two: (one + two) / 2, model.params, other.params), config)
 
 

@@ -156,7 +156,8 @@ def _derived_config(arrays: Tensors, stages: tuple[PyramidStage, ...], scale_m: 
     )
     inputs, width = arrays["decoder.projection.kernel"].shape
     decoder = DecoderConfig(input_channels=inputs, model_channels=width, num_layers=count(r"decoder\.layer_\d+"))
-    return ModelConfig(PyramidConfig(stages, num_steps), encoder, decoder, scale_m)
+    pyramid = PyramidConfig(stages, num_steps)
+    return ModelConfig(pyramid, encoder, decoder, scale_m, trained=("registration", "overlap"))
 
 
 def read_torch_file(path: str | Path) -> Any:

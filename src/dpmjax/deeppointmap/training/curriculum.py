@@ -16,7 +16,7 @@ import numpy as np
 
 from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields
 from dpmjax.deeppointmap.model import Initialization
-from dpmjax.deeppointmap.model_config import ModelConfig, Preset, model_preset
+from dpmjax.deeppointmap.model_config import ModelConfig, Preset, Stage, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
 from dpmjax.scans.augment import AugmentConfig
 
@@ -90,6 +90,46 @@ class SamplingConfig:
 
 
 @dataclass(frozen=True)
+class OverlapConfig:
+    """Settings of the second stage, which trains the overlap head alone (defaults: DeepPointMap's published program).
+
+    Attributes:
+        num_epochs: number of times that each scan is the first of a pair; of a pool, that each pair is seen.
+        batch_pairs: number of pairs of a step.
+        pool_pairs: number of pairs whose features are computed once and kept in memory; 0 draws and encodes new pairs
+            for each step.
+        hard_share: share of the pairs of a pool that are hard. Half of these are of one street that was seen twice; the
+            others look alike, at least 20 m apart. Without such pairs, they are drawn as all others.
+        rate_share: learning rate and weight decay, as shares of those of the first stage.
+    """
+
+    num_epochs: int = 10
+    batch_pairs: int = 32
+    pool_pairs: int = 0
+    hard_share: float = 0.0
+    rate_share: float = 0.1
+
+    def __post_init__(self) -> None:
+        require_fields(self, "num_epochs", "batch_pairs", low=1)
+        require_fields(self, "pool_pairs", low=0)
+        require_positive_fields(self, "rate_share")
+        if not 0 <= self.hard_share <= (1 if self.pool_pairs else 0):
+            expected = "expected 0 to 1, and 0 without a pool of pairs"
+            raise ValueError(f"hard_share: {expected}, got {self.hard_share}")
+
+    def num_steps(self, num_scans: int) -> int:
+        """Computes the number of steps.
+
+        Args:
+            num_scans: number of scans that are trained on.
+
+        Returns:
+            At least 1.
+        """
+        return max(1, self.num_epochs * (self.pool_pairs or num_scans) // self.batch_pairs)
+
+
+@dataclass(frozen=True)
 class TrainingConfig:
     """All settings of training except the scans (DeepPointMap section 3.3 and its published configuration).
 
@@ -115,6 +155,8 @@ class TrainingConfig:
         max_gradient_norm: longer gradients are scaled down to this norm; infinity for none.
         scans_at_once: about this many scans of a sample are encoded at the same time. More scans need more memory and
             keep a large device busy; the results change by rounding only.
+        stages: stages that `train` does, in this order; "overlap" alone trains the head of a given model.
+        overlap: settings of the second stage.
     """
 
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -136,6 +178,8 @@ class TrainingConfig:
     warmup_steps: int = 0
     max_gradient_norm: float = math.inf
     scans_at_once: int = 8
+    stages: tuple[Stage, ...] = ("registration", "overlap")
+    overlap: OverlapConfig = field(default_factory=OverlapConfig)
 
     def __post_init__(self) -> None:
         require_positive_fields(self, "learning_rate", "final_learning_rate")
@@ -146,6 +190,9 @@ class TrainingConfig:
             if value is not None and not value > 0:
                 raise ValueError(f"{name}: expected more than 0, got {value}")
         require_count("len(curriculum)", len(self.curriculum))
+        for stage in self.stages:
+            require_one_of("stages", stage, get_args(Stage))
+        require_count("len(stages)", len(self.stages))
         largest = max(stage.max_group for stage in self.curriculum)
         if largest > self.sampling.num_scans:
             raise ValueError(
@@ -282,6 +329,7 @@ PRESETS = {
         learning_rate=2e-3,
         warmup_steps=20,
         max_gradient_norm=5.0,
+        overlap=OverlapConfig(num_epochs=30, pool_pairs=1024, hard_share=0.25),
     ),
     "small": TrainingConfig(
         model=model_preset("small"),
@@ -300,6 +348,7 @@ PRESETS = {
         thins_maps=True,
         initialization="normal",
         scans_at_once=4,
+        overlap=OverlapConfig(num_epochs=40, pool_pairs=2048, hard_share=0.25),
     ),
     # Steps of the curriculum: twelve epochs of 10,000 scans on one device.
     "paper": TrainingConfig(num_epochs=12.0),

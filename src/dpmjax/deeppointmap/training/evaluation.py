@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -165,6 +165,45 @@ def draw_evaluation_pairs(
     store = ScanStore([prepare_drive(thinned, settings)])
     scans, placed = store.read(np.arange(len(thinned)), settings, rng)
     return EvaluationPairs(scans, placed.T_world_scan, pairs, config.scale_m)
+
+
+def join_evaluation_pairs(parts: Sequence[EvaluationPairs]) -> EvaluationPairs:
+    """Joins the pairs of several drives, those of one kind together.
+
+    Args:
+        parts: at least one; pairs of one configuration.
+
+    Returns:
+        The pairs of all drives.
+    """
+    starts = np.cumsum([0, *(len(part.T_world_scan) for part in parts)])
+    found: dict[PairKind, list[Pairs]] = {}
+    for start, part in zip(starts, parts, strict=False):
+        for some in part.pairs:
+            found.setdefault(some.kind, []).append(Pairs(some.kind, some.sources + start, some.targets + start))
+    joined = tuple(
+        Pairs(kind, *(np.concatenate([getattr(one, side) for one in some]) for side in ("sources", "targets")))
+        for kind, some in found.items()
+    )
+    scans = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(part.scans for part in parts))
+    poses = np.concatenate([part.T_world_scan for part in parts])
+    return EvaluationPairs(scans, poses, joined, parts[0].scale_m)
+
+
+def pair_kinds(drive: LidarSequence, kinds: Sequence[PairKind]) -> tuple[PairKind, ...]:
+    """Finds the kinds of which a drive has pairs.
+
+    Args:
+        drive: scans with true poses.
+        kinds: kinds of pairs.
+
+    Returns:
+        Some of the kinds, in order.
+    """
+    distances = scan_distances(drive)
+    return tuple(
+        kind for kind in kinds if np.any((distances >= kind.min_distance_m) & (distances <= kind.max_distance_m))
+    )
 
 
 def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:

@@ -25,6 +25,14 @@ from jaxtyping import Float, Int
 from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig, layout_capacity
+from dpmjax.deeppointmap.training.overlap_stage import (
+    OverlapHooks,
+    OverlapState,
+    init_overlap,
+    train_overlap,
+    why_no_overlap,
+    with_head,
+)
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
@@ -121,16 +129,19 @@ class Trained(NamedTuple):
     """Result of training.
 
     Attributes:
-        model: the model with the best score; the last one without an evaluation.
-        progress: progress after the last step.
+        model: the model with the best score; the last one without an evaluation. Its `config.trained` lists the stages
+            that came to their end.
+        progress: progress after the last step of registration.
         stopped_by: the number that `stop` returned; 0 after the last step.
         speed: seconds of the steps of this call.
+        overlap: state of the second stage; None where it was not begun.
     """
 
     model: Model
     progress: TrainingProgress
     stopped_by: int
     speed: Speed
+    overlap: OverlapState | None = None
 
 
 def begin_training(config: TrainingConfig, *, seed: int = 0, start: Model | None = None) -> TrainingProgress:
@@ -189,8 +200,10 @@ def train(
 ) -> Trained:
     """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
-    Each scan is prepared before the first step, or at each use where `config.num_variants` is 0. With several processes
-    (`join_processes`), each calls this function with the same arguments; process 0 alone evaluates and reports.
+    The first stage trains everything but the overlap head, and the second stage this head alone; `config.stages` may
+    leave one out. Each scan is prepared before the first step, or at each use where `config.num_variants` is 0. With
+    several processes (`join_processes`), each calls this function with the same arguments; process 0 alone evaluates,
+    reports and trains the head.
 
     Args:
         drives: sequences with a true pose for each scan, such as `io.open_lidar_sequence` and
@@ -207,22 +220,47 @@ def train(
 
     Raises:
         ValueError: if there is no drive, or `start` is a model of another network. Also if a drive has no poses, no
-            readable scan, or no two scans at a distance of `config.sampling`, and if `cache` is given with prepared
-            scans.
+            readable scan, or no two scans at a distance of `config.sampling`, if all scans overlap or none do, and if
+            `cache` is given with prepared scans.
         TrainingLostError: if the loss is not finite.
     """
     if cache is not None and isinstance(drives, ScanStore):
         raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
-    # Calibrations belong to the parameters that they were fitted for.
-    config = replace(config, model=replace(config.model, calibration=None, overlap=None))
+    is_head_alone = "registration" not in config.stages
+    # Calibrations belong to the parameters that they were fitted for; the head is not among them.
+    kept = start.config if is_head_alone and isinstance(start, Model) else None
+    config = replace(config, model=replace(config.model, calibration=None, overlap=None, trained=()))
     begun = start if isinstance(start, TrainingProgress) else begin_training(config, seed=seed, start=start)
     store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
+    if "overlap" in config.stages and (reason := why_no_overlap(store.table)) is not None:
+        raise ValueError(f"drives: {reason}; leave the stage overlap out")
+    if is_head_alone:
+        first = Trained(Model(begun.state.params, kept or config.model), begun, 0, Speed())
+        return _with_trained_head(first, store, config, hooks, seed=seed)
     config = config.for_scans(len(store.table), num_samples=jax.device_count())
     if not isinstance(start, TrainingProgress):
         begun = replace(begun, state=replace(begun.state, end=np.asarray(config.num_steps, np.int32)))
     progress, stopped_by, speed = _run_steps(store, config, hooks, begun, seed=seed)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
-    return Trained(_local(Model(params, config.model)), progress, stopped_by, speed)
+    ended = replace(config.model, trained=() if stopped_by else ("registration",))
+    first = Trained(_local(Model(params, ended)), progress, stopped_by, speed)
+    if stopped_by or "overlap" not in config.stages:
+        return first
+    return _with_trained_head(first, store, config, hooks, seed=seed)
+
+
+def _with_trained_head(
+    first: Trained, store: ScanStore, config: TrainingConfig, hooks: TrainingHooks, *, seed: int
+) -> Trained:
+    """Does the second stage, in process 0."""
+    state = init_overlap(first.model)
+    with together():
+        if is_first():
+            _, state = train_overlap(store, first.model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
+    state = from_first(state)
+    is_whole = int(state.step) >= config.overlap.num_steps(len(store.table))
+    model = _local(with_head(first.model, state.head, is_trained=is_whole))
+    return first._replace(model=model, stopped_by=0 if is_whole else 1, overlap=state)
 
 
 def _run_steps(

@@ -5,7 +5,7 @@
     state, report = step(state, batch)
 
 The step is deterministic: samples and their augmentation are drawn when a batch is made. All parts learn except the
-overlap head: overlap is fitted afterwards (`deeppointmap.overlap_prediction`).
+overlap head, which the second stage trains (`training.overlap_stage`).
 """
 
 from __future__ import annotations

@@ -1,0 +1,94 @@
+"""The files of a training: models, curves, a picture of matches, and the summary."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dpmjax import cli, deeppointmap, viz, weights
+
+if TYPE_CHECKING:
+    from dpmjax.cli.train_run import Records
+
+MODEL, LAST, BEST = "model.safetensors", "last.safetensors", "best.safetensors"
+# Largest number of listed damaged scans; further ones are only counted.
+MAX_LISTED = 10
+SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "overlap_loss")
+
+
+def write_other_model(
+    folder: cli.RunFolder, trained: deeppointmap.Trained, records: Records, metrics: dict[str, Any], *, origin: str
+) -> None:
+    """Writes the last model of the first stage beside the best, or the best beside the last."""
+    from dpmjax.cli.train_run import best_model, last_model
+
+    if metrics["best_step"] is not None and "registration" in metrics["trained"]:
+        name, other = (BEST, best_model) if records.takes_last else (LAST, last_model)
+        write_model(folder / name, other(trained), metrics, origin=f"{name} of {origin}")
+
+
+def write_model(path: Path, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
+    """Writes a model with a description of its training, which begins with the preset and the data."""
+    best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
+    card = f"{origin} ({metrics['num_scans']} scans), {metrics['steps']} steps{best}, seed {metrics['seed']}. "
+    card += f"Trained: {', '.join(model.config.trained) or 'nothing to its end'}; chosen by {metrics['chosen_by']}. "
+    if "recall" in metrics:
+        card += (
+            f"Held-out places, {metrics['num_held_out_pairs']} pairs 2-10 m apart, any yaw: recall (2 m, 5 deg) "
+            f"{metrics['recall']:.3f}, before {metrics['recall_untrained']:.3f}."
+        )
+    else:
+        card += "Not evaluated."
+    unfinished = path.with_name(f".tmp_{path.name}")
+    weights.save_model(model, unfinished, card=card)
+    unfinished.replace(path)
+
+
+def draw_curves(folder: cli.RunFolder) -> None:
+    """Draws loss.png: losses and recalls over the steps."""
+    rows = cli.read_history(folder / cli.HISTORY)
+    if rows:
+        curves = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SHOWN_CURVES}
+        curves = {name.replace("_", " "): curve for name, curve in curves.items() if np.isfinite(curve).any()}
+        viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), folder / "loss.png")
+
+
+def draw_matches(
+    folder: cli.RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs
+) -> None:
+    """Draws matches.png: of the pairs left out of the training, the one of the median error."""
+    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
+    number = int(np.argsort(errors)[len(errors) // 2])
+    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
+    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
+    is_inlier = matches.is_inlier[number]
+    p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
+    q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
+    distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
+    title = f"Pair of scans left out of the training, the one of the median error ({errors[number]:.2f} m)\n"
+    title += "right matches are less than 3 m apart under the true motion"
+    motions = {"source moved by the estimated motion": np.asarray(matches.T_target_source[number], np.float64)}
+    pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
+    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), folder / "matches.png")
+
+
+def print_summary(folder: cli.RunFolder, metrics: dict[str, Any]) -> None:
+    """Prints the recall, the scans that were left out, and the folder."""
+    at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
+    if "recall" in metrics:
+        print(f"recall on held-out places {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
+    else:
+        print(f"ended after step {metrics['steps']}{at}; not evaluated")
+    for name in ("overlap", "head"):
+        if np.isfinite(auc := metrics["calibration"].get(f"auc_{name}", math.nan)):
+            by = "regression" if name == "overlap" else name
+            print(f"overlap by the {by}: AUC {auc:.3f} on held-out places")
+    bad = metrics["bad_scans"]
+    if bad:
+        print(f"{len(bad)} scans left out, all of them in {folder / cli.METRICS}:")
+        for source, reason in list(bad.items())[:MAX_LISTED]:
+            print(f"  {source}: {reason}")
+    print(f"results in {folder.path}")

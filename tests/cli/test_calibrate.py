@@ -1,0 +1,93 @@
+"""Calibration on the drives of a user: fitted on the training part, measured on held-out places."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.cli.calibrate import MeasuredDrives, calibrate, fit_confidence, measure_overlap
+from dpmjax.deeppointmap import CLOUD_FEATURES, ELEMENT_FEATURES, OVERLAP_FEATURES, SCAN_FEATURES
+from tests.deeppointmap import toy
+
+
+def registrations(num: int, seed: int, *, is_right: bool | None = None) -> dict:
+    """Registrations whose features say how probably they are right."""
+    rng = np.random.default_rng(seed)
+    right = rng.uniform(size=num) < 0.5 if is_right is None else np.full(num, is_right)
+
+    def features(names: tuple[str, ...]) -> list[list[float]]:
+        return (rng.normal(size=(num, len(names))) + right[:, None]).tolist()
+
+    return {
+        "of_clouds": features(CLOUD_FEATURES),
+        "of_elements": features(ELEMENT_FEATURES),
+        "of_scans": features(SCAN_FEATURES),
+        "of_weak_scans": [None] * num,
+        "lookalike_gap_of_elements": [None] * num,
+        "lookalike_gap_of_scans": [None] * num,
+        "is_right_of_clouds": right.tolist(),
+        "is_right": right.tolist(),
+        "distance_m": [5.0] * num,
+    }
+
+
+def matches(num: int, seed: int) -> dict:
+    """Matches whose first number tells overlap, and a head that knows less."""
+    rng = np.random.default_rng(seed)
+    is_overlap = np.arange(num) % 2 == 0
+    evidence = rng.normal(size=(num, len(OVERLAP_FEATURES)))
+    evidence[:, 0] += 3 * is_overlap
+    head = 1 / (1 + np.exp(-rng.normal(size=num) - 0.5 * is_overlap))
+    return {"evidence": evidence.tolist(), "is_overlap": is_overlap.tolist(), "head": head.tolist()}
+
+
+@pytest.fixture(scope="module")
+def model() -> dpmjax.Model:
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+def test_fits_are_measured_on_held_out_places(model) -> None:
+    of_places = [registrations(60, seed) for seed in (0, 1)], [registrations(60, 2)]
+    measured = MeasuredDrives(*of_places, matches(200, 3), matches(100, 4))
+    calibrated, numbers = calibrate(model, measured)
+    assert calibrated.config.calibration is not None
+    assert calibrated.config.calibration.of_weak_scans is None
+    assert calibrated.config.overlap.weights[0] > 1
+    assert (numbers["num_pairs"], numbers["num_overlap_pairs"], numbers["num_tested_overlap_pairs"]) == (120, 200, 100)
+    assert numbers["brier_of_scans"] < numbers["brier_of_a_constant_of_scans"]
+    assert numbers["auc_overlap"] > 0.9 > numbers["auc_head"] > 0.5
+    toy.assert_trees_equal(calibrated.params, model.params)
+
+
+def test_what_the_pairs_cannot_fix_is_left_out(model) -> None:
+    measured = MeasuredDrives([registrations(20, 0, is_right=True)], [], None, None)
+    calibrated, numbers = calibrate(model, measured)
+    assert (calibrated.config.calibration, calibrated.config.overlap) == (None, None)
+    assert numbers == {"num_pairs": 20}
+
+
+def test_without_other_places_each_one_is_left_out_in_turn() -> None:
+    calibration, numbers, held_out = fit_confidence([registrations(60, seed) for seed in range(3)])
+    assert calibration is not None
+    assert len(held_out["of_scans"][0]) == 180
+    assert numbers["brier_of_scans"] < 0.25
+
+
+@pytest.mark.slow
+def test_tested_pairs_hold_a_scan_of_the_held_out_places(model, monkeypatch) -> None:
+    from dpmjax import deeppointmap
+
+    drives, drawn = [toy.drive(1), toy.drive(2)], []
+    draw = deeppointmap.draw_overlap_pairs
+
+    def recorded(*args, **options):
+        drawn.append(draw(*args, **options))
+        return drawn[-1]
+
+    monkeypatch.setattr(deeppointmap, "draw_overlap_pairs", recorded)
+    found = measure_overlap(model, drives, 16, 0, anchors=[np.array([22, 23]), np.array([20])])
+    assert {22, 23, 44} >= set(drawn[0][:, 0].tolist())
+    assert (sum(found["is_overlap"]), len(found["head"]), np.shape(found["evidence"])) == (8, 16, (16, 16))
+    assert measure_overlap(model, [toy.drive(1, num_scans=3)], 8, 0) is None
