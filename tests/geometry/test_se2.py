@@ -119,24 +119,13 @@ def test_wrap_angle_has_slope_one_everywhere() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-2, 1.0])
-def test_log_undoes_exp_and_its_derivative_is_that_of_finite_differences(scale: float, float64) -> None:
-    twists, h = scale * np.random.default_rng(6).uniform(-3, 3, (5, 3)), 1e-6
-    poses = np.asarray(se2.from_matrix(rigid.exp(twists)))
-    np.testing.assert_allclose(se2.log(poses), twists, **DOUBLE)
-    steps = np.asarray(se2.from_matrix(rigid.exp(h * np.eye(3))))
-    forward, backward = (np.asarray(se2.log(se2.compose(poses[:, None], s))) for s in (steps, se2.inverse(steps)))
-    expected = np.swapaxes(forward - backward, 1, 2) / (2 * h)
-    np.testing.assert_allclose(se2.log_jacobian(poses), expected, rtol=1e-6, atol=1e-6)
+def test_log_undoes_exp(scale: float, float64) -> None:
+    twists = scale * np.random.default_rng(6).uniform(-3, 3, (5, 3))
+    np.testing.assert_allclose(se2.log(np.asarray(se2.from_matrix(rigid.exp(twists)))), twists, **DOUBLE)
 
 
 @pytest.mark.parametrize("turn", [1e-5, 1e-2, 0.2, 0.5, 2.5])
-def test_log_and_its_derivative_keep_their_digits_at_any_turn(turn: float) -> None:
+def test_log_keeps_its_digits_at_any_turn(turn: float) -> None:
     twist = np.array([20, -30, turn], np.float32)
     pose = se2.from_matrix(rigid.exp(twist))
     np.testing.assert_allclose(se2.log(pose), twist, rtol=1e-6, atol=1e-5)
-    vx, vy, w = twist.astype(np.float64)
-    ad = np.array([[0, -w, vy], [w, 0, -vx], [0, 0, 0]])
-    right, term = np.zeros((3, 3)), np.eye(3)
-    for k in range(40):
-        right, term = right + term, term @ -ad / (k + 2)
-    np.testing.assert_allclose(se2.log_jacobian(pose), np.linalg.inv(right), atol=3e-5)

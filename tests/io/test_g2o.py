@@ -76,12 +76,11 @@ def test_graph_is_read_as_it_was_written(tmp_path: Path, text: str) -> None:
     assert_same(read_g2o(packed), graph)
 
 
-@pytest.mark.parametrize("text", [PLANAR.replace("FIX 3\n", ""), spatial_text()[0]], ids=["plane", "space"])
-def test_gtsam_reads_the_same_cost(tmp_path: Path, text: str) -> None:
+def test_gtsam_reads_the_same_cost_in_space(tmp_path: Path) -> None:
     gtsam = import_or_skip("gtsam")
-    graph = read_g2o(written(tmp_path, text))
+    graph = read_g2o(written(tmp_path, spatial_text()[0]))
     path = write_g2o(tmp_path / "ours.g2o", graph)
-    factors, values = gtsam.readG2o(str(path), graph.tangent_size == 6)
+    factors, values = gtsam.readG2o(str(path), True)
     np.testing.assert_allclose(2 * factors.error(values), optimize_pose_graph(graph).chi2_initial, rtol=1e-9)
 
 

@@ -1,6 +1,12 @@
-"""State dictionaries of the published layout, made up at any size: names and shapes as the checkpoints have them."""
+"""State dictionaries of the published layout, made up at any size, and files of them as PyTorch writes them."""
 
 from __future__ import annotations
+
+import json
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,13 +16,61 @@ Tensors = dict[str, np.ndarray]
 
 
 def published_tensors(config: ModelConfig, seed: int = 0) -> dict[str, Tensors]:
-    """{"encoder": tensors by name, "decoder": tensors by name}, random."""
+    """{"encoder": tensors by name, "decoder": tensors by name}, random, of sizes that keep the size of features."""
     rng = np.random.default_rng(seed)
     shapes = {"encoder": _encoder_shapes(config), "decoder": _decoder_shapes(config)}
-    return {
-        part: {name: rng.normal(size=shape).astype(np.float32) for name, shape in named.items()}
-        for part, named in shapes.items()
+
+    def draw(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        values = rng.normal(size=shape)
+        if len(shape) == 1:
+            values = 0.1 * values + name.endswith(".weight")
+        else:
+            values /= np.sqrt(shape[1])
+        return values.astype(np.float32)
+
+    return {part: {name: draw(name, shape) for name, shape in named.items()} for part, named in shapes.items()}
+
+
+def write_checkpoint(path: Path, tensors: dict[str, Tensors], config: ModelConfig) -> dict[str, Any]:
+    """Writes tensors as `torch.save` does, and the published configuration beside it, which is returned."""
+    with zipfile.ZipFile(path, "w") as file:
+        content, number = b"", 0
+        for part, named in tensors.items():
+            of_part = b""
+            for name, values in named.items():
+                of_part += _pickled(name) + _pickled_tensor(values, str(number))
+                file.writestr(f"archive/data/{number}", np.ascontiguousarray(values).tobytes())
+                number += 1
+            content += _pickled(part) + pickle.EMPTY_DICT + pickle.MARK + of_part + pickle.SETITEMS
+        content = pickle.EMPTY_DICT + pickle.MARK + content + pickle.SETITEMS
+        file.writestr("archive/data.pkl", pickle.PROTO + b"\x02" + content + pickle.STOP)
+    stages = config.pyramid.stages
+    settings = {
+        "encoder": {
+            "npoint": [stage.num_points for stage in stages],
+            "radius_list": [stage.radii for stage in stages],
+            "nsample_list": [[stage.num_neighbours] * len(stage.radii) for stage in stages],
+            "upsample_layers": config.pyramid.num_interpolations,
+        },
+        "coordinate_scale": config.scale_m,
     }
+    path.with_name("config.json").write_text(json.dumps(settings))
+    return settings
+
+
+def _pickled(value: Any) -> bytes:
+    """A pickle without its first two and its last byte, which stand once in a file."""
+    return pickle.dumps(value, 2)[2:-1]
+
+
+def _pickled_tensor(values: np.ndarray, key: str) -> bytes:
+    """A call of the function that makes a tensor of a storage: offset, shape, strides, and two more arguments."""
+    strides = tuple(step // values.itemsize for step in np.ascontiguousarray(values).strides)
+    storage = _pickled("storage") + b"ctorch\nFloatStorage\n" + _pickled(key) + _pickled("cpu") + _pickled(values.size)
+    hooks = b"ccollections\nOrderedDict\n" + pickle.EMPTY_TUPLE + pickle.REDUCE
+    arguments = pickle.MARK + storage + pickle.TUPLE + pickle.BINPERSID + _pickled(0)
+    arguments += _pickled(values.shape) + _pickled(strides) + pickle.NEWFALSE + hooks
+    return b"ctorch._utils\n_rebuild_tensor_v2\n" + pickle.MARK + arguments + pickle.TUPLE + pickle.REDUCE
 
 
 def _linear(name: str, num_in: int, num_out: int, num_ones: int) -> dict[str, tuple[int, ...]]:

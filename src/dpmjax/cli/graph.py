@@ -56,8 +56,11 @@ def main(config: Config) -> None:
     settings = pose_graph.PoseGraphConfig(outlier_chi2=config.outlier_chi2, max_iterations=config.iterations)
     folder = cli.open_run_folder(config, NAME)
     with cli.recording(folder):
-        notes = cli.report_notes(notes_on_parts(config.graph, graph))
         found = pose_graph.optimize_pose_graph(graph, settings)
+        free = found.free_nodes
+        # A doubt: the solver has logged it, so that the console shows it already.
+        doubts = [Note(f"{config.graph}: {pose_graph.describe_free_nodes(free)}", is_doubt=True)] if free else []
+        notes = cli.report_notes(doubts)
         metrics = {"graph": config.graph.name, **graph_numbers(found), **notes, "wall_s": time.perf_counter() - started}
         poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
         io.write_g2o(folder / "graph.g2o", found.graph)
@@ -76,15 +79,6 @@ def main(config: Config) -> None:
         if not found.is_converged:
             advice = "give more --iterations, or a kernel by --outlier-chi2"
             raise InputError(config.graph, f"no minimum after {found.iterations} iterations", advice)
-
-
-def notes_on_parts(path: Path, graph: pose_graph.PoseGraph) -> tuple[Note, ...]:
-    """Returns a note on a graph whose edges, those with any information, do not join all nodes."""
-    source, target, _, information = graph.edges
-    has_any = information.any(axis=(1, 2))
-    sizes = np.bincount(pose_graph.label_parts(len(graph.poses), source[has_any], target[has_any]))
-    text = f"{path}: no edge joins its {len(sizes)} parts, the largest of {sizes.max()} nodes"
-    return () if len(sizes) == 1 else (Note(f"{text}; each stays where its first or its fixed nodes are"),)
 
 
 def graph_numbers(found: pose_graph.OptimizedPoseGraph) -> dict[str, Any]:

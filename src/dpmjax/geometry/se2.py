@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from dpmjax.checks import as_float
-from dpmjax.geometry.rigid import SERIES_BELOW, matmul, namespace_of
+from dpmjax.geometry.rigid import SERIES_BELOW, namespace_of
 from dpmjax.types import AnyArray
 
 Poses = NDArray[np.float64]
@@ -239,25 +239,6 @@ def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
     x, y, angle = pose_a_b[..., 0], pose_a_b[..., 1], wrap_angle(pose_a_b[..., 2])
     share, half = 1 - angle**2 * _missing_cotangent(angle), angle / 2
     return jnp.stack([share * x + half * y, share * y - half * x, angle], axis=-1)
-
-
-@jax.jit
-def log_jacobian(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3 3"]:
-    """The derivative of log(T_a_b @ rigid.exp(step)) by the step, at zero: the inverse right Jacobian.
-
-    Args:
-        pose_a_b: (..., 3), heading below half a turn.
-
-    Returns:
-        (..., 3, 3).
-    """
-    twist = log(pose_a_b)
-    vx, vy, angle = twist[..., 0], twist[..., 1], twist[..., 2]
-    zero, factor = jnp.zeros_like(angle), _missing_cotangent(angle)[..., None, None]
-    rows = ((zero, -angle, vy), (angle, zero, -vx), (zero, zero, zero))
-    ad = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-    # The series of Bernoulli numbers ends here, because ad^3 = -angle^2 ad.
-    return jnp.eye(3, dtype=twist.dtype) + ad / 2 + factor * matmul(ad, ad)
 
 
 def _missing_cotangent(angle: Float[Array, "..."]) -> Float[Array, "..."]:

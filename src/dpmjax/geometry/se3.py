@@ -85,8 +85,9 @@ def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
         (..., 6, 6) for tangents (translation, rotation).
     """
     T_a_b = as_float("T_a_b", T_a_b)
-    with jax.default_matmul_precision("highest"):
-        return jaxlie.SE3.from_matrix(T_a_b).adjoint().astype(T_a_b.dtype)
+    R = T_a_b[..., :3, :3]
+    top = jnp.concatenate([R, rigid.matmul(_cross_matrix(T_a_b[..., :3, 3]), R)], axis=-1)
+    return jnp.concatenate([top, jnp.concatenate([jnp.zeros_like(R), R], axis=-1)], axis=-2)
 
 
 def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:

@@ -1,6 +1,12 @@
+from .dense import DenseSolution as DenseSolution
+from .dense import solve_dense as solve_dense
+from .free_nodes import FreeNodes as FreeNodes
+from .free_nodes import describe_free_nodes as describe_free_nodes
+from .free_nodes import find_free_nodes as find_free_nodes
 from .graph import Edges as Edges
 from .graph import PoseGraph as PoseGraph
 from .graph import label_parts as label_parts
 from .optimize import OptimizedPoseGraph as OptimizedPoseGraph
 from .optimize import PoseGraphConfig as PoseGraphConfig
 from .optimize import optimize_pose_graph as optimize_pose_graph
+from .residuals import residuals as residuals

@@ -16,7 +16,7 @@ Indices = NDArray[np.int64]
 Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
 # Degrees of freedom of a pose by its shape: x, y, heading in the plane; a homogeneous matrix in space.
-_TANGENT_SIZE = {(3,): 3, (4, 4): 6}
+TANGENT_SIZE = {(3,): 3, (4, 4): 6}
 # Largest error of an information matrix that was computed in float32, relative to its largest entry.
 _ROUNDING = 1e-5
 
@@ -28,7 +28,8 @@ class Edges(NamedTuple):
         source: (e,) row of the pose that was measured.
         target: (e,) row of the pose in whose frame it was measured.
         measurements: `T_target_source`; (e, 3) x, y, heading in the plane, (e, 4, 4) in space.
-        information: inverse covariance in the tangent of the source frame, translation first; (e, 3, 3) or (e, 6, 6).
+        information: inverse covariance of the residual (`pose_graph.residuals`), translation first; (e, 3, 3) or
+            (e, 6, 6). In space its rotations are rotation vectors in radians.
     """
 
     source: Indices
@@ -96,9 +97,10 @@ class PoseGraph:
             The graph, in float64.
 
         Raises:
-            ValueError: the shapes do not match, a number is not finite, an edge joins no two nodes of the graph, or an
-                information matrix is not symmetric and positive semidefinite.
+            ValueError: the shapes do not match, a number is not finite, an edge joins no two nodes of the graph, an
+                information matrix is not symmetric and positive semidefinite, or an array is traced.
         """
+        require_untraced("PoseGraph", poses, edges, is_fixed, ids)
         poses = np.asarray(poses, np.float64)
         source, target = (np.asarray(rows, np.int64) for rows in edges[:2])
         edges = Edges(source, target, *(np.asarray(values, np.float64) for values in edges[2:]))
@@ -110,7 +112,7 @@ class PoseGraph:
     @property
     def tangent_size(self) -> int:
         """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
-        return _TANGENT_SIZE[self.poses.shape[1:]]
+        return TANGENT_SIZE[self.poses.shape[1:]]
 
     def held_nodes(self) -> NDArray[np.bool_]:
         """Finds the nodes that an optimisation does not move.
@@ -126,6 +128,20 @@ class PoseGraph:
         return held
 
 
+def require_untraced(name: str, *arguments: Any) -> None:
+    """Refuses traced arrays, which the host cannot read.
+
+    Args:
+        name: name of what was called, for the message.
+        *arguments: its arguments.
+
+    Raises:
+        ValueError: one of them is traced, as inside of `jax.jit`, `jax.grad` or `jax.vmap`.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
+        raise ValueError(f"{name}: runs on the host and cannot be traced; `pose_graph.solve_dense` can")
+
+
 def _require(is_right: bool | np.bool_, name: str, expected: str, got: Any) -> None:
     if not is_right:
         raise ValueError(f"{name}: expected {expected}, got {got}")
@@ -134,7 +150,7 @@ def _require(is_right: bool | np.bool_, name: str, expected: str, got: Any) -> N
 def _check(graph: PoseGraph) -> None:
     edges, size, count = graph.edges, len(graph.poses), len(graph.edges.source)
     pose = graph.poses.shape[1:]
-    _require(pose in _TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", graph.poses.shape)
+    _require(pose in TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", graph.poses.shape)
     tangent = (graph.tangent_size, graph.tangent_size)
     arrays = {"poses": graph.poses, "is_fixed": graph.is_fixed, "ids": graph.ids, **edges._asdict()}
     leading = {"poses": size, "is_fixed": size, "ids": size}

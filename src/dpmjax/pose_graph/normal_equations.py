@@ -1,11 +1,8 @@
-"""Residuals of edges, and sparse normal equations made of small dense blocks, solved by SuperLU.
+"""Sparse normal equations made of small dense blocks, solved by SuperLU.
 
 A term of a least-squares problem touches a few nodes (two for an edge of a pose graph). Its share of J^T W J is a dense
-block for every pair of them, its share of J^T W r a vector for each.
-
-The residuals of edges and their derivatives are in JAX with 64-bit floats. Poses move on the right, T_world_node @
-exp(delta). The residual of an edge is the logarithm of the motion from the measured to the present relative pose. It is
-in the tangent of the source frame, translation first, as in GTSAM.
+block for every pair of them, its share of J^T W r a vector for each. Those of a pose graph are computed by JAX with
+64-bit floats (`pose_graph/residuals.py`).
 """
 
 from __future__ import annotations
@@ -14,15 +11,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.geometry import rigid, se2, se3
 from dpmjax.pose_graph.graph import Edges, Floats, Indices
+from dpmjax.pose_graph.residuals import move, normal_blocks
 
 
 class Linearisation(NamedTuple):
@@ -72,25 +68,8 @@ def _padded(values: NDArray[Any], fill: Any) -> NDArray[Any]:
 
 @jax.jit
 def _linearise(poses: Array, step: Array, edges: Edges) -> tuple[Array, Array, Array, Array]:
-    is_planar = poses.ndim == 2
-    poses = se2.compose(poses, step) if is_planar else rigid.compose(poses, rigid.exp(step))
-    relative = _relative(poses[edges.target], poses[edges.source])
-    difference = _relative(jnp.asarray(edges.measurements), relative)
-    algebra = se2 if is_planar else se3
-    residual, of_source = algebra.log(difference), algebra.log_jacobian(difference)
-    adjoint = algebra.adjoint(se2.inverse(relative) if is_planar else rigid.inverse(relative))
-    with jax.default_matmul_precision("highest"):
-        jacobian = jnp.stack([-of_source @ adjoint, of_source], axis=1)
-        weighted = jnp.einsum("eij,esjk->esik", edges.information, jacobian)
-        blocks = jnp.einsum("eski,etkj->estij", jacobian, weighted)
-        gradient = jnp.einsum("eski,ek->esi", weighted, residual)
-        chi2 = jnp.einsum("ei,eij,ej->e", residual, edges.information, residual)
-    return poses, chi2, blocks, gradient
-
-
-def _relative(target: Float[Array, "e *s"], source: Float[Array, "e *s"]) -> Float[Array, "e *s"]:
-    """Returns the poses of the sources in the frames of the targets."""
-    return se2.relative(target, source) if source.ndim == 2 else rigid.compose(rigid.inverse(target), source)
+    poses = move(poses, step)
+    return poses, *normal_blocks(poses, edges)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +179,25 @@ def _elimination_order(block_row: Indices, block_column: Indices, num_free: int)
     ones = np.ones(len(block_row))
     joined = sp.csc_matrix((ones, (block_row, block_column)), (num_free, num_free))
     # The numbers only have to make a matrix that needs no pivots.
-    return _factorise(joined, 2.0 * joined.sum(axis=0).A1 + 1.0, "MMD_AT_PLUS_A").perm_c.astype(np.int64)
+    return factorise(joined, 2.0 * joined.sum(axis=0).A1 + 1.0, "MMD_AT_PLUS_A").perm_c.astype(np.int64)
 
 
-def _factorise(
+def factorise(
     matrix: sp.csc_matrix, diagonal: Floats, order: Literal["NATURAL", "MMD_AT_PLUS_A"]
 ) -> scipy.sparse.linalg.SuperLU:
+    """Factorises a symmetric matrix without pivoting.
+
+    Args:
+        matrix: (m, m).
+        diagonal: (m,) numbers added to its diagonal.
+        order: order of elimination.
+
+    Returns:
+        The factors.
+
+    Raises:
+        RuntimeError: a pivot is zero.
+    """
     options = {"SymmetricMode": True}
     damped = (matrix + sp.diags(diagonal)).tocsc()
     return scipy.sparse.linalg.splu(damped, permc_spec=order, diag_pivot_thresh=0.0, options=options)
@@ -225,7 +217,7 @@ def solve_symmetric(matrix: sp.csc_matrix, right: Floats, extra: Floats | float 
     if not len(right):
         return right
     try:
-        factors = _factorise(matrix, np.broadcast_to(extra, (len(right),)), "NATURAL")
+        factors = factorise(matrix, np.broadcast_to(extra, (len(right),)), "NATURAL")
     except RuntimeError:
         return np.full_like(right, np.nan)
     return factors.solve(right)

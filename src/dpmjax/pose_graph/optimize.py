@@ -10,6 +10,7 @@ nearest rotations; with them known, the translations are linear too (Martinec an
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,8 +20,11 @@ from jaxtyping import Float
 
 from dpmjax.checks import require_count, require_positive
 from dpmjax.geometry import rigid, se2
-from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph
+from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
+from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph, require_untraced
 from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
+
+LOGGER = logging.getLogger(__name__)
 
 # Width of the kernel at the start, in final widths; each step narrows it.
 _FIRST_WIDENING, _NARROWING = 1000.0, 1.6
@@ -70,6 +74,7 @@ class OptimizedPoseGraph(NamedTuple):
         iterations: number of linear solves, rejected ones included.
         weights: (e,) final weight of each edge, 0 (rejected) to 1; all one without a kernel.
         is_converged: False where the iterations ran out, or no step lowered the cost.
+        free_nodes: nodes that the edges leave free; they stay near their given poses. Each group is logged, too.
     """
 
     graph: PoseGraph
@@ -78,6 +83,7 @@ class OptimizedPoseGraph(NamedTuple):
     iterations: int
     weights: Floats
     is_converged: bool
+    free_nodes: tuple[FreeNodes, ...]
 
 
 class _State(NamedTuple):
@@ -94,8 +100,9 @@ def optimize_pose_graph(
 ) -> OptimizedPoseGraph:
     """Moves all free poses so that the relative poses agree with the measured ones.
 
-    Fixed nodes stay. In each connected part without a fixed node the first node stays, so that a graph of several
-    parts is no singular system.
+    The residuals are those of `pose_graph.residuals`. Fixed nodes stay. In each connected part without a fixed node the
+    first node stays, so that a graph of several parts is no singular system. Nodes that the edges leave free are named
+    in the result and in a logged warning. Runs on the host; `pose_graph.solve_dense` can be traced.
 
     Args:
         graph: poses and measurements, in the plane or in space.
@@ -106,8 +113,9 @@ def optimize_pose_graph(
         The optimised graph and its cost; the graph itself where no step lowers the cost.
 
     Raises:
-        ValueError: the cost of the given poses is not a finite number, or `trust` is not positive.
+        ValueError: the cost of the given poses is not a finite number, `trust` is not positive, or an array is traced.
     """
+    require_untraced("optimize_pose_graph", graph.poses, graph.edges, trust)
     config = config or PoseGraphConfig()
     if not (np.asarray(trust) > 0).all():
         raise ValueError("trust: expected numbers above 0, got others")
@@ -129,7 +137,10 @@ def optimize_pose_graph(
         iterations += 1
     weights, moved = _weights(state.at.chi2, width), replace(graph, poses=state.at.poses)
     chi2 = float((weights * state.at.chi2).sum())
-    return OptimizedPoseGraph(moved, chi2, chi2_initial, iterations, weights, state.is_converged)
+    free = find_free_nodes(moved)
+    if free:
+        LOGGER.warning("%s; they stay near their given poses", describe_free_nodes(free))
+    return OptimizedPoseGraph(moved, chi2, chi2_initial, iterations, weights, state.is_converged, free)
 
 
 def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig) -> _State:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, as_mask, as_points, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
+from dpmjax.geometry.implicit import solution_tangent
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
 from dpmjax.geometry.rigid import safe_sqrt
@@ -187,7 +188,6 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
 
 @_solve.defjvp
 def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, Array], Any]:
-    # The balance b(step, clouds) is 0 at the solution: d step = -(db / dstep)^-1 (db / dclouds) dclouds.
     source, target, normals, _ = primals
     T, converged = _solve(metric, *primals)
     centre, size, least = rigid.transform_points(T, _mean(source)[None])[0], _size(source), _resolution(target)
@@ -209,13 +209,14 @@ def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, A
         forces = pairs.weights[:, None] * forces
         return scales * jnp.concatenate([forces, _turning(pairs.points - centre, forces)], axis=-1).sum(0)
 
-    still = jnp.zeros_like(scales)
-    derivative = jax.jacfwd(balance)(still, source.points, target.points)
-    _, change = jax.jvp(
-        partial(balance, still), (source.points, target.points), (tangents[0].points, tangents[1].points)
+    step = solution_tangent(
+        balance,
+        (source.points, target.points),
+        (tangents[0].points, tangents[1].points),
+        num_unknowns=len(scales),
+        open_share=_OPEN_SHARE,
     )
-    step = -jnp.matmul(jnp.linalg.pinv(derivative, rtol=_OPEN_SHARE), change, precision="highest")
-    _, T_tangent = jax.jvp(moved, (still,), (step,))
+    _, T_tangent = jax.jvp(moved, (jnp.zeros_like(scales),), (step,))
     return (T, converged), (T_tangent, np.zeros(converged.shape, jax.dtypes.float0))
 
 

@@ -1,0 +1,152 @@
+"""The traced solver: the minimum of the host's solver, padding, batches, gradients against differences in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dpmjax.geometry import rigid, se2
+from dpmjax.pose_graph import Edges, PoseGraphConfig, optimize_pose_graph, solve_dense
+from tests.pose_graph.test_optimize import KINDS, random_graph
+
+# float32 poses of a few metres after a solve of up to 48 unknowns.
+CLOSE: dict[str, Any] = {"rtol": 1e-3, "atol": 1e-3}
+
+
+def arrays_of(seed: int, tangent: int, **options: float) -> tuple[jax.Array, Edges]:
+    graph = random_graph(seed, tangent, **options)
+    return jnp.asarray(graph.poses), Edges(*map(jnp.asarray, graph.edges))
+
+
+def moved(poses: jax.Array, step: jax.Array) -> jax.Array:
+    return se2.compose(poses, step) if poses.ndim == 2 else rigid.compose(poses, rigid.exp(step))
+
+
+@pytest.mark.slow
+@KINDS
+def test_minimum_is_that_of_the_sparse_solver(tangent: int, float64) -> None:
+    graph = random_graph(0, tangent)
+    expected = optimize_pose_graph(graph, PoseGraphConfig(tolerance=1e-12, is_chordal_start=False))
+    found = solve_dense(*arrays_of(0, tangent))
+    assert found.converged
+    np.testing.assert_allclose(found.chi2, expected.chi2, rtol=1e-9)
+    np.testing.assert_allclose(found.poses, expected.graph.poses, atol=1e-6)
+    np.testing.assert_array_equal(found.poses[0], graph.poses[0])
+    assert not solve_dense(*arrays_of(0, tangent), num_steps=1).converged
+
+
+def test_nodes_that_are_fixed_stay() -> None:
+    poses, edges = arrays_of(1, 3)
+    is_fixed = jnp.isin(jnp.arange(8), jnp.array([3, 7]))
+    found = solve_dense(poses, edges, is_fixed=is_fixed)
+    np.testing.assert_array_equal(found.poses[is_fixed], poses[is_fixed])
+    assert np.abs(found.poses - poses)[~is_fixed].min() > 0
+    np.testing.assert_array_equal(solve_dense(poses, edges, is_fixed=jnp.ones(8, bool)).poses, poses)
+
+
+def padded(poses: jax.Array, edges: Edges, extra: int = 2) -> tuple[jax.Array, Edges, jax.Array]:
+    """Nodes and edges that are not there, of NaN."""
+
+    def pad(values: jax.Array) -> jax.Array:
+        filler = jnp.nan if values.dtype.kind == "f" else 1
+        return jnp.concatenate([values, jnp.full((extra, *values.shape[1:]), filler, values.dtype)])
+
+    count = len(edges.source)
+    return pad(poses), Edges(*map(pad, edges)), jnp.arange(count + extra) < count
+
+
+def test_padding_reaches_neither_the_poses_nor_the_gradient() -> None:
+    poses, edges = arrays_of(2, 3)
+    more_poses, more_edges, mask = padded(poses, edges)
+
+    def total(measurements: jax.Array, poses: jax.Array, edges: Edges, mask: jax.Array | None) -> jax.Array:
+        found = solve_dense(poses, edges._replace(measurements=measurements), edge_mask=mask)
+        return jnp.sum(found.poses[:8] ** 2) + found.chi2
+
+    value_and_grad = jax.jit(jax.value_and_grad(total))
+    plain, slope = value_and_grad(edges.measurements, poses, edges, None)
+    value, gradient = value_and_grad(more_edges.measurements, more_poses, more_edges, mask)
+    np.testing.assert_allclose(value, plain, rtol=1e-5)
+    np.testing.assert_allclose(gradient[:-2], slope, **CLOSE)
+    np.testing.assert_array_equal(gradient[-2:], 0.0)
+    assert np.isnan(solve_dense(more_poses, more_edges, edge_mask=mask).poses[-2:]).all()
+
+
+def test_batch_is_the_call_and_compiles_once(assert_compiles_nothing) -> None:
+    graphs = [arrays_of(seed, 3) for seed in (0, 1)]
+    solve = jax.jit(jax.vmap(lambda poses, edges: solve_dense(poses, edges)))
+    together = solve(*jax.tree.map(lambda *x: jnp.stack(x), *graphs))
+    for row, graph in enumerate(graphs):
+        np.testing.assert_allclose(together.poses[row], solve_dense(*graph).poses, **CLOSE)
+        assert together.converged[row]
+    with assert_compiles_nothing():
+        solve(*jax.tree.map(lambda *x: jnp.stack(x), *graphs[::-1]))
+
+
+@pytest.mark.slow
+@KINDS
+def test_gradient_is_that_of_differences(tangent: int, float64) -> None:
+    poses, edges = arrays_of(3, tangent, noise=0.03, start=0.05)
+    rng = np.random.default_rng(4)
+    reading = jnp.asarray(rng.normal(size=poses.shape))
+    num_edges = len(edges.source)
+    roots = rng.normal(size=(num_edges, tangent, tangent))
+    along = {
+        "measurements": jnp.asarray(rng.normal(size=(num_edges, tangent))),
+        "information": jnp.asarray(roots + np.swapaxes(roots, 1, 2)),
+        "fixed": jnp.asarray(rng.normal(size=(1, tangent))),
+    }
+
+    def read(change: dict[str, jax.Array]) -> jax.Array:
+        measurements = moved(edges.measurements, change["measurements"])
+        changed = edges._replace(measurements=measurements, information=edges.information + change["information"])
+        given = jnp.concatenate([moved(poses[:1], change["fixed"]), poses[1:]])
+        found = solve_dense(given, changed)
+        return jnp.sum(reading * found.poses) + found.chi2
+
+    function = jax.jit(read)
+    still = jax.tree.map(jnp.zeros_like, along)
+    gradient = jax.jit(jax.grad(read))(still)
+    for name, direction in along.items():
+        ends = [function(still | {name: step * direction}) for step in (1e-5, -1e-5)]
+        slope = float((ends[0] - ends[1]) / 2e-5)
+        assert abs(slope) > 1e-3
+        assert float(jnp.sum(gradient[name] * direction)) == pytest.approx(slope, rel=1e-6, abs=1e-6), name
+    along_all: Callable[[dict[str, jax.Array]], Any] = partial(jax.jvp, function, (still,))
+    total = sum(float(jnp.sum(gradient[name] * along[name])) for name in along)
+    assert float(along_all((along,))[1]) == pytest.approx(total, rel=1e-9)
+
+
+def test_start_of_free_nodes_has_no_gradient() -> None:
+    poses, edges = arrays_of(5, 3)
+    gradient = jax.grad(lambda poses: jnp.sum(jnp.cos(solve_dense(poses, edges).poses)))(poses)
+    np.testing.assert_array_equal(gradient[1:], 0.0)
+    assert np.abs(gradient[0]).min() > 1e-3
+
+
+def test_motion_that_no_edge_measures_has_no_gradient(float64) -> None:
+    poses, edges = arrays_of(6, 3)
+    chain = Edges(*(values[:7] for values in edges))
+    chain = chain._replace(information=chain.information.at[4].set(jnp.diag(jnp.array([1.0, 1.0, 0.0]))))
+
+    def last(measurements: jax.Array) -> jax.Array:
+        return solve_dense(poses, chain._replace(measurements=measurements)).poses[5, 2]
+
+    heading, gradient = jax.value_and_grad(last)(chain.measurements)
+    assert np.isfinite(heading)
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(gradient[4], 0.0, atol=1e-8)
+
+
+def test_wrong_arguments_are_named() -> None:
+    poses, edges = arrays_of(0, 3)
+    with pytest.raises(ValueError, match="^is_fixed: expected bool"):
+        solve_dense(poses, edges, is_fixed=jnp.ones(7, bool))
+    with pytest.raises(ValueError, match="^num_steps: expected at least 1"):
+        solve_dense(poses, edges, num_steps=0)
