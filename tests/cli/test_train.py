@@ -84,6 +84,15 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
 
 
 @pytest.mark.slow
+def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(whole) -> None:
+    rows = read_history(whole[1] / HISTORY)
+    assert {bool(row["recall"]) for row in rows} == {True, False}
+    for row in rows:
+        assert [bool(row[name]) for name in train_run.OFFSETS] == [bool(row["recall"])] * 3
+        assert bool(row["offset"])
+
+
+@pytest.mark.slow
 def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, whole, monkeypatch, caplog) -> None:
     monkeypatch.setattr(train_run, "SAVE_EVERY_S", 0.0)
     train(tmp_path, stop_after=3)

@@ -38,7 +38,9 @@ SAVE_EVERY_S = 300.0
 SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
 RECALLS = (*KIND_NAMES, "real_recall", "real_recall_far")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS)
+# Coefficients of determination of predicted offsets, on the selection pairs; empty without an offset head.
+OFFSETS = ("offset_r2_normal", "offset_r2_along", "offset_r2_up")
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OFFSETS)
 
 
 class EvaluationSets(NamedTuple):
@@ -164,21 +166,26 @@ class Records:
         self.earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
         total = int(self.start.state.end)
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
-        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
+        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
         self.run_s = self.earlier_s
         self._seen: set[dpm.CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
     def evaluate(self, model: dpm.Model) -> float:
-        """Returns the mean recall on the selection pairs, and measures that on real pairs."""
+        """Returns the mean recall on the selection pairs, and measures their offsets and the recall on real pairs."""
 
-        def mean_recalls(sets: Sequence[dpm.EvaluationPairs]) -> list[float]:
-            found = (dpm.evaluate_registration(model, pairs).recalls for pairs in sets)
-            return np.mean([[recall.recall for recall in recalls] for recalls in found], axis=0).tolist()
+        def mean_recalls(found: Sequence[dpm.Evaluation]) -> list[float]:
+            return np.mean([[recall.recall for recall in one.recalls] for one in found], axis=0).tolist()
 
-        of_kinds = mean_recalls(self.sets.selection)
-        of_real = mean_recalls(self.sets.real) if self.sets.real else [math.nan, math.nan]
-        self._recalls = dict(zip(RECALLS, (*of_kinds, *of_real), strict=True))
+        found, real = (
+            [dpm.evaluate_registration(model, pairs) for pairs in sets]
+            for sets in (self.sets.selection, self.sets.real)
+        )
+        of_kinds = mean_recalls(found)
+        of_real = mean_recalls(real) if real else [math.nan, math.nan]
+        predicted = [offsets for one in found for offsets in one.offsets]
+        r2 = dpm.measure_offsets(predicted if model.config.decoder.predicts_offsets else []).r2.tolist()
+        self._recalls = dict(zip((*RECALLS, *OFFSETS), (*of_kinds, *of_real, *r2), strict=True))
         return float(np.mean(of_kinds))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
@@ -257,6 +264,8 @@ def _stage_name(stage: dpm.CurriculumStage) -> str:
 
 def _values(record: dpm.StepRecord) -> dict[str, Any]:
     values = {**record.report._asdict(), **record.report.terms._asdict(), "score": record.score}
+    if values["offset"] == 0:  # no offset head is trained
+        values["offset"] = math.nan
     return {name: float(values[name]) for name in MEASURES if math.isfinite(values[name])}
 
 

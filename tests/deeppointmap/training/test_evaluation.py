@@ -8,7 +8,14 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import PairKind, draw_evaluation_pairs, evaluate_registration, init_model
+from dpmjax.deeppointmap import (
+    PairKind,
+    draw_evaluation_pairs,
+    evaluate_registration,
+    init_model,
+    measure_offsets,
+    offset_quality,
+)
 from dpmjax.deeppointmap.training.step import encode_sample
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
@@ -23,6 +30,22 @@ def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
     np.testing.assert_array_equal(clouds.mask, expected.mask)
     np.testing.assert_allclose(clouds.positions, expected.positions, atol=1e-4)
     np.testing.assert_allclose(clouds.features, expected.features, **ACCUMULATED)
+
+
+@pytest.mark.slow
+def test_offsets_of_an_evaluation_are_those_of_its_pairs() -> None:
+    model = init_model(jax.random.key(0), toy.MODEL)
+    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, toy.MODEL)
+    evaluation, some = evaluate_registration(model, pairs), pairs.pairs[0]
+    sources, targets = (
+        [jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in rows[:, 0]]
+        for rows in (some.sources, some.targets)
+    )
+    motions = pairs.true_motions(some).astype(np.float32)
+    expected = offset_quality(model, zip(sources, targets, motions, strict=True))
+    found = measure_offsets(evaluation.offsets)
+    assert found.num_pairs == expected.num_pairs > 0
+    np.testing.assert_allclose(found.r2, expected.r2, **ACCUMULATED)
 
 
 def test_a_map_holds_its_first_scan_once() -> None:
