@@ -13,7 +13,7 @@ to 20 m apart and turned by any yaw, are registered. A registration within 2 m a
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
-a scan; the scans themselves are not used again. Another table has the accuracy of the offset head in the frame of walls, as
+a scan; the scans themselves are not used again. Another table has the accuracy of the offset head at walls, as
 coefficient of determination and root mean square residual. Rows of all recorded drives together have confidence
 intervals and say which methods differ.
 

@@ -21,10 +21,13 @@ from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
     TrainingHooks,
+    WallOffsets,
     begin_training,
     draw_evaluation_pairs,
+    evaluate_registration,
     init_model,
     init_training,
+    measure_offsets,
     training_preset,
 )
 from dpmjax.deeppointmap.training.curriculum import stage_layouts
@@ -84,12 +87,21 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
 
 
 @pytest.mark.slow
-def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(whole) -> None:
-    rows = read_history(whole[1] / HISTORY)
+def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path, monkeypatch) -> None:
+    evaluate, true = evaluate_registration, np.random.default_rng(0).normal(size=(50, 3))
+    known = WallOffsets(true * [0.5, 1, 0], true, np.ones(50, bool))
+    monkeypatch.setattr(
+        train_run.dpm, "evaluate_registration", lambda *args: evaluate(*args)._replace(offsets=(known, known))
+    )
+    train(tmp_path)
+    rows = read_history(tmp_path / HISTORY)
     assert {bool(row["recall"]) for row in rows} == {True, False}
+    expected = measure_offsets([known]).r2
+    assert expected[1] == 1 > expected[0] > expected[2]
     for row in rows:
-        assert [bool(row[name]) for name in train_run.OFFSETS] == [bool(row["recall"])] * 3
-        assert bool(row["offset"])
+        found = [float(row[name] or "nan") for name in train_run.OFFSETS]
+        np.testing.assert_allclose(found, expected if row["recall"] else np.full(3, np.nan), rtol=1e-5)
+        assert row["offset"]
 
 
 @pytest.mark.slow

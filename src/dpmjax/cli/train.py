@@ -71,7 +71,7 @@ class Config(ProcessOptions):
     """Go on from these weights at a fifth of the learning rate; their network takes the place of that of the preset.
     Without it, begin from random ones."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
-    """Leave these out, to see what each is worth (the paper's Table 2)."""
+    """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
     frame: Literal["lidar", "bearing", "local"] | None = None
     """Frame of the encoder's features: of the lidar, of the ray to each point, or of the wall at it; without it, the
     preset decides."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ from dpmjax.deeppointmap import (
     offset_quality,
 )
 from dpmjax.deeppointmap.training.step import encode_sample
+from dpmjax.geometry.pyramid import PyramidStage
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
@@ -34,8 +36,11 @@ def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
 
 @pytest.mark.slow
 def test_offsets_of_an_evaluation_are_those_of_its_pairs() -> None:
-    model = init_model(jax.random.key(0), toy.MODEL)
-    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, toy.MODEL)
+    # As many descriptors as points, so that many are close.
+    stages = (PyramidStage(128, (0.2,), 8), PyramidStage(8, (0.4,), 4))
+    config = replace(toy.MODEL, pyramid=replace(toy.MODEL.pyramid, stages=stages))
+    model = init_model(jax.random.key(0), config)
+    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, config)
     evaluation, some = evaluate_registration(model, pairs), pairs.pairs[0]
     sources, targets = (
         [jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in rows[:, 0]]
