@@ -13,7 +13,7 @@ to 20 m apart and turned by any yaw, are registered. A registration within 2 m a
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
-a scan; the scans themselves are not used again. Another table has the accuracy of the offset head along each axis, as
+a scan; the scans themselves are not used again. Another table has the accuracy of the offset head at walls, as
 coefficient of determination and root mean square residual. Rows of all recorded drives together have confidence
 intervals and say which methods differ.
 
@@ -185,7 +185,7 @@ def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, nu
 
 
 def offset_row(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
-    """Returns the accuracy of the offset head on close descriptors, along x, y and z of the lidar."""
+    """Returns the accuracy of the offset head on close descriptors: along the normal, along the wall, up."""
     quality = dpm.offset_quality(
         model,
         [(*(encode(model, points) for points in (pair.source, pair.target)), pair.T_target_source) for pair in pairs],
@@ -240,7 +240,7 @@ def cloud_tables(rows: Sequence[cli.Row]) -> str:
             errors = (row["recall_refined"], cli.length_text(row["median_error_refined_m"]))
             lines.append([*case, row["method"].removeprefix(CLOUDS), row["num_pairs"], *errors])
     clouds = ("sequence", "distance", "surface elements of clouds", "pairs", "recall", "median error")
-    axes = ("sequence", "distance", "offsets along x: R2 (rmse)", "y", "z")
+    axes = ("sequence", "distance", "offsets along the normal: R2 (rmse)", "along the wall", "up")
     tables = [cli.markdown(clouds, lines) if lines else "", cli.markdown(axes, offsets) if offsets else ""]
     return "\n\n".join(filter(None, tables))
 

@@ -24,10 +24,13 @@ from dpmjax.deeppointmap import (
     OverlapConfig,
     SampleMaker,
     TrainingHooks,
+    WallOffsets,
     begin_training,
     draw_evaluation_pairs,
+    evaluate_registration,
     init_model,
     init_training,
+    measure_offsets,
     prepare_drive,
     training_preset,
 )
@@ -121,6 +124,24 @@ def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_pa
     assert [pairs.kind for pairs in some.of_scans.pairs] == list(KINDS[:2])
     assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 4
     assert max(pairs.sources.max() for pairs in some.pairs.pairs) >= 24  # of the second drive
+
+
+@pytest.mark.slow
+def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path, monkeypatch) -> None:
+    evaluate, true = evaluate_registration, np.random.default_rng(0).normal(size=(50, 3))
+    known = WallOffsets(true * [0.5, 1, 0], true, np.ones(50, bool))
+    monkeypatch.setattr(
+        train_run.dpm, "evaluate_registration", lambda *args: evaluate(*args)._replace(offsets=(known, known))
+    )
+    train(tmp_path)
+    rows = read_history(tmp_path / HISTORY)
+    assert {bool(row["recall"]) for row in rows} == {True, False}
+    expected = measure_offsets([known]).r2
+    assert expected[1] == 1 > expected[0] > expected[2]
+    for row in rows:
+        found = [float(row[name] or "nan") for name in train_run.OFFSETS]
+        np.testing.assert_allclose(found, expected if row["recall"] else np.full(3, np.nan), rtol=1e-5)
+        assert row["offset"]
 
 
 @pytest.mark.slow

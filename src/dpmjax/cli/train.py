@@ -76,7 +76,7 @@ class Config(ProcessOptions):
     calibrate: bool = True
     """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
-    """Leave these out, to see what each is worth (the paper's Table 2)."""
+    """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
     frame: Literal["lidar", "bearing", "local"] | None = None
     """Frame of the encoder's features: of the lidar, of the ray to each point, or of the wall at it; without it, the
     preset decides."""

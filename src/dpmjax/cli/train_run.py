@@ -31,7 +31,9 @@ SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
 RECALLS = ("recall", "recall_far")
 OVERLAP_MEASURES = ("overlap_loss", "overlap_accuracy")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OVERLAP_MEASURES)
+# Coefficients of determination of predicted offsets, on the pairs that choose the model; empty without an offset head.
+OFFSETS = ("offset_r2_normal", "offset_r2_along", "offset_r2_up")
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OFFSETS, *OVERLAP_MEASURES)
 
 
 class Selection(NamedTuple):
@@ -141,19 +143,21 @@ class Records:
         self.earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
         total = int(self.start.state.end) if "registration" in settings.stages else 0
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
-        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
+        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
         self.run_s, self._pace_s = self.earlier_s, math.nan
         self._seen: set[dpm.CurriculumStage] = set()
         self._tell_compilation(self.start.state)
 
     def evaluate(self, model: dpm.Model) -> float:
-        """Returns the mean recall of the pairs of scans that choose the model."""
+        """Returns the mean recall of the pairs of scans that choose the model, and measures their offsets."""
         pairs = self.selection.of_scans
         if pairs is None:
             return math.nan
         found = dpm.evaluate_registration(model, pairs)
         named = zip(pairs.pairs, found.recalls, strict=True)
+        r2 = dpm.measure_offsets(found.offsets if model.config.decoder.predicts_offsets else []).r2.tolist()
         self._recalls |= {KIND_NAMES[some.kind]: recall.recall for some, recall in named}
+        self._recalls |= dict(zip(OFFSETS, r2, strict=True))
         return float(np.mean([recall.recall for recall in found.recalls]))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
@@ -294,6 +298,8 @@ def _stage_name(stage: dpm.CurriculumStage) -> str:
 
 def _values(record: dpm.StepRecord) -> dict[str, Any]:
     values = {**record.report._asdict(), **record.report.terms._asdict(), "score": record.score}
+    if values["offset"] == 0:  # no offset head is trained
+        values["offset"] = math.nan
     return {name: float(values[name]) for name in MEASURES if math.isfinite(values[name])}
 
 

@@ -70,12 +70,10 @@ from .training.curriculum import training_preset as training_preset
 from .training.curriculum import without as without
 from .training.evaluation import Evaluation as Evaluation
 from .training.evaluation import EvaluationPairs as EvaluationPairs
-from .training.evaluation import OffsetQuality as OffsetQuality
 from .training.evaluation import PairKind as PairKind
 from .training.evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .training.evaluation import evaluate_registration as evaluate_registration
 from .training.evaluation import join_evaluation_pairs as join_evaluation_pairs
-from .training.evaluation import offset_quality as offset_quality
 from .training.evaluation import pair_kinds as pair_kinds
 from .training.loop import Speed as Speed
 from .training.loop import StepRecord as StepRecord
@@ -86,6 +84,10 @@ from .training.loop import TrainingProgress as TrainingProgress
 from .training.loop import begin_training as begin_training
 from .training.loop import train as train
 from .training.objective import ObjectiveConfig as ObjectiveConfig
+from .training.offset_quality import OffsetQuality as OffsetQuality
+from .training.offset_quality import WallOffsets as WallOffsets
+from .training.offset_quality import measure_offsets as measure_offsets
+from .training.offset_quality import offset_quality as offset_quality
 from .training.overlap_stage import OverlapHooks as OverlapHooks
 from .training.overlap_stage import OverlapRecord as OverlapRecord
 from .training.overlap_stage import OverlapState as OverlapState

@@ -31,7 +31,7 @@ class DecoderConfig:
             clouds. With False they attend to the features of their own cloud alone, which describe the surroundings
             already. The result then depends neither on the other cloud nor on positions, and training needs fewer
             steps.
-        predicts_offsets: False leaves all offsets at 0, for the ablation of Table 2.
+        predicts_offsets: False leaves all offsets at 0, as in `tiny` and `small`, and in the ablation of Table 2.
         compute_dtype: type of the matrix products.
     """
 

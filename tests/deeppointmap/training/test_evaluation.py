@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import PairKind, draw_evaluation_pairs, evaluate_registration, init_model
+from dpmjax.deeppointmap import (
+    PairKind,
+    draw_evaluation_pairs,
+    evaluate_registration,
+    init_model,
+    measure_offsets,
+    offset_quality,
+)
 from dpmjax.deeppointmap.training.step import encode_sample
+from dpmjax.geometry.pyramid import PyramidStage
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
@@ -38,6 +47,25 @@ def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(asse
         found = evaluate_registration(model, many)
     assert [len(recall.translation_errors_m) for recall in found.recalls] == [13, 13]
     assert found.clouds.positions.shape[0] == 24
+
+
+@pytest.mark.slow
+def test_offsets_of_an_evaluation_are_those_of_its_pairs() -> None:
+    # As many descriptors as points, so that many are close.
+    stages = (PyramidStage(128, (0.2,), 8), PyramidStage(8, (0.4,), 4))
+    config = replace(toy.MODEL, pyramid=replace(toy.MODEL.pyramid, stages=stages))
+    model = init_model(jax.random.key(0), config)
+    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, config)
+    evaluation, some = evaluate_registration(model, pairs), pairs.pairs[0]
+    sources, targets = (
+        [jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in rows[:, 0]]
+        for rows in (some.sources, some.targets)
+    )
+    motions = pairs.true_motions(some).astype(np.float32)
+    expected = offset_quality(model, zip(sources, targets, motions, strict=True))
+    found = measure_offsets(evaluation.offsets)
+    assert found.num_pairs == expected.num_pairs > 0
+    np.testing.assert_allclose(found.r2, expected.r2, **ACCUMULATED)
 
 
 def test_a_map_holds_its_first_scan_once() -> None:

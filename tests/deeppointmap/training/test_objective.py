@@ -163,6 +163,18 @@ def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
         sides(9)
 
 
+def test_without_weight_offsets_reach_neither_loss_nor_gradient() -> None:
+    bare = replace(CONFIG, offset_weight=0.0)
+    a, b = sides(10)
+    total, terms = matching_loss(a, b, T_B_A, config=CONFIG)
+    lost = a.replace(offsets=a.offsets * jnp.nan)
+    value, of_bare = matching_loss(lost, b, T_B_A, config=bare)
+    np.testing.assert_allclose(value, total - terms.offset, **ACCUMULATED)
+    assert of_bare.offset == 0 < terms.offset
+    gradient = jax.grad(lambda x: matching_loss(a.replace(offsets=x), b, T_B_A, config=bare)[0])(lost.offsets)
+    assert not np.any(gradient)
+
+
 def test_a_negative_weight_is_refused(as_user) -> None:
     with pytest.raises(ValueError, match="^offset_weight: expected"):
         ObjectiveConfig(offset_weight=-1)

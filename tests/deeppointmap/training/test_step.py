@@ -101,7 +101,19 @@ def test_parts_of_the_training_can_be_left_out() -> None:
     assert without(config, "coarse-loss").objective.coarse_weight == 0
     bare = without(config, "occlusion").augment
     assert (bare.sector_probability, bare.box_probability, bare.max_drop_ratio) == (0, 0, 0.5)
-    assert not without(config, "offset-head").model.decoder.predicts_offsets
+    paper = training_preset("paper")
+    assert paper.model.decoder.predicts_offsets
+    assert not without(paper, "offset-head").model.decoder.predicts_offsets
+
+
+@pytest.mark.slow
+def test_a_model_without_offsets_has_no_offset_loss(maker, start) -> None:
+    decoder = replace(toy.MODEL.decoder, predicts_offsets=False)
+    config = replace(toy.TRAINING, model=replace(toy.MODEL, decoder=decoder))
+    _, expected = make_step(without(toy.TRAINING, "offset-head"))(start, maker(0))
+    _, report = make_step(config)(start, maker(0))
+    assert report.terms.offset == 0
+    np.testing.assert_allclose(report.loss, expected.loss, **ACCUMULATED)
 
 
 @pytest.mark.slow

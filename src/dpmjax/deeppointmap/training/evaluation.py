@@ -1,36 +1,32 @@
-"""Evaluation while training: registration of held-out pairs of maps, and the offset head in metres."""
+"""Evaluation while training: registration of held-out pairs of maps, and their offsets."""
 
 from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dpmjax.deeppointmap.evaluation_pairs import draw_rows_apart, scan_distances, true_poses
 from dpmjax.deeppointmap.matching import merge_clouds, thinned_mask
-from dpmjax.deeppointmap.model import Model, correlate, predict_offsets
+from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.scan_registration import trace_match
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
-from dpmjax.deeppointmap.training.objective import ObjectiveConfig, training_pairs
+from dpmjax.deeppointmap.training.offset_quality import TRAINED, WallOffsets, wall_offsets
 from dpmjax.deeppointmap.training.preparation import prepare_drive
 from dpmjax.deeppointmap.training.sampling import SampleScans
 from dpmjax.deeppointmap.training.scan_store import ScanStore
 from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
-from dpmjax.geometry.bearing import directions_of
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.scans.augment import AugmentConfig
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import AnyArray, DescriptorCloud, Poses, Registration
-
-TRAINED = ObjectiveConfig()
+from dpmjax.types import DescriptorCloud, Poses, Registration
 
 PAIR_STREAM = 3103
 # Scans, maps or pairs that one compiled program evaluates in turn.
@@ -124,11 +120,13 @@ class Evaluation(NamedTuple):
     Attributes:
         recalls: errors and share of correct registrations of each kind.
         matches: stacked registrations of each kind.
+        offsets: stacked offsets of the close descriptors of each kind; `measure_offsets` measures them.
         clouds: descriptors of all scans, stacked.
     """
 
     recalls: tuple[RegistrationRecall, ...]
     matches: tuple[Registration, ...]
+    offsets: tuple[WallOffsets, ...]
     clouds: DescriptorCloud
 
 
@@ -230,15 +228,18 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
         pairs: pairs from `draw_evaluation_pairs`.
 
     Returns:
-        Errors, registrations and descriptors.
+        Errors, registrations, offsets and descriptors.
     """
     clouds = _in_chunks(functools.partial(_encode_all, model), pairs.scans)
-    matches, recalls = [], []
+    matches, offsets, recalls = [], [], []
     for some in pairs.pairs:
         sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
-        matches.append(_in_chunks(functools.partial(_register_all, model), *sides))
-        recalls.append(registration_recall(matches[-1].T_target_source, pairs.true_motions(some)))
-    return Evaluation(tuple(recalls), tuple(matches), clouds)
+        motions = pairs.true_motions(some)
+        match, found = _in_chunks(functools.partial(_register_all, model), *sides, motions.astype(np.float32))
+        matches.append(match)
+        offsets.append(found)
+        recalls.append(registration_recall(match.T_target_source, motions))
+    return Evaluation(tuple(recalls), tuple(matches), tuple(offsets), clouds)
 
 
 def _in_chunks(function: Callable[..., Any], *trees: Any) -> Any:
@@ -258,11 +259,15 @@ def _encode_all(model: Model, scans: SampleScans) -> DescriptorCloud:
 
 
 @jax.jit
-def _register_all(model: Model, sources: DescriptorCloud, targets: DescriptorCloud) -> Registration:
-    def best_motion(maps: tuple[DescriptorCloud, DescriptorCloud]) -> Registration:
-        return jax.tree.map(lambda leaf: leaf[0], trace_match(model, *maps, config=model.config.matching))
+def _register_all(
+    model: Model, sources: DescriptorCloud, targets: DescriptorCloud, T_target_source: Float[Array, "p 4 4"]
+) -> tuple[Registration, WallOffsets]:
+    def best_motion(pair: tuple[DescriptorCloud, DescriptorCloud, Array]) -> tuple[Registration, WallOffsets]:
+        source, target, T = pair
+        hypotheses = trace_match(model, source.described, target.described, config=model.config.matching)
+        return jax.tree.map(lambda leaf: leaf[0], hypotheses), wall_offsets(model, source, target, T, TRAINED)
 
-    return jax.lax.map(best_motion, (sources, targets))
+    return jax.lax.map(best_motion, (sources, targets, T_target_source))
 
 
 def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Poses) -> DescriptorCloud:
@@ -278,59 +283,3 @@ def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: P
 @jax.jit
 def _merge_all(clouds: DescriptorCloud, T_map_scan: Array) -> DescriptorCloud:
     return jax.vmap(merge_clouds)(clouds, T_map_scan)
-
-
-class OffsetQuality(NamedTuple):
-    """Accuracy of predicted offsets along x, y and z of the lidar.
-
-    Attributes:
-        r2: coefficient of determination: 1 less the mean squared residual over the variance of the true offsets.
-        rmse_m: root mean square residual, metres.
-        spread_m: standard deviation of the true offsets, metres: the residual without any prediction.
-        num_pairs: number of pairs of descriptors.
-    """
-
-    r2: Float[np.ndarray, " 3"]
-    rmse_m: Float[np.ndarray, " 3"]
-    spread_m: Float[np.ndarray, " 3"]
-    num_pairs: int
-
-
-def offset_quality(
-    model: Model,
-    pairs: Iterable[tuple[DescriptorCloud, DescriptorCloud, Float[AnyArray, "4 4"]]],
-    *,
-    config: ObjectiveConfig = TRAINED,
-) -> OffsetQuality:
-    """Compares predicted offsets with the true ones, over all pairs of descriptors that are close.
-
-    The offset loss (DeepPointMap eq. 6) whitens the residuals, so that it cannot show whether an axis is predicted.
-
-    Args:
-        model: encoder and decoder.
-        pairs: source, target and true motion `T_target_source` of each pair of clouds.
-        config: radius and number of close pairs, as in training.
-
-    Returns:
-        The quality; NaN where no two descriptors are close, and `r2` along an axis without spread.
-    """
-    found = [_offsets(model, source, target, jnp.asarray(T), config) for source, target, T in pairs]
-    if sum(len(true) for _, true in found) == 0:
-        nothing = np.full(3, np.nan)
-        return OffsetQuality(nothing, nothing, nothing, 0)
-    predicted, true = (np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True))
-    squared, variance = np.mean((predicted - true) ** 2, axis=0), np.var(true, axis=0)
-    r2 = 1 - np.divide(squared, variance, out=np.full(3, np.nan), where=variance > 0)
-    return OffsetQuality(r2, np.sqrt(squared), np.sqrt(variance), len(true))
-
-
-def _offsets(
-    model: Model, source: DescriptorCloud, target: DescriptorCloud, T: jax.Array, config: ObjectiveConfig
-) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """Returns predicted and true offsets of the close pairs, in the frame of the source."""
-    source, target = correlate(model, source, target)
-    close, _ = training_pairs(source, target, T, config=config)
-    directions = directions_of(source)[:, None]
-    predicted = predict_offsets(model, source.features[:, None], target.features, directions, close.indices)
-    mask = np.asarray(close.mask)
-    return np.asarray(predicted)[mask], np.asarray(close.offsets)[mask]

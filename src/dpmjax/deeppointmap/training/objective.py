@@ -30,7 +30,7 @@ class ObjectiveConfig:
 
     Attributes:
         coarse_weight: weight of the coarse pairing loss.
-        offset_weight: weight of the offset loss.
+        offset_weight: weight of the offset loss; 0 leaves it out, and its term is 0.
         positive_radius_m: largest distance of the positive, which is the nearest descriptor; further descriptors within
             it are neutral.
         offset_radius_m: largest distance of the pairs whose offsets are learned.
@@ -161,10 +161,11 @@ def _direction(
     is_absent = jnp.broadcast_to(~target.mask, squared.shape)
     loss = functools.partial(info_nce, positives=positives, temperature=TEMPERATURE)
     close = source.close
+    offsets = source.offsets.reshape(-1, 3), close.offsets.reshape(-1, 3)
     return ObjectiveTerms(
         pairing=loss(source.matched_features, target.matched_features, ignore=is_absent),
         coarse=loss(source.coarse_features, target.coarse_features, ignore=is_absent | is_close),
-        offset=offset_loss(source.offsets.reshape(-1, 3), close.offsets.reshape(-1, 3), close.mask.reshape(-1)),
+        offset=offset_loss(*offsets, close.mask.reshape(-1)) if config.offset_weight else jnp.zeros(()),
         top1_accuracy=_top1_accuracy(source, target, positives),
         num_positives=jnp.sum(has_positive),
     )

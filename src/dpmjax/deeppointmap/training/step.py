@@ -178,6 +178,8 @@ def batch_loss(
     Returns:
         The loss and its terms; 0 without any group.
     """
+    if not config.model.decoder.predicts_offsets:
+        config = replace(config, objective=replace(config.objective, offset_weight=0.0))
     model = Model(params, config.model)
 
     def of_sample(sample: RegistrationSample) -> tuple[Array, ObjectiveTerms]:
