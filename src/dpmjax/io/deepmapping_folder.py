@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from dpmjax.io.clouds import parse_pcd
-from dpmjax.io.files import natural_key, parse_mat, read_bytes, refusing
+from dpmjax.io.files import load_mat, natural_key, read_bytes, refusing
 from dpmjax.sequences import FloatArray, ScanSequence, Unit, pad_scans, require
 
 _PIXELS_PER_UNIT = 512.0
@@ -75,7 +75,7 @@ def _list_files(path: Path) -> dict[str, bytes]:
 
 def _read_poses(content: bytes, source: str, num_scans: int) -> FloatArray:
     """Reads the (n, 3) array `pose` of a MATLAB file."""
-    variables = parse_mat(content, source)
+    variables = load_mat(content, source)
     found = f"variables are {', '.join(variables) or 'none'}"
     require("pose" in variables, source, found, "the file needs a variable 'pose'")
     pose = np.asarray(variables["pose"])
