@@ -13,7 +13,8 @@ import numpy as np
 
 from dpmjax.io.clouds import parse_pcd
 from dpmjax.io.files import load_mat, natural_key, read_bytes, refusing
-from dpmjax.sequences import FloatArray, ScanSequence, Unit, pad_scans, require
+from dpmjax.io.poses import planar_rows
+from dpmjax.sequences import ScanSequence, Unit, pad_scans, require
 
 _PIXELS_PER_UNIT = 512.0
 _LARGEST_STORED = 8.0  # A picture of 2048 pixels has a diagonal of 5.7 stored units.
@@ -45,17 +46,19 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     for scan in scans:
         scan[~np.isfinite(scan).all(axis=1) | (scan == 0).all(axis=1)] = np.nan
     points, mask = pad_scans(scans)
-    found = "every point of every scan is zero (an invalid beam)"
-    require(mask.any(), path, found, "give scans that measured something")
-    largest = np.abs(points).max()
-    found = f"coordinates up to {largest:g}"
-    require(largest <= _LARGEST_LENGTH, path, found, "give metres, or pixels / 512")
-    is_small = unit is not None or largest <= _LARGEST_STORED
-    require(is_small, path, f"{found}, too large for pixels / 512", "name the unit m if they are metres")
+    largest = float(np.abs(points).max(initial=0.0))
+    found = f"coordinates up to {largest:g}, too large for {unit or 'pixels / 512'}"
+    is_small = largest <= (_LARGEST_STORED if unit is None else _LARGEST_LENGTH)
+    require(is_small, path, found, "give pixels / 512, or name the unit m if they are metres")
     if unit != "m":
         points *= np.float32(_PIXELS_PER_UNIT)
-    pose_name = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
-    reference = None if pose_name is None else _read_poses(files[pose_name], f"{path}/{pose_name}", len(names))
+    source = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
+    reference = None
+    if source is not None:
+        variables = load_mat(files[source], f"{path}/{source}")
+        found = f"variables are {', '.join(variables) or 'none'}"
+        require("pose" in variables, f"{path}/{source}", found, "the file needs a variable 'pose'")
+        reference = planar_rows(np.asarray(variables["pose"]), len(names), f"{path}/{source}")
     return ScanSequence(Path(path).stem, points, mask, unit or "px", reference)
 
 
@@ -71,15 +74,3 @@ def _list_files(path: Path) -> dict[str, bytes]:
         members = [m for m in archive if m.isfile() and not m.issparse() and m.name.lower().endswith(_SUFFIXES)]
         members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
         return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
-
-
-def _read_poses(content: bytes, source: str, num_scans: int) -> FloatArray:
-    """Reads the (n, 3) array `pose` of a MATLAB file."""
-    variables = load_mat(content, source)
-    found = f"variables are {', '.join(variables) or 'none'}"
-    require("pose" in variables, source, found, "the file needs a variable 'pose'")
-    pose = np.asarray(variables["pose"])
-    is_good = pose.shape == (num_scans, 3) and pose.dtype.kind in "fiu"
-    require(is_good, source, f"pose is {pose.shape} for {num_scans} scans", "give (n, 3) x px, y px, theta rad")
-    require(np.isfinite(pose).all(), source, "pose holds NaN or infinite values", "give a pose to every scan")
-    return pose.astype(np.float64)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
@@ -225,6 +225,27 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
         if bad.any():
             raise InputError(source, f"pose {bad.argmax()} is no rigid motion", "give rotation matrices")
     return poses
+
+
+def planar_rows(values: NDArray[np.generic], num_scans: int, source: str | Path) -> FloatArray:
+    """Converts an array of planar poses to checked rows.
+
+    Args:
+        values: (n, 3) x, y, heading, or homogeneous (n, 3, 3).
+        num_scans: required number of poses.
+        source: source for messages.
+
+    Returns:
+        (n, 3).
+
+    Raises:
+        InputError: another shape, or see `check_poses`.
+    """
+    is_good = values.shape in ((num_scans, 3), (num_scans, 3, 3)) and values.dtype.kind in "fiu"
+    found = f"poses are {values.shape} {values.dtype} for {num_scans} scans"
+    require(is_good, source, found, "give (n, 3) x, y, heading or (n, 3, 3)")
+    poses = check_poses(values.astype(np.float64), source)
+    return poses if poses.ndim == 2 else se2.from_matrix(poses)
 
 
 def interpolate_poses(times: FloatArray, poses: FloatArray, wanted: FloatArray) -> FloatArray:
