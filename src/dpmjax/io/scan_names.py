@@ -6,14 +6,12 @@ import collections
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.io.files import natural_key
 from dpmjax.io.lidar_file import SCAN_SUFFIXES
-from dpmjax.sequences import FloatArray, Note
+from dpmjax.sequences import FloatArray, Note, require
 
 # Usual names of files of reference poses in the lidar's frame.
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
@@ -30,17 +28,16 @@ _LEAST_NUMBERED = 3
 _NUM_KINDS = 4
 
 
-def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
+def scan_files(folder: Path) -> list[Path]:
     """Lists the scans of a folder in the order of their numbers: the files of the most frequent ending.
 
     Args:
         folder: searched folder, without its subfolders.
-        suffixes: endings of scans.
 
     Returns:
         The files, without those that `folder_note` names; none where there is no such folder.
     """
-    most = _files_of_one_ending(folder, suffixes)
+    most = _files_of_one_ending(folder, SCAN_SUFFIXES)
     strays = strays_among(most)
     return sort_scans([file for file in most if file not in strays])
 
@@ -166,30 +163,19 @@ def _counted_stamps(numbers: Sequence[Sequence[str]]) -> FloatArray | None:
     return counted if _LEAST_SPREAD_RATIO * spread < spread_of_decimals else None
 
 
-def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
-    """Returns the numbers in the names of files.
+def last_numbers(files: Sequence[Path]) -> list[int]:
+    """Returns the last number in each name.
 
     Args:
         files: the scans.
-        largest: largest valid number.
 
     Returns:
-        One number a file, or None where a name is no number or too large.
+        One number a file.
+
+    Raises:
+        InputError: a name has no number, or one that is too large.
     """
-    names = [_stem_of(file) for file in files]
-    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
-    return [int(name) for name in names] if is_good else None
-
-
-def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None:
-    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
-
-    Args:
-        rows: (m, ...) values.
-        files: the n scans.
-
-    Returns:
-        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
-    """
-    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
-    return None if numbers is None else rows[list(numbers)]
+    found = [re.findall(r"[0-9]+", _stem_of(file))[-1:] for file in files]
+    bad = next((file for file, number in zip(files, found, strict=True) if not number or int(number[0]) > 2**62), None)
+    require(bad is None, bad or "", "a file name without a number of a scan", "keep the names of the data set")
+    return [int(number) for (number,) in found]
