@@ -49,7 +49,7 @@ class _Header(NamedTuple):
 
     names: list[str]
     record: np.dtype[np.void]
-    count: int
+    num_points: int
     encoding: str
     size: int
 
@@ -154,19 +154,19 @@ def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDA
     kept = [i for i, field in enumerate(fields) if field.itemsize > 0 and header.names[i] != _PADDING]
     if header.encoding == "ascii":
         return _read_text(content, header, kept, source)
-    body, sizes = content[header.size :], [header.count * field.itemsize for field in fields]
+    body, sizes = content[header.size :], [header.num_points * field.itemsize for field in fields]
     columns: dict[str, NDArray[Any]] = {}
-    found = f"truncated or damaged, {header.count} points in {header.encoding} ({{error}})"
+    found = f"truncated or damaged, {header.num_points} points in {header.encoding} ({{error}})"
     with refusing(source, found, _AGAIN, _DAMAGED):
         if header.encoding != "binary_compressed":
-            records = np.frombuffer(body, header.record, header.count)
+            records = np.frombuffer(body, header.record, header.num_points)
             return {header.names[i]: records[f"{i}"][:, 0] for i in kept}
         packed, size = np.frombuffer(body, "<u4", 2).tolist()
         orders = (order for order in (range(len(sizes)), kept) if sum(sizes[i] for i in order) == size)
         order, values, start = next(orders), unpack_lzf(body[8 : 8 + packed], size), 0
         for i in order:
             values_of_field = np.frombuffer(values, fields[i].base, sizes[i] // fields[i].base.itemsize, start)
-            columns[header.names[i]] = values_of_field.reshape(header.count, -1)[:, 0]
+            columns[header.names[i]] = values_of_field.reshape(header.num_points, -1)[:, 0]
             start += sizes[i]
     return columns
 
@@ -174,9 +174,9 @@ def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDA
 def _read_text(content: bytes, header: _Header, kept: list[int], source: str) -> dict[str, NDArray[Any]]:
     """Reads rows of numbers; rows may have numbers for the padding, or leave it out."""
     lines = enumerate(content[header.size :].splitlines(), 1 + content[: header.size].count(b"\n"))
-    rows = [(number, words) for number, line in lines if (words := line.decode("latin-1").split())][: header.count]
-    found = f"truncated: the header promises {header.count} points, {len(rows)} are there"
-    require(len(rows) >= header.count, source, found, _AGAIN)
+    rows = [(number, words) for number, line in lines if (words := line.decode("latin-1").split())][: header.num_points]
+    found = f"truncated: the header promises {header.num_points} points, {len(rows)} are there"
+    require(len(rows) >= header.num_points, source, found, _AGAIN)
     widths = [header.record[i].shape[0] for i in range(len(header.names))]
     table = to_numbers(rows, source) if rows else np.zeros((0, sum(widths)))
     if table.shape[1] == sum(widths[i] for i in kept):

@@ -48,9 +48,8 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
             for intrinsics of images of another size, poses that are no rigid motions, and images without valid pixels.
     """
     folder = Path(path)
-    require(folder.is_dir(), folder, "no such folder", "give a folder of NAME.depth.png files")
     images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
-    require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give at least two")
+    require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give a folder of at least two")
     named = sorted(folder.glob("*intrinsics*.txt"))
     require(len(named) > 0, folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
     poses = [image.with_name(image.name.replace(".depth.png", ".pose.txt")) for image in images]
@@ -58,7 +57,7 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
     found = f"no {next(iter(missing), None)} ({len(missing)} missing)"
     require(len(missing) in (0, len(poses)), folder, found, "give a pose to every image or to none")
     rows, columns = read_depth_png(images[0]).shape
-    fx, fy, cx, cy = _read_matrix(named[0], (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    fx, fy, cx, cy = _read_matrix(named[0], 3)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     advice = "give focal lengths above 0; where one is negative, the x or y axis of its poses points the other way"
     with refusing(named[0], "not a camera ({error})", advice, (ValueError,)):
         camera = Camera(columns, rows, fx, fy, cx, cy)
@@ -68,7 +67,7 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
     points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
     T_world_camera = None
     if not missing:
-        T_world_camera = np.concatenate([check_poses(_read_matrix(pose, (4, 4))[None], pose) for pose in poses])
+        T_world_camera = np.concatenate([check_poses(_read_matrix(pose, 4)[None], pose) for pose in poses])
     return DepthSequence(folder.name, points, mask, False, T_world_camera)
 
 
@@ -95,7 +94,6 @@ def read_active_vision(
     if num_views < 2:
         raise ValueError(f"num_views: expected at least 2, got {num_views}")
     scene = Path(path)
-    require(scene.is_dir(), scene, "no such folder", "give the folder of a scene, such as Home_001_1")
     poses = _read_scene_poses(scene / "image_structs.mat")
     links = _read_links(scene / "annotations.json")
     depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
@@ -175,10 +173,9 @@ def _read_clouds(
     return np.stack(points), np.stack(mask)
 
 
-def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
-    matrix = read_table(path)
-    is_good = matrix.shape == shape and np.isfinite(matrix).all()
-    require(is_good, path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
+def _read_matrix(path: Path, size: int) -> FloatArray:
+    matrix = read_table(path, size)
+    require(len(matrix) == size, path, f"a matrix of {matrix.shape}", f"give {size} x {size} finite numbers")
     return matrix
 
 
@@ -213,9 +210,9 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
 
 
 def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    content, kinds = read_bytes(path), (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError)
+    kinds = (ValueError, AttributeError, RecursionError)
     with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
-        links = json.loads(content)
+        links = json.loads(read_bytes(path))
         return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
 
 

@@ -13,7 +13,6 @@ import logging
 import os
 import pickle
 import re
-import struct
 import subprocess
 import sys
 import zipfile
@@ -31,13 +30,11 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.sequences import FloatArray, InputError, Note, require
 
 _log = logging.getLogger(__name__)
-_MOST_PIXELS = 1 << 26
 # SciPy's reader of MATLAB files ends the process on some damaged ones, so it runs in one of its own.
 _LOAD_MAT = (
     "import io, pickle, sys, scipy.io; "
     "pickle.dump(scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True), sys.stdout.buffer)"
 )
-_MAT_SECONDS = 60
 
 
 @contextmanager
@@ -55,10 +52,12 @@ def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exce
         Nothing.
 
     Raises:
-        InputError: an error of one of these kinds was raised within.
+        InputError: an error of one of these kinds was raised within; an InputError stays as it is.
     """
     try:
         yield
+    except InputError:
+        raise
     except kinds as error:
         found = found.replace("{kind}", type(error).__name__).replace("{error}", str(error))
         raise InputError(source, found, advice) from error
@@ -123,17 +122,18 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
     return path
 
 
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+def natural_key(name: str, number: str = "[0-9]+") -> tuple[tuple[int, float, str], ...]:
     """Returns a sort key under which scan_2 comes before scan_10.
 
     Args:
         name: a file name or path.
+        number: pattern of a number.
 
     Returns:
         The name cut into numbers and text; numbers compare as numbers and come before text.
     """
-    pieces = [piece for piece in re.split(r"(\d+)", name) if piece]
-    return tuple((0, int(p), "") if p.isdecimal() and len(p) < 100 else (1, 0, p) for p in pieces)
+    pieces = [piece for piece in re.split(f"({number})", name) if piece]
+    return tuple((0, float(p), p) if re.fullmatch(number, p) else (1, 0.0, p) for p in pieces)
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -211,24 +211,29 @@ def to_numbers(rows: Sequence[tuple[int, Sequence[str]]], source: str | Path) ->
         raise
 
 
-def read_table(path: str | Path) -> FloatArray:
+def read_table(path: str | Path, width: int | None = None) -> FloatArray:
     """Reads rows of numbers, separated by blanks, commas or semicolons.
 
     Empty lines, lines with # in front, and one line of names above the numbers are left out.
 
     Args:
         path: the file.
+        width: required numbers in a row, all finite; None: any.
 
     Returns:
         (n, k).
 
     Raises:
-        InputError: there is no such file, no row, rows differ in length, or a word is no number.
+        InputError: there is no such file, no row, rows differ in length, a word is no number, or another width.
     """
     rows = [(number, re.sub("[,;]", " ", line).split()) for number, line in enumerate(read_lines(path), 1)]
     rows = [(number, words) for number, words in rows if words and words[0][:1] != "#"]
     has_names = len(rows) > 1 and not any(map(is_number, rows[0][1]))
-    return to_numbers(rows[has_names:], path)
+    table = to_numbers(rows[has_names:], path)
+    is_good = width is None or (table.shape[1] == width and bool(np.isfinite(table).all()))
+    found = f"rows of {table.shape[1]} numbers, or some not finite"
+    require(is_good, path, found, f"give {width} finite numbers a row")
+    return table
 
 
 def to_float32(values: ArrayLike) -> NDArray[np.float32]:
@@ -291,7 +296,7 @@ def load_mat(content: bytes, source: str | Path) -> dict[str, Any]:
     advice = "save it again with -v7, or remove it"
     with refusing(source, "not a readable MATLAB file ({kind})", advice, (Exception,)):
         command = [sys.executable, "-P", "-c", _LOAD_MAT]
-        done = subprocess.run(command, input=content, capture_output=True, check=True, timeout=_MAT_SECONDS)
+        done = subprocess.run(command, input=content, capture_output=True, check=True, timeout=60)
         variables: dict[str, Any] = pickle.loads(done.stdout)
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
@@ -310,16 +315,11 @@ def read_depth_png(path: str | Path) -> NDArray[np.int64]:
     """
     from matplotlib.image import imread
 
-    content, advice = read_bytes(path), "copy the picture again"
-    is_png = content.startswith(b"\x89PNG\r\n\x1a\n") and len(content) >= 25
-    require(is_png, path, "not a readable PNG (no PNG header)", advice)
-    width, height, bits = struct.unpack(">IIB", content[16:25])
-    is_small = 0 < width * height <= _MOST_PIXELS
-    require(is_small, path, f"not a readable PNG (a size of {width} x {height})", advice)
-    # Pillow raises many kinds of errors.
-    with refusing(path, "not a readable PNG ({error})", advice, (Exception,)):
+    content = read_bytes(path)
+    # Pillow raises many kinds of errors, one of them for pictures that would fill the memory.
+    with refusing(path, "not a readable PNG ({error})", "copy the picture again", (Exception,)):
         image = np.asarray(imread(io.BytesIO(content), format="png"), np.float64)
-    is_good = image.ndim == 2 and bits == 16
-    require(is_good, path, f"pixels are {image.shape} of {bits} bits", "give a PNG of one channel of 16 bits")
+    found = f"pixels are {image.shape} of {content[24]} bits"
+    require(image.ndim == 2 and content[24] == 16, path, found, "give a PNG of one channel of 16 bits")
     # matplotlib divides by the largest number of 16 bits.
     return np.rint(image * 65535.0).astype(np.int64)

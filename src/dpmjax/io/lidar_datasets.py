@@ -171,7 +171,7 @@ def _with_kitti_360_poses(root: Path, drive: Drive3D) -> Drive3D:
     path, calibration = root / "data_poses" / drive.name / "poses.txt", root / "calibration"
     if not path.is_file():
         return drive
-    rows = _read_rows(path, "KITTI-360's poses.txt: frame and 12 numbers")
+    rows = read_table(path, 13)  # frame and pose
     cameras = calibration / "calib_cam_to_pose.txt"
     T_imu_cam0 = from_rows(read_labelled(cameras, ("image_00",), 12, "take KITTI-360's calibration folder"), cameras)
     lidar = calibration / "calib_cam_to_velo.txt"
@@ -194,7 +194,7 @@ def _read_carla(folder: Path, drive: Drive3D) -> Drive3D:
     path = drive.files[0].parent.parent / "full_poses_lidar.txt"
     if not path.is_file():
         return drive
-    rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
+    rows = read_table(path, 13)  # pose and time
     at = _CARLA_POSES_PER_FRAME * np.array(last_numbers(drive.files))
     found = f"{len(rows)} rows for {len(at)} frames"
     require(at.max() < len(rows), path, found, f"give {_CARLA_POSES_PER_FRAME} rows a frame")
@@ -216,7 +216,7 @@ def _read_mulran(folder: Path, drive: Drive3D) -> Drive3D:
     drive = drive._replace(times=times)
     if not path.is_file():
         return drive
-    rows = _read_rows(path, "MulRan's global_pose.csv: stamp and 12 numbers")
+    rows = read_table(path, 13)  # stamp and pose
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
@@ -248,14 +248,6 @@ def _first_row(path: Path, width: int) -> FloatArray:
     rows = read_table(path)
     require(rows.shape[1] >= width, path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
     return rows[:1, :width]
-
-
-def _read_rows(path: Path, layout: str) -> FloatArray:
-    """Reads the finite numbers (n, 13) of a pose file."""
-    rows = read_table(path)
-    is_good = rows.shape[1] == 13 and np.isfinite(rows).all()
-    require(is_good, path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
-    return rows
 
 
 def read_labelled(path: Path, names: Sequence[str], count: int, advice: str) -> FloatArray:

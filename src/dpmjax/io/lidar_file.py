@@ -28,7 +28,7 @@ _LEAST_USUAL_SHARE = 0.05
 _MOST_ROWS_OF_TRANSPOSE = 16
 # Points in map coordinates are nearer to their middle than to the origin by this factor.
 _MAP_RATIO = 5.0
-# LAZ packs a point of 20 bytes or more to 3, and to less only where all points are alike. A record has 54 bytes or more.
+# LAZ packs a point of 20 bytes or more to 3, to less only where all points are alike; a record has 54 bytes or more.
 _MOST_POINTS_PER_BYTE, _RECORD_BYTES = 100, 54
 _COLUMN_COUNTS, _USUAL_COLUMNS = (3, 4, 5, 6, 7, 8), 4
 _NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5

@@ -185,10 +185,9 @@ def order_note(times: FloatArray, source: str | Path) -> Note | None:
         The note, or None.
     """
     rows = 1 + np.flatnonzero(np.diff(times) <= 0)
-    if not len(rows):
-        return None
-    found = f"{len(rows)} of {len(times)} times are not later than the one before, the first is that of scan {rows[0]}"
-    return Note(f"{source}: {found}; scans stay in the order of their names, check their times", is_doubt=True)
+    found = f"{len(rows)} of {len(times)} times are not later than the one before, the first is that of scan"
+    advice = "scans stay in the order of their names, check their times"
+    return Note(f"{source}: {found} {rows[0]}; {advice}", is_doubt=True) if len(rows) else None
 
 
 def read_lidar_trajectory(path: str | Path) -> FloatArray:
@@ -268,10 +267,7 @@ def read_relations(path: str | Path) -> Relations:
         InputError: the file is missing, has another number of columns, holds words that are no numbers, or relations
             that leave the plane.
     """
-    table = read_table(path)
-    advice = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
-    require(table.shape[1] == 8, path, f"{table.shape[-1]} numbers a line, not 8", advice)
-    require(bool(np.isfinite(table).all()), path, "NaN or infinite values", "remove the line")
+    table = read_table(path, 8)  # t1 t2 x y z roll pitch yaw
     is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
     require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")
     return Relations(table[:, 0], table[:, 1], table[:, [2, 3, 7]])

@@ -44,14 +44,6 @@ _SAME_POSE = 1e-9  # Largest difference of the numbers of poses that count as th
 _KINDS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError)
 
 
-class _Topic(NamedTuple):
-    """A topic of a bag: its name, type and number of messages, such as /points of sensor_msgs/msg/PointCloud2."""
-
-    name: str
-    kind: str
-    num_messages: int
-
-
 class _Place(NamedTuple):
     """A message in a bag: time of its header, of its recording, and its number among those of the same time, ns."""
 
@@ -61,11 +53,16 @@ class _Place(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """Poses of a frame in its parent: `T_parent_child` (n, 4, 4) at times (n,) s; a single one where it never moves."""
+    """Poses of a frame in its parent: `T_parent_child` (n, 4, 4) at times (n,) s."""
 
     parent: str
     times: FloatArray
     T_parent_child: FloatArray
+
+    @property
+    def is_constant(self) -> bool:
+        """True for a mounting, also where it is published again and again."""
+        return float(np.ptp(self.T_parent_child, axis=0).max()) < _SAME_POSE
 
 
 def is_bag(path: Path) -> bool:
@@ -102,30 +99,28 @@ class _Bag:
             self._reader: Any = highlevel.AnyReader(_bag_files(path), default_typestore=types)
             self._reader.open()
             weakref.finalize(self, self._reader.close)
-            topics = self._reader.topics.items()
-            self.topics = [_Topic(name, str(info.msgtype), int(info.msgcount)) for name, info in topics]
+            # Type and number of messages by name.
+            self.topics = {name: (str(it.msgtype), int(it.msgcount)) for name, it in self._reader.topics.items()}
 
-    def of_kinds(self, kinds: Collection[str]) -> list[_Topic]:
+    def of_kinds(self, kinds: Collection[str]) -> list[str]:
         """Finds the topics of these types that have messages."""
-        return [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
+        return [name for name, (kind, count) in self.topics.items() if kind in kinds and count > 0]
 
-    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> _Topic:
-        """Chooses the topic of scans of these types: the one that the user names, else the only one."""
-        types = {each.name: each.kind.rpartition("/")[2] for each in self.topics}
+    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> tuple[str, str]:
+        """Chooses the topic of scans of these types, and its type: the one that the user names, else the only one."""
+        types = {name: kind.rpartition("/")[2] for name, (kind, _) in self.topics.items()}
         held = ", ".join(f"{name} ({kind})" for name, kind in types.items()) or "none"
-        fitting, advice = self.of_kinds(kinds), "name one with --topic"
-        if not fitting:
-            others = (advice for others, advice in _OTHER_KINDS.items() if set(others) & set(types.values()))
-            advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
-        require(len(fitting) > 0, self.path, f"no {what}; its topics are {held}", advice)
-        if topic is not None:
-            fitting = [each for each in fitting if each.name.strip("/") == topic.strip("/")]
-            is_other = topic.strip("/") in [name.strip("/") for name in types]
-            found = f"topic {topic} has no {what}" if is_other else f"no topic {topic}"
-            require(len(fitting) > 0, self.path, f"{found}, it has {held}", "name one of those with --topic")
-        names = ", ".join(each.name for each in fitting)
-        require(len(fitting) == 1, self.path, f"{len(fitting)} topics of {what}: {names}", advice)
-        return fitting[0]
+        named = [name for name in types if topic is None or name.strip("/") == topic.strip("/")]
+        found = f"no topic {topic}, it has {held}"
+        require(topic is None or len(named) > 0, self.path, found, "name one of those with --topic")
+        fitting = [name for name in self.of_kinds(kinds) if name in named]
+        others = (advice for others, advice in _OTHER_KINDS.items() if {types[name] for name in named} & set(others))
+        advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
+        found = f"no {what}{'' if topic is None else f' in topic {topic}'}; its topics are {held}"
+        require(len(fitting) > 0, self.path, found, advice)
+        found = f"{len(fitting)} topics of {what}: {', '.join(fitting)}"
+        require(len(fitting) == 1, self.path, found, "name one with --topic")
+        return fitting[0], self.topics[fitting[0]][0]
 
     def read(self, topic: str, place: _Place) -> Any:
         """Reads a message at one of the `places` of its topic."""
@@ -189,15 +184,15 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
         InputError: a damaged bag, no topic of planar scans, or several.
     """
     bag = _Bag(path)
-    chosen = bag.choose(_PLANAR_SCANS, topic, "planar scans")
+    chosen, kind = bag.choose(_PLANAR_SCANS, topic, "planar scans")
     with refusing(path, "a broken message ({error})", "record the topic again", _KINDS):
         messages = [
-            (_stamp_of(message), message.header.frame_id.strip("/"), _ends_of(message, chosen.kind))
-            for message in bag.messages(chosen.name)
+            (_stamp_of(message), message.header.frame_id.strip("/"), _ends_of(message, kind))
+            for message in bag.messages(chosen)
         ]
         stamps, frames, scans = zip(*messages, strict=True)
         if min(stamps) <= 0:
-            stamps = tuple(place.stamp_ns * 1e-9 for place in bag.places(chosen.name))
+            stamps = tuple(place.stamp_ns * 1e-9 for place in bag.places(chosen))
         order = np.argsort(stamps, kind="stable")
         times = np.array(stamps)[order]
         T_odom_laser, is_upside_down, notes = _odometry(bag, frames[order[0]], times)
@@ -249,18 +244,15 @@ def _pose_of(position: Any, orientation: Any) -> FloatArray:
 
 
 def _motion_of(parent: str, rows: list[tuple[float, FloatArray]]) -> _Motion:
-    """Makes a motion of poses at times; a mounting that is published again and again has one pose."""
     times, first = np.unique([time for time, _ in rows], return_index=True)
-    poses = np.array([rows[i][1] for i in first])
-    count = 1 if float(np.ptp(poses, axis=0).max()) < _SAME_POSE else len(times)
-    return _Motion(parent, times[:count], poses[:count])
+    return _Motion(parent, times, np.array([rows[i][1] for i in first]))
 
 
 def _transforms(bag: _Bag) -> dict[str, _Motion]:
     """Reads the motion of each frame in its parent, from /tf and /tf_static; of several parents, that of the most."""
     rows: dict[tuple[str, str], list[tuple[float, FloatArray]]] = {}
     for topic in bag.of_kinds(_TRANSFORMS):
-        for message in bag.messages(topic.name):
+        for message in bag.messages(topic):
             for each in message.transforms:
                 T = _pose_of(each.transform.translation, each.transform.rotation)
                 ends = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
@@ -280,25 +272,25 @@ def _odometry(bag: _Bag, frame: str, times: FloatArray) -> tuple[FloatArray | No
         and notes.
     """
     motions, T_top_laser, top = _transforms(bag), np.eye(4), frame
-    is_upside_down = frame in motions and np.median(motions[frame].T_parent_child[:, 2, 2]) < 0
-    for _ in motions:  # not without end, where transforms form a circle
-        if top in motions and len(motions[top].times) == 1 and motions[top].parent not in _MAP_FRAMES:
+    is_upside_down = frame in motions and bool(np.median(motions[frame].T_parent_child[:, 2, 2]) < 0)
+    for _ in range(len(motions)):  # transforms may form a circle
+        if top in motions and motions[top].is_constant and motions[top].parent not in _MAP_FRAMES:
             T_top_laser, top = motions[top].T_parent_child[0] @ T_top_laser, motions[top].parent
-    found, what = motions.get(top), f"the transforms of {top}"
-    if found is None or found.parent in _MAP_FRAMES or not _covers(found.times, times):
+    found, what = motions.get(top), f"odometry of the transforms to {frame}"
+    if found is None or found.is_constant or found.parent in _MAP_FRAMES or not _covers(found.times, times):
         topics = bag.of_kinds(_ODOMETRY)
-        names = ", ".join(topic.name for topic in topics)
+        names = ", ".join(topics)
         if len(topics) != 1:
             text = f"{bag.path}: {len(topics)} topics of odometry ({names}), none is used"
             return None, is_upside_down, (Note(text, is_doubt=True),) if topics else ()
         poses = [(_stamp_of(message), message.pose.pose) for message in bag.messages(names)]
         found = _motion_of("odom", [(stamp, _pose_of(pose.position, pose.orientation)) for stamp, pose in poses])
-        what = f"the odometry of {names}"
+        what = f"odometry of {names}"
     if not _covers(found.times, times):
-        text = f"{bag.path}: {what} is not of the times of the scans; it is not used"
+        text = f"{bag.path}: the {what} is not of the times of the scans; it is not used"
         return None, is_upside_down, (Note(text, is_doubt=True),)
     T = np.asarray(interpolate_poses(found.times, found.T_parent_child, times) @ T_top_laser)
-    return T, bool(np.median(T[:, 2, 2]) < 0), (Note(f"{bag.path}: odometry by {what}"),)
+    return T, bool(np.median(T[:, 2, 2]) < 0), (Note(f"{bag.path}: {what}"),)
 
 
 def _covers(times: FloatArray, wanted: FloatArray) -> bool:
@@ -322,15 +314,15 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
         InputError: a damaged bag, or no topic of clouds, or several.
     """
     bag = _Bag(path)
-    chosen = bag.choose(_CLOUDS, topic, "point clouds")
-    places = bag.places(chosen.name)
+    chosen, kind = bag.choose(_CLOUDS, topic, "point clouds")
+    places = bag.places(chosen)
     times = np.array([place.stamp_ns for place in places], np.float64) * 1e-9
-    sources = tuple(f"{path} {chosen.name} {index}" for index in range(len(places)))
+    sources = tuple(f"{path} {chosen} {index}" for index in range(len(places)))
 
     def read(index: int) -> TimedCloud:
-        message = bag.read(chosen.name, places[index])
+        message = bag.read(chosen, places[index])
         with refusing(sources[index], "a broken message ({error})", "record the topic again", _KINDS):
-            cloud = _cloud_of(message, chosen.kind)
+            cloud = _cloud_of(message, kind)
         return check_scan(cloud, sources[index])
 
     name = path.resolve().stem

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import tarfile
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.carmen import read_carmen_log
-from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.files import load_arrays, log_notes, read_bytes, to_float32
+from dpmjax.io.clouds import parse_pcd
+from dpmjax.io.files import load_arrays, load_mat, log_notes, natural_key, read_bytes, refusing, to_float32
 from dpmjax.io.poses import planar_rows
 from dpmjax.io.scan_bags import is_bag, read_scan_bag
-from dpmjax.sequences import FloatArray, Note, ScanSequence, Unit, counted, require
+from dpmjax.sequences import FloatArray, Note, ScanSequence, Unit, counted, pad_scans, require
 
 Table = Mapping[str, NDArray[np.generic]]
 _FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, a bag of ROS, or .npy / .npz arrays"
@@ -32,6 +33,9 @@ _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask (n, b
 # Largest difference between the third coordinates of planar points.
 _LARGEST_HEIGHT = 1e-3
 _LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
+# The DeepMapping authors' files: coordinates of PCD files are pixels / 512, so that a picture of 2048 pixels has a
+# diagonal of 5.7. Poses are pixels and radians, in the variable `pose`.
+_PIXELS_PER_UNIT, _LARGEST_STORED, _LARGEST_LENGTH, _POSE_FILE = 512.0, 8.0, 1e7, "gt_pose.mat"
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
@@ -102,14 +106,15 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     if not sequence.mask.any():
         return sequence
     ranges = np.where(sequence.mask, np.linalg.norm(sequence.points.astype(np.float64), axis=2), 0.0)
-    limit = (1.0 - _SAME_RANGE) * ranges.max()
-    is_maximum = ranges >= limit
-    num_maxima, share = int(is_maximum.sum()), is_maximum.sum() / max(sequence.mask.sum(), 1)
-    is_code = num_maxima >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
-    if not is_code or (sequence.mask & ~is_maximum).any(axis=1).mean() < _LEAST_OTHERS:
+    is_maximum = ranges >= (1.0 - _SAME_RANGE) * ranges.max()
+    share = is_maximum.sum() / sequence.mask.sum()
+    is_code = (
+        is_maximum.sum() >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
+    )
+    mask = sequence.mask & ~is_maximum
+    if not is_code or mask.any(axis=1).mean() < _LEAST_OTHERS:
         return sequence
     found = f"{100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
-    mask = sequence.mask & (np.linalg.norm(sequence.points, axis=2) < limit)
     points = np.where(mask[..., None], sequence.points, np.float32(0))
     return replace(sequence, mask=mask, points=points, notes=(*sequence.notes, Note(f"{path}: {found}")))
 
@@ -128,12 +133,12 @@ def _check_beams(sequence: ScanSequence, path: Path, numbers: range) -> None:
     num_beams = sequence.mask.shape[1]
     advice = f"give {_LEAST_BEAMS} beams or more; arrays are (scans, beams, 2)"
     require(num_beams >= _LEAST_BEAMS, path, f"scans of {num_beams} beams", advice)
-    empty = np.flatnonzero(~sequence.mask.any(axis=1))
-    found = "every beam of every scan is invalid or at maximum range"
-    require(len(empty) < len(sequence), path, found, "check the ranges")
-    first = numbers[int(empty[0])] if len(empty) else None
-    found = f"{len(empty)} of {len(sequence)} scans have no valid beam, the first is scan {first}"
-    require(first is None, path, found, "remove such scans, or choose others")
+    empty = np.flatnonzero(~sequence.mask.any(axis=1)).tolist()
+    first = [numbers[scan] for scan in empty[:1]]
+    found = (
+        f"{len(empty)} of {len(sequence)} scans have no valid beam below the maximum range, the first is scan {first}"
+    )
+    require(not empty, path, found, "check the ranges, remove such scans, or choose others")
     points = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
     differ = (sequence.points != points[:, None]).any(axis=2) & sequence.mask
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
@@ -177,7 +182,8 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
         InputError: the file is missing or damaged, lacks an array, has wrong shapes, or holds NaN or infinite values
             other than for invalid beams.
     """
-    table, notes = load_arrays(path), ()
+    table = load_arrays(path)
+    notes: tuple[Note, ...] = ()
     if "points" in table:
         points = _take(table, "points", [(-1, -1, 2), (-1, -1, 3)], path)
         heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:]
@@ -231,3 +237,55 @@ def _points_of_ranges(table: Table, path: str | Path) -> tuple[FloatArray, tuple
         notes = (Note(text, is_doubt=True),)
     ranges = np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.nan)
     return ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1), notes
+
+
+def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
+    """Reads a folder or an uncompressed or compressed tar archive of `*.pcd` and `gt_pose.mat`.
+
+    Args:
+        path: the folder, or the archive.
+        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them unchanged, for
+            other PCD scans.
+
+    Returns:
+        The scans in natural order of their names; scans with fewer points than the longest are padded with masked
+        beams; reference poses where there is a `gt_pose.mat`.
+
+    Raises:
+        InputError: no such path, no PCD file, a damaged PCD file, a pose file that does not fit, or
+            coordinates too large for their unit.
+    """
+    files = _list_files(Path(path))
+    names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
+    require(len(names) > 0, path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
+    scans = [parse_pcd(files[name], f"{path}/{name}").points[:, :2] for name in names]
+    for scan in scans:
+        scan[~np.isfinite(scan).all(axis=1) | (scan == 0).all(axis=1)] = np.nan
+    points, mask = pad_scans(scans)
+    largest = float(np.abs(points).max(initial=0.0))
+    found = f"coordinates up to {largest:g}, too large for {unit or 'pixels / 512'}"
+    is_small = largest <= (_LARGEST_STORED if unit is None else _LARGEST_LENGTH)
+    require(is_small, path, found, "give pixels / 512, or name the unit m if they are metres")
+    if unit != "m":
+        points *= np.float32(_PIXELS_PER_UNIT)
+    source = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
+    reference = None
+    if source is not None:
+        variables = load_mat(files[source], f"{path}/{source}")
+        found = f"variables are {', '.join(variables) or 'none'}"
+        require("pose" in variables, f"{path}/{source}", found, "the file needs a variable 'pose'")
+        reference = planar_rows(np.asarray(variables["pose"]), len(names), f"{path}/{source}")
+    return ScanSequence(Path(path).stem, points, mask, unit or "px", reference)
+
+
+def _list_files(path: Path) -> dict[str, bytes]:
+    """Reads the PCD and MAT files by name; archives are read in memory and never unpacked."""
+    if path.is_dir():
+        chosen = [file for file in path.iterdir() if file.name.lower().endswith((".pcd", ".mat"))]
+        return {file.name: read_bytes(file) for file in chosen if file.is_file()}
+    # The parsers of tar, gzip, bzip2 and xz raise many kinds of errors.
+    found, advice = "not a readable tar archive ({error})", "copy the archive again"
+    with refusing(path, found, advice, (Exception,)), tarfile.open(path) as archive:
+        members = [m for m in archive if m.isfile() and not m.issparse() and m.name.lower().endswith((".pcd", ".mat"))]
+        members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
+        return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}
