@@ -36,9 +36,9 @@ def table() -> np.ndarray:
 def test_columns_are_judged_by_the_values(tmp_path: Path, table: np.ndarray, columns: int) -> None:
     path = tmp_path / "0.bin"
     table[:, :columns].tofile(path)  # 1200 points of any number of columns fit all of 3, 4, 5, 6 and 8
-    found = find_columns(path, path.read_bytes())
-    assert found.num_columns == columns
-    assert (found.note is None) == (columns == 4)
+    found, note = find_columns(path, path.read_bytes())
+    assert found == columns
+    assert (note is None) == (columns == 4)
     np.testing.assert_array_equal(read_lidar_file(path), table[:, :3])
 
 
@@ -95,7 +95,7 @@ def test_given_columns_that_the_values_contradict_are_a_doubt(tmp_path: Path, ta
 def test_the_ending_of_nuscenes_tells_where_values_do_not(tmp_path: Path) -> None:
     path = tmp_path / "n015__LIDAR_TOP__1532402927647951.pcd.bin"
     np.random.default_rng(0).normal(0, 10, (NUM, 5)).astype("<f4").tofile(path)
-    assert find_columns(path, path.read_bytes()).num_columns == 5
+    assert find_columns(path, path.read_bytes())[0] == 5
 
 
 def test_one_scan_decides_for_its_drive(tmp_path: Path, table: np.ndarray) -> None:

@@ -187,11 +187,11 @@ def test_scans_of_another_moment_are_put_there_and_their_reference_is_carried_by
     ("line", "found"),
     [
         ("FLASER", "not a FLASER line"),
-        ("FLASER 3 1 2 3 0 0 0", "at least 9 expected"),
+        ("FLASER 3 1 2 3 0 0 0", "not a FLASER line"),
         ("FLASER 2 1 abc 0 0 0 0 0 0 1 h 1", "not a FLASER line"),
         ("FLASER 2 1 nan 0 0 0 0 0 0 1 h 1", "NaN"),
         ("FLASER 2 1 1 0 0 inf 0 0 0 1 h 1", "infinite"),
-        ("FLASER 0 0 0 0 0 0 0 1 h 1", "at least"),
+        ("FLASER 0 0 0 0 0 0 0 1 h 1", "n = 0"),
     ],
 )
 def test_bad_line_is_named_with_its_number(tmp_path, line, found):

@@ -191,12 +191,8 @@ def write_scene(folder, rng):
 
 
 def pcd_bytes(rng, *, kind):
-    """Files of the Point Cloud Library: compressed, padded, or with characters for bytes."""
+    """Files of the Point Cloud Library: compressed, or padded."""
     points = np.round(cloud(rng), 1).astype("<f4")
-    if kind == "characters":
-        head = pcd_header("x y z tag", "4 4 4 1", "F F F U", "1 1 1 1", "ascii", 40)
-        rows = (" ".join(map(str, row)).encode() + bytes([32, rng.integers(256)]) + b"\n" for row in points)
-        return head + b"".join(rows)
     if kind == "compressed":
         return pcd_header("x y z", "4 4 4", "F F F", "1 1 1", "binary_compressed", 40) + compressed(list(points.T))
     records = np.zeros(40, [("p", "<f4", 3), ("a", "u1", 4), ("t", "<f8"), ("b", "u1", 8)])
@@ -284,7 +280,7 @@ LIDAR_FILES = {
     "ascii pcd": write_ascii_pcd,
     "ply": lambda folder, rng: io.write_ply(folder / "0.ply", cloud(rng)),
     "ascii ply": write_ascii_ply,
-    **{f"pcd, {kind}": partial(write_pcd_bytes, kind=kind) for kind in ("compressed", "padded", "characters")},
+    **{f"pcd, {kind}": partial(write_pcd_bytes, kind=kind) for kind in ("compressed", "padded")},
     "las": partial(write_las_file, suffix=".las"),
     "laz": partial(write_las_file, suffix=".laz"),
 }

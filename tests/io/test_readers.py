@@ -93,12 +93,12 @@ def with_value(index, value):
 @pytest.mark.parametrize(
     ("arrays", "found"),
     [
-        ({"points": with_value((0, 1, 0), np.nan)}, "scan 0, beam 1"),
-        ({"points": with_value((2,), np.nan)}, "1 of 6 scans .* scan 2"),
-        ({"points": with_value((), np.nan)}, "every beam"),
-        ({"points": POINTS[0]}, r"give \(n, b, 2\)"),
+        ({"points": with_value((0, 1, 0), np.nan)}, r"scan, beam \[\[0, 1\]\]"),
+        ({"points": with_value((2,), np.nan)}, r"1 of 6 scans .* scan \[2\]"),
+        ({"points": with_value((), np.nan)}, "6 of 6 scans have no valid beam"),
+        ({"points": POINTS[0]}, r"give points \(n, b, 2\)"),
         ({"points": np.concatenate([POINTS, POINTS[..., :1]], axis=2)}, "the third coordinates of the points differ"),
-        ({"points": POINTS[..., :1]}, r"give \(n, b, 2\)"),
+        ({"points": POINTS[..., :1]}, r"give points \(n, b, 2\)"),
         ({"points": POINTS.astype(str)}, "points are"),
         ({"points": np.ones((5, 10, 3))}, "scans of 10 beams"),
         ({"points": np.ones((5, 40, 2))}, "one and the same"),
@@ -110,8 +110,8 @@ def with_value(index, value):
         ({"points": POINTS / 1000}, "median range"),
         ({"points": POINTS, "poses": POSES[:4]}, "poses are"),
         ({"points": POINTS, "poses": POSES * np.nan}, "NaN"),
-        ({"points": POINTS, "mask": np.ones(3, bool)}, "mask is"),
-        ({"points": POINTS, "mask": np.zeros((6, NUM_BEAMS), bool)}, "every beam"),
+        ({"points": POINTS, "mask": np.ones(3, bool)}, "mask are"),
+        ({"points": POINTS, "mask": np.zeros((6, NUM_BEAMS), bool)}, "no valid beam"),
         ({"points": POINTS, "times": np.ones(3)}, "times are"),
         ({"points": POINTS, "unit": "miles"}, "miles"),
         ({"ranges": np.ones((6, NUM_BEAMS)), "angles": np.ones(3)}, "angles"),
@@ -238,7 +238,7 @@ def test_a_scan_in_millimetres_is_warned_of(tmp_path, caplog):
 
 def test_import_is_light():
     heavy = "('scipy', 'jax', 'matplotlib')"
-    code = f"import sys, dpmjax.io as d; d.ScanSequence; print(*[m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, dpmjax.io as d; d.InputError; print(*[m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 

@@ -99,7 +99,7 @@ def test_the_names_of_the_columns_order_the_quaternion(tmp_path, names, is_w_fir
 
 def test_a_row_of_nan_is_named(tmp_path):
     (tmp_path / "a.txt").write_text("0 1 2 3 0 0 0 1\n1 nan nan nan nan nan nan nan\n")
-    with pytest.raises(InputError, match=r"in pose 1; remove its line"):
+    with pytest.raises(InputError, match=r"in pose 1; .*remove its line"):
         read_stamped_poses(tmp_path / "a.txt")
 
 

@@ -1,5 +1,4 @@
 from .clouds import write_ply as write_ply
-from .deepmapping_folder import ScanSequence as ScanSequence
 from .depth import DepthSequence as DepthSequence
 from .depth import is_active_vision as is_active_vision
 from .depth import read_active_vision as read_active_vision
@@ -22,4 +21,5 @@ from .poses import write_poses_npy as write_poses_npy
 from .poses import write_tum as write_tum
 from .references import read_lidar_trajectory as read_lidar_trajectory
 from .references import read_relations as read_relations
+from .scans2d import ScanSequence as ScanSequence
 from .scans2d import read_sequence as read_sequence

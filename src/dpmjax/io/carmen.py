@@ -10,7 +10,6 @@ from __future__ import annotations
 import bisect
 import dataclasses
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,17 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.geometry import se2
-from dpmjax.io.files import read_lines, refusing
+from dpmjax.io.files import is_number, read_lines, refusing
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, pad_scans, require
 
 _log = logging.getLogger(__name__)
-_FLASER = "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp"
-_ROBOTLASER1 = (
-    "a line reads ROBOTLASER1 type start_angle field_of_view step max_range accuracy remission_mode n r1..rn m i1..im "
-    "laser_x laser_y laser_theta robot_x robot_y robot_theta, five more numbers, timestamp host timestamp"
-)
-# Words of a ROBOTLASER1 line before its ranges, and after its poses up to the last time stamp.
-_HEAD, _TAIL = 9, 8
+_FORMS = {
+    "FLASER": "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp",
+    "ROBOTLASER1": (
+        "a line reads ROBOTLASER1 type start_angle field_of_view step max_range accuracy remission_mode n r1..rn m "
+        "i1..im laser_x laser_y laser_theta robot_x robot_y robot_theta, five more numbers, timestamp host timestamp"
+    ),
+}
 _LARGEST_NUMBER = 1e18
 _SHORTEST_SCALE_M = 7.9  # Least range of the code for "no echo" of the lasers of these logs.
 _LONGEST_RANGE_M = 1e6
@@ -70,19 +69,23 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
         InputError: the file cannot be read, has no FLASER and no ROBOTLASER1 line, or one lacks values or holds words
             that are no numbers.
     """
-    lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ("FLASER", "ROBOTLASER1", "ODOM", "NEFF")}
+    lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in (*_FORMS, "ODOM", "NEFF")}
     for number, words in enumerate(map(str.split, read_lines(path)), 1):
         if words and words[0] in lines:
             lines[words[0]].append((number, words))
     is_newer = not lines["FLASER"]
-    found, parse = (lines["ROBOTLASER1"], _parse_newer) if is_newer else (lines["FLASER"], _parse_older)
+    found = lines["ROBOTLASER1"] if is_newer else lines["FLASER"]
     require(len(found) > 0, path, "no FLASER and no ROBOTLASER1 line", "give a CARMEN log of a front laser")
     if not is_newer and lines["ROBOTLASER1"]:
         _log.warning("%s: only its FLASER lines are read, its ROBOTLASER1 lines are left out", path)
-    scans = [parse(words, f"{path}:{number}") for number, words in found]
+    scans = [_parse_scan(words, f"{path}:{number}") for number, words in found]
     largest = max(float(scan.ranges.max()) for scan in scans)
     limit = min(largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf, _LONGEST_RANGE_M)
-    points, mask = pad_scans([_end_points(scan, limit) for scan in scans])
+    ends = []
+    for scan in scans:
+        ranges = np.where((scan.ranges > 0) & (scan.ranges < limit), scan.ranges, np.nan)
+        ends.append(ranges[:, None] * np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]))
+    points, mask = pad_scans(ends)
     times = np.array([scan.time for scan in scans])
     poses, odometry = np.array([scan.pose for scan in scans]), np.array([scan.odometry for scan in scans])
     if is_newer:
@@ -96,11 +99,6 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
     wheels = None if are_equal and reference is not None else odometry
     name = Path(path).name.split(".")[0]
     return _in_order_of_time(ScanSequence(name, points, mask, "m", reference, wheels, times), path)
-
-
-def _end_points(scan: _Scan, limit: float) -> FloatArray:
-    ranges = np.where((scan.ranges > 0) & (scan.ranges < limit), scan.ranges, np.nan)
-    return ranges[:, None] * np.column_stack([np.cos(scan.angles), np.sin(scan.angles)])
 
 
 def scan_angles(num_beams: int) -> FloatArray:
@@ -119,51 +117,42 @@ def scan_angles(num_beams: int) -> FloatArray:
     return -np.pi / 2 + step * np.arange(num_beams, dtype=np.float64)
 
 
-def _parse_older(words: list[str], source: str) -> _Scan:
-    with refusing(source, "not a FLASER line ({error})", _FLASER, (ValueError, IndexError, OverflowError)):
-        count = int(words[1])
-        values = np.array(words[2 : 2 + count + 6], np.float64)
-        time = float(words[count + 8]) if len(words) > count + 8 else 0.0
-    found = f"{len(words) - 2} values after n = {count}, at least {count + 6} expected"
-    require(count >= 1 and len(values) >= count + 6, source, found, _FLASER)
-    _check_numbers(values[:count], [*values[count:], time], source)
-    return _Scan(values[:count], scan_angles(count), values[count : count + 3], values[count + 3 :], time)
-
-
-def _parse_newer(words: list[str], source: str) -> _Scan:
-    with refusing(source, "not a ROBOTLASER1 line ({error})", _ROBOTLASER1, (ValueError, IndexError, OverflowError)):
-        start, step, count = float(words[2]), float(words[4]), int(words[8])
-        ranges: FloatArray = np.array(words[_HEAD : _HEAD + count], np.float64)
-        first = _HEAD + count + 1 + int(words[_HEAD + count])
+def _parse_scan(words: list[str], source: str) -> _Scan:
+    """Reads the words of a FLASER or a ROBOTLASER1 line."""
+    is_newer = words[0] == "ROBOTLASER1"
+    first = 9 if is_newer else 2
+    found, kinds = f"not a {words[0]} line ({{error}})", (ValueError, IndexError, OverflowError)
+    with refusing(source, found, _FORMS[words[0]], kinds):
+        count = int(words[first - 1])
+        if count < 1:
+            raise ValueError(f"n = {count}")
+        ranges, angles = np.array(words[first : first + count], np.float64), scan_angles(count)
+        first += count
+        if is_newer:
+            angles = float(words[2]) + float(words[4]) * np.arange(count, dtype=np.float64)
+            first += 1 + int(words[first])  # after the remissions
+            if not float(words[4]) > 0 or abs(float(words[2])) >= 7:
+                raise ValueError(f"angles from {words[2]} by {words[4]} radians")
         poses = np.array(words[first : first + 6], np.float64)
-        time = float(words[first + 6 + 5]) if len(words) >= first + 6 + _TAIL else 0.0
-    found = f"{len(words)} words for {count} ranges"
-    require(count >= 1 and len(ranges) == count and len(poses) == 6, source, found, _ROBOTLASER1)
-    require(step > 0 and abs(start) < 7, source, f"angles from {start} by {step} radians", _ROBOTLASER1)
-    _check_numbers(ranges, [start, step, *poses, time], source)
-    return _Scan(ranges, start + step * np.arange(count, dtype=np.float64), poses[:3], poses[3:], time)
-
-
-def _check_numbers(ranges: FloatArray, others: Sequence[float], source: str) -> None:
-    is_good = not np.isnan(ranges).any() and bool((np.abs(others) < _LARGEST_NUMBER).all())
-    require(is_good, source, "NaN, infinite or huge values", "remove the line")
+        stamp = first + 11 if is_newer else first + 6
+        time = float(words[stamp]) if len(words) > stamp else 0.0
+        if len(ranges) != count or len(poses) != 6:
+            raise ValueError(f"{len(words)} words for {count} ranges")
+        if np.isnan(ranges).any() or not (np.abs([*angles, *poses, time]) < _LARGEST_NUMBER).all():
+            raise ValueError("NaN, infinite or huge values")
+    return _Scan(ranges, angles, poses[:3], poses[3:], time)
 
 
 def _is_at_wheels(lines: list[list[str]], poses: FloatArray, times: FloatArray) -> bool:
-    """Returns True where most poses lie at an ODOM line beside them in time; damaged lines do not count."""
-    wheels = []
-    for words in lines:
-        try:
-            row = [float(words[7]), *map(float, words[1:4])]
-        except (ValueError, IndexError):
-            continue
-        if np.isfinite(row).all():
-            wheels.append(row)
-    if not wheels:
+    """Returns True if most laser poses coincide with an ODOM line beside them in time; damaged lines do not count."""
+    rows = [(words[7], *words[1:3]) for words in lines if len(words) > 7]
+    wheels = np.array([[float(word) for word in row] for row in rows if all(map(is_number, row))]).reshape(-1, 3)
+    wheels = wheels[np.isfinite(wheels).all(axis=1)]
+    if not len(wheels):
         return False
-    ordered = np.array(sorted(wheels, key=lambda row: row[0]))
+    ordered = wheels[np.argsort(wheels[:, 0], kind="stable")]
     after = np.searchsorted(ordered[:, 0], times)
-    beside = ordered[np.clip([after - 1, after], 0, len(ordered) - 1), 1:3]
+    beside = ordered[np.clip([after - 1, after], 0, len(ordered) - 1), 1:]
     return float(np.median(np.linalg.norm(beside - poses[:, :2], axis=-1).min(axis=0))) < _SAME_PLACE_M
 
 
@@ -178,41 +167,35 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     Returns:
         The scans in the order of time.
     """
-    times, odometry, rows = sequence.times, sequence.odometry_poses, np.arange(len(sequence))
-    assert times is not None
+    times, rows = np.asarray(sequence.times), np.arange(len(sequence))
     if np.ptp(times) == 0:
         return dataclasses.replace(sequence, times=None)
-    is_usual = np.ones(len(rows) - 1, bool) if odometry is None else _are_usual_steps(odometry)
+    given = sequence.odometry_poses
+    odometry = np.zeros((len(rows), 3)) if given is None else given
+    lengths = _step_lengths(odometry[:-1], odometry[1:])
+    is_usual = lengths <= _USUAL_STEP * np.median(lengths)
     times = _with_one_clock(times, is_usual)
     ordered = _longest_ascending(times)
     late = np.setdiff1d(rows, ordered)
     if 2 * len(late) > len(times):
         _log.warning("%s: time stamps are in no order; lines stay in their order, times are dropped", path)
         return dataclasses.replace(sequence, times=None)
+    by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
     moved = np.zeros(len(times), bool)
-    if odometry is not None:
-        by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
-        moved[late] = by_time < _SHORTER_WAY * by_row
+    moved[late] = by_time < _SHORTER_WAY * by_row
     if len(late):
         message = "%s: %d of %d lines are of another moment; %d are moved to their time, the others are interpolated"
         _log.warning(message, path, len(late), len(times), moved.sum())
     known = np.union1d(ordered, np.flatnonzero(moved))
     stamps = np.interp(rows, ordered, times[ordered])
     stamps[known] = times[known]
+    # Lines that join lines in order by usual steps alone have the odometry of their place.
+    piece = np.concatenate([[0], np.cumsum(~is_usual)])
+    is_continuous = np.isin(piece, piece[ordered])
+    odometry = _interpolated(odometry, ordered, np.union1d(known, np.flatnonzero(is_continuous)))
+    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=None if given is None else odometry)
     order = np.argsort(stamps, kind="stable")
-    if odometry is not None:
-        # Lines that join lines in order by usual steps alone have the odometry of their place.
-        piece = np.concatenate([[0], np.cumsum(~is_usual)])
-        is_continuous = np.isin(piece, piece[ordered])
-        odometry = _interpolated(odometry, ordered, np.union1d(known, np.flatnonzero(is_continuous)))
-    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=odometry)
     return _carry_reference(repaired.take(order), moved[order])
-
-
-def _are_usual_steps(odometry: FloatArray) -> BoolArray:
-    """Returns True for steps (n - 1,) of the odometry that are not much longer than half of them."""
-    length = _ways(odometry[:-1], odometry[1:])
-    return np.asarray(length <= _USUAL_STEP * np.median(length))
 
 
 def _with_one_clock(times: FloatArray, is_usual: BoolArray) -> FloatArray:
@@ -234,7 +217,7 @@ def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArr
     return between
 
 
-def _ways(start: FloatArray, end: FloatArray) -> FloatArray:
+def _step_lengths(start: FloatArray, end: FloatArray) -> FloatArray:
     """Computes the lengths of motions, metres and radians added."""
     step = se2.relative(start, end)
     return np.asarray(np.hypot(step[:, 0], step[:, 1]) + np.abs(se2.wrap_angle(step[:, 2])))
@@ -244,11 +227,8 @@ def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.
     """Computes the increase of the path length by each late line, inserted at the position of its key."""
     after = np.searchsorted(keys[ordered], keys[late])
     before, after = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
-
-    def way(start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
-        return _ways(odometry[start], odometry[end])
-
-    return way(before, late) + way(late, after) - way(before, after)
+    start, middle, end = odometry[before], odometry[late], odometry[after]
+    return _step_lengths(start, middle) + _step_lengths(middle, end) - _step_lengths(start, end)
 
 
 def _carry_reference(sequence: ScanSequence, moved: BoolArray) -> ScanSequence:

@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.io.files import natural_key, parse_mat, read_bytes, read_depth_png, read_lines, read_table, refusing
+from dpmjax.io.files import load_mat, natural_key, read_bytes, read_depth_png, read_lines, read_table, refusing
 from dpmjax.io.poses import check_poses
-from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, InputError, require
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, homogeneous, require
 
 _log = logging.getLogger(__name__)
 _NOTHING_MM = 65535  # besides 0
@@ -48,27 +48,26 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
             for intrinsics of images of another size, poses that are no rigid motions, and images without valid pixels.
     """
     folder = Path(path)
-    require(folder.is_dir(), folder, "no such folder", "give a folder of NAME.depth.png files")
     images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
-    require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give at least two")
+    require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give a folder of at least two")
     named = sorted(folder.glob("*intrinsics*.txt"))
     require(len(named) > 0, folder, "no *intrinsics*.txt", "add the 3 x 3 matrix of the depth camera")
-    intrinsics, matrix = named[0], _read_matrix(named[0], (3, 3))
     poses = [image.with_name(image.name.replace(".depth.png", ".pose.txt")) for image in images]
     missing = [pose.name for pose in poses if not pose.is_file()]
     found = f"no {next(iter(missing), None)} ({len(missing)} missing)"
     require(len(missing) in (0, len(poses)), folder, found, "give a pose to every image or to none")
     rows, columns = read_depth_png(images[0]).shape
-    camera = _make_camera(intrinsics, columns, rows, matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
-    found = (
-        f"the optical axis at column {camera.cx:g}, row {camera.cy:g}, beside the images of {columns} x {rows} pixels"
-    )
-    is_inside = 0 < camera.cx < columns - 1 and 0 < camera.cy < rows - 1
-    require(is_inside, intrinsics, found, "give rows fx 0 cx, 0 fy cy, 0 0 1, of the size of the images")
+    fx, fy, cx, cy = _read_matrix(named[0], 3)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    advice = "give focal lengths above 0; where one is negative, the x or y axis of its poses points the other way"
+    with refusing(named[0], "not a camera ({error})", advice, (ValueError,)):
+        camera = Camera(columns, rows, fx, fy, cx, cy)
+    found = f"the optical axis at column {cx:g}, row {cy:g}, beside the images of {columns} x {rows} pixels"
+    is_inside = 0 < cx < columns - 1 and 0 < cy < rows - 1
+    require(is_inside, named[0], found, "give rows fx 0 cx, 0 fy cy, 0 0 1, of the size of the images")
     points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
     T_world_camera = None
     if not missing:
-        T_world_camera = np.concatenate([check_poses(_read_matrix(pose, (4, 4))[None], pose) for pose in poses])
+        T_world_camera = np.concatenate([check_poses(_read_matrix(pose, 4)[None], pose) for pose in poses])
     return DepthSequence(folder.name, points, mask, False, T_world_camera)
 
 
@@ -95,14 +94,13 @@ def read_active_vision(
     if num_views < 2:
         raise ValueError(f"num_views: expected at least 2, got {num_views}")
     scene = Path(path)
-    require(scene.is_dir(), scene, "no such folder", "give the folder of a scene, such as Home_001_1")
     poses = _read_scene_poses(scene / "image_structs.mat")
     links = _read_links(scene / "annotations.json")
     depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
     known = sorted(name for name in poses if name in links and depth_of[name].is_file())
     found = "no image with links, pose and depth"
     require(len(known) > 0, scene, found, "unpack the scene's high_res_depth folder too")
-    names = _walk(known, links, num_views, np.random.default_rng([seed, 13]))
+    names = _draw_walk(known, links, num_views, np.random.default_rng([seed, 13]))
     camera = _read_colmap_camera(scene / "cameras.txt")
     points, mask = _read_clouds([depth_of[name] for name in names], camera, (height, width), max_depth_m)
     return DepthSequence(f"{scene.name}, walk {seed}", points, mask, True, np.stack([poses[name] for name in names]))
@@ -151,10 +149,10 @@ def back_project(
 
 
 def _read_clouds(
-    images: Iterable[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
+    images: Sequence[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
 ) -> tuple[NDArray[np.float32], BoolArray]:
     """Reads points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres; warns of most pixels too deep."""
-    images, clouds, depths = list(images), [], []
+    clouds, depths = [], []
     for image in images:
         depth_mm = read_depth_png(image)
         depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
@@ -167,44 +165,28 @@ def _read_clouds(
     blank = [image for image, one in zip(images, mask, strict=True) if not one.any()]
     # Where most pixels are too deep, the unit is wrong, not an image.
     is_deep = float(np.median(depths)) > max_depth_m
-    require(len(blank) < (1 if is_deep else len(images)), image.parent, found, advice)
+    require(len(blank) < (1 if is_deep else len(images)), images[0].parent, found, advice)
     if is_deep:
-        _log.warning("%s: %s; %s", image.parent, found, advice)
-    if blank:
-        advice = f"leave out such images, {len(blank)} of {len(images)}"
-        raise InputError(blank[0], f"no pixel measures up to {max_depth_m:g} m", advice)
+        _log.warning("%s: %s; %s", images[0].parent, found, advice)
+    which = f"leave out such images, {len(blank)} of {len(images)}"
+    require(not blank, next(iter(blank), ""), f"no pixel measures up to {max_depth_m:g} m", which)
     return np.stack(points), np.stack(mask)
 
 
-def _read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
-    matrix = read_table(path)
-    is_good = matrix.shape == shape and np.isfinite(matrix).all()
-    require(is_good, path, f"a matrix of {matrix.shape}", f"give {shape[0]} x {shape[1]} finite numbers")
+def _read_matrix(path: Path, size: int) -> FloatArray:
+    matrix = read_table(path, size)
+    require(len(matrix) == size, path, f"a matrix of {matrix.shape}", f"give {size} x {size} finite numbers")
     return matrix
 
 
-def _make_camera(path: Path, width: int, height: int, intrinsics: Iterable[float]) -> Camera:
-    """Makes the camera of fx, fy, cx, cy."""
-    values = [float(value) for value in intrinsics]
-    if min(values[:2]) < 0.0:
-        axis = "x" if values[0] < 0.0 else "y"
-        found = f"a negative focal length, {min(values[:2]):g}: the {axis} axis of its poses points the other way"
-        raise InputError(path, found, f"give it without the sign, and turn the {axis} axis of the cameras in all poses")
-    with refusing(path, "not a camera ({error})", "give focal lengths above 0", (ValueError,)):
-        return Camera(width, height, *values)
-
-
-def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
+def _draw_walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
     """Draws the names of the images of a walk; a turn replaces an unavailable move, and the reverse."""
-    is_known = set(known)
-
-    def reachable(name: str, kinds: tuple[str, ...]) -> list[str]:
-        return [links[name][kind] for kind in kinds if links[name].get(kind) in is_known]
-
     name = known[rng.integers(len(known))]
-    names = [name]
+    names, is_known = [name], set(known)
     while len(names) < num_views:
-        moves, turns = reachable(name, _MOVES), reachable(name, _TURNS)
+        moves, turns = (
+            [links[name][kind] for kind in kinds if links[name].get(kind) in is_known] for kinds in (_MOVES, _TURNS)
+        )
         options = moves if (rng.random() < 0.5 and moves) or not turns else turns
         require(len(options) > 0, name, "no neighbour with a depth image and a pose", "unpack the whole scene")
         name = options[rng.integers(len(options))]
@@ -215,24 +197,22 @@ def _walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.rando
 def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
     """Reads T_world_camera of every image with a pose of the reconstruction, metres."""
     poses = {}
-    variables = parse_mat(read_bytes(path), path)
+    variables = load_mat(read_bytes(path), path)
     found, advice = "not the dataset's pose file ({kind})", "copy image_structs.mat of the scene"
     with refusing(path, found, advice, (KeyError, ValueError, TypeError, AttributeError)):
-        scale_m = float(variables["scale"].item()) / 1000.0
+        scale_m = float(variables["scale"]) / 1000.0
         for entry in variables["image_structs"]:
-            R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64).reshape(-1)
-            if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
-                continue  # not placed by the reconstruction
-            T_world_camera = np.eye(4)
-            T_world_camera[:3, :3], T_world_camera[:3, 3] = R.T, -R.T @ t * scale_m
-            poses[str(entry["image_name"])] = T_world_camera
+            R, t = np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64)
+            # Images that the reconstruction has not placed have empty arrays.
+            if R.shape == (3, 3) and t.shape == (3,) and np.isfinite(R).all() and np.isfinite(t).all():
+                poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
     return poses
 
 
 def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    content, kinds = read_bytes(path), (UnicodeDecodeError, json.JSONDecodeError, AttributeError, RecursionError)
+    kinds = (ValueError, AttributeError, RecursionError)
     with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
-        links = json.loads(content)
+        links = json.loads(read_bytes(path))
         return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
 
 
@@ -240,10 +220,8 @@ def _read_colmap_camera(path: Path) -> Camera:
     """Reads size and pinhole part of a COLMAP camera; the dataset's usual one where the file is missing."""
     if not path.is_file():
         return ACTIVE_VISION
-    for line in read_lines(path):
-        words = line.split()
-        if len(words) >= 8 and not line.startswith("#"):
-            found = f"not a camera: {line.strip()} ({{error}})"
-            with refusing(path, found, "give COLMAP's cameras.txt", (ValueError,)):
-                return Camera(int(words[2]), int(words[3]), *(float(word) for word in words[4:8]))
-    raise InputError(path, "no camera in it", "give COLMAP's cameras.txt")
+    lines = (line.split() for line in read_lines(path) if not line.startswith("#"))
+    words = next((words for words in lines if len(words) >= 8), [])
+    found = f"no camera in it, or not a camera: {' '.join(words)} ({{error}})"
+    with refusing(path, found, "give COLMAP's cameras.txt", (ValueError, IndexError)):
+        return Camera(int(words[2]), int(words[3]), *map(float, words[4:8]))

@@ -1,6 +1,6 @@
 """Whole files as bytes, lines, tables and arrays: read with one-line errors, written completely or not at all.
 
-Arrays are those of NumPy, variables of MATLAB, and depth images of 16 bits in PNG files.
+Arrays are those of NumPy, variables of MATLAB (by SciPy), and depth images of 16 bits in PNG files.
 """
 
 from __future__ import annotations
@@ -10,17 +10,18 @@ import gzip
 import importlib
 import io
 import logging
-import math
 import os
+import pickle
 import re
-import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy_format
@@ -29,14 +30,11 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.sequences import FloatArray, InputError, Note, require
 
 _log = logging.getLogger(__name__)
-# A part of a file that unpacks to more than this many times its size has a wrong header: deflate reaches 1032.
-_LARGEST_COMPRESSION = 1100
-_MOST_PIXELS = 1 << 26
-# Codes of MATLAB's files: data elements, categories of arrays, and storage of numbers and text.
-_MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE = range(1, 6)
-_STORAGE = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_STORAGE |= {16: "u1", 17: "u2"}
+# SciPy's reader of MATLAB files ends the process on some damaged ones, so it runs in one of its own.
+_LOAD_MAT = (
+    "import io, pickle, sys, scipy.io; "
+    "pickle.dump(scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True), sys.stdout.buffer)"
+)
 
 
 @contextmanager
@@ -54,10 +52,12 @@ def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exce
         Nothing.
 
     Raises:
-        InputError: an error of one of these kinds was raised within.
+        InputError: an error of one of these kinds was raised within; an InputError stays as it is.
     """
     try:
         yield
+    except InputError:
+        raise
     except kinds as error:
         found = found.replace("{kind}", type(error).__name__).replace("{error}", str(error))
         raise InputError(source, found, advice) from error
@@ -122,17 +122,18 @@ def write_atomically(path: str | Path, content: bytes | str) -> Path:
     return path
 
 
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+def natural_key(name: str, number: str = "[0-9]+") -> tuple[tuple[int, float, str], ...]:
     """Returns a sort key under which scan_2 comes before scan_10.
 
     Args:
         name: a file name or path.
+        number: pattern of a number.
 
     Returns:
         The name cut into numbers and text; numbers compare as numbers and come before text.
     """
-    pieces = [piece for piece in re.split(r"(\d+)", name) if piece]
-    return tuple((0, int(p), "") if p.isdecimal() and len(p) < 100 else (1, 0, p) for p in pieces)
+    pieces = [piece for piece in re.split(f"({number})", name) if piece]
+    return tuple((0, float(p), p) if re.fullmatch(number, p) else (1, 0.0, p) for p in pieces)
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -184,12 +185,11 @@ def is_number(word: str, kind: type[int | float] = float) -> bool:
     return True
 
 
-def to_numbers(rows: Sequence[Sequence[str]], lines: Sequence[int], source: str | Path) -> FloatArray:
+def to_numbers(rows: Sequence[tuple[int, Sequence[str]]], source: str | Path) -> FloatArray:
     """Converts words to numbers.
 
     Args:
-        rows: n rows of k words each.
-        lines: (n,) the line of each row in its file, from 1.
+        rows: n rows: the line in the file, from 1, and its k words.
         source: name of the file, for messages.
 
     Returns:
@@ -199,37 +199,41 @@ def to_numbers(rows: Sequence[Sequence[str]], lines: Sequence[int], source: str 
         InputError: there is no row, rows differ in length, or a word is no number; line and column are named.
     """
     require(len(rows) > 0, source, "no row", "write rows of numbers")
-    for line, row in zip(lines, rows, strict=True):
-        found = f"line {line} has {len(row)} columns, line {lines[0]} has {len(rows[0])}"
-        require(len(row) == len(rows[0]), source, found, "give rows of equal length")
     try:
-        return np.array([[float(word) for word in row] for row in rows])
-    except ValueError as error:
-        words = ((line, column, word) for line, row in zip(lines, rows, strict=True) for column, word in enumerate(row))
-        line, column, word = next(entry for entry in words if not is_number(entry[2]))
-        found = f"line {line}, column {column + 1}: {word[:40]!r} is not a number"
-        raise InputError(source, found, "write plain decimal numbers") from error
+        return np.array([[float(word) for word in words] for _, words in rows])
+    except ValueError:
+        for line, words in rows:
+            found = f"line {line} has {len(words)} columns, line {rows[0][0]} has {len(rows[0][1])}"
+            require(len(words) == len(rows[0][1]), source, found, "give rows of equal length")
+            for column, word in enumerate(words, 1):
+                found = f"line {line}, column {column}: {word[:40]!r} is not a number"
+                require(is_number(word), source, found, "write plain decimal numbers")
+        raise
 
 
-def read_table(path: str | Path) -> FloatArray:
+def read_table(path: str | Path, width: int | None = None) -> FloatArray:
     """Reads rows of numbers, separated by blanks, commas or semicolons.
 
     Empty lines, lines with # in front, and one line of names above the numbers are left out.
 
     Args:
         path: the file.
+        width: required numbers in a row, all finite; None: any.
 
     Returns:
         (n, k).
 
     Raises:
-        InputError: there is no such file, no row, rows differ in length, or a word is no number.
+        InputError: there is no such file, no row, rows differ in length, a word is no number, or another width.
     """
-    lines = [(number, re.sub("[,;]", " ", line).split()) for number, line in enumerate(read_lines(path), 1)]
-    lines = [(number, words) for number, words in lines if words and words[0][:1] != "#"]
-    if len(lines) > 1 and not any(map(is_number, lines[0][1])):
-        lines = lines[1:]
-    return to_numbers([words for _, words in lines], [number for number, _ in lines], path)
+    rows = [(number, re.sub("[,;]", " ", line).split()) for number, line in enumerate(read_lines(path), 1)]
+    rows = [(number, words) for number, words in rows if words and words[0][:1] != "#"]
+    has_names = len(rows) > 1 and not any(map(is_number, rows[0][1]))
+    table = to_numbers(rows[has_names:], path)
+    is_good = width is None or (table.shape[1] == width and bool(np.isfinite(table).all()))
+    found = f"rows of {table.shape[1]} numbers, or some not finite"
+    require(is_good, path, found, f"give {width} finite numbers a row")
+    return table
 
 
 def to_float32(values: ArrayLike) -> NDArray[np.float32]:
@@ -251,28 +255,20 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     Raises:
         InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
     """
-    require(Path(path).exists(), path, "no such file", "check the path")
     require(not Path(path).is_dir(), path, "a folder", "give one file")
-    require(Path(path).stat().st_size > 0, path, "an empty file of 0 bytes", "copy it again")
+    content = read_bytes(path)
+    require(len(content) > 0, path, "an empty file of 0 bytes", "copy it again")
     found, advice = "not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
     # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
-    with refusing(path, found, advice, (Exception,)), Path(path).open("rb") as file:
-        if file.read(6) == npy_format.MAGIC_PREFIX:
-            file.seek(0)
-            return {"points": _parse_npy(file.read())}
-        file.seek(0)
-        with _open_archive(file) as archive:
-            members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+    with refusing(path, found, advice, (Exception,)):
+        if content.startswith(npy_format.MAGIC_PREFIX):
+            return {"points": _parse_npy(content)}
+        if not content.startswith(b"PK"):
+            raise ValueError("it has no header of NumPy")
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
             chosen = [key for key in (members if keys is None else keys) if key in members]
             return {key: _parse_npy(archive.read(members[key])) for key in chosen}
-
-
-def _open_archive(file: BinaryIO) -> zipfile.ZipFile:
-    """Opens an `.npz`; raises a ValueError for a file of another kind."""
-    start = file.read(2)
-    if start != b"PK":
-        raise ValueError("it has no header of NumPy")
-    return zipfile.ZipFile(file)
 
 
 def _parse_npy(content: bytes) -> NDArray[np.generic]:
@@ -283,75 +279,26 @@ def _parse_npy(content: bytes) -> NDArray[np.generic]:
     return values
 
 
-def parse_mat(content: bytes, source: str | Path) -> dict[str, Any]:
-    """Reads the variables of a MATLAB file. SciPy's reader ends the process on some damaged files.
+def load_mat(content: bytes, source: str | Path) -> dict[str, Any]:
+    """Reads the variables of a MATLAB file (of version 4 to 7) by `scipy.io.loadmat`.
 
     Args:
         content: the whole file.
         source: its name, for messages.
 
     Returns:
-        Arrays and text by name; a struct array is a list of dictionaries, a cell array a list.
+        Arrays, text and numbers by name, without axes of length one; a struct is a dictionary, an array of structs a
+        list.
 
     Raises:
-        InputError: no such file format, or a damaged file.
+        InputError: SciPy cannot read the file, or it ends or keeps the process that reads it.
     """
-    # Damage shows as one of many kinds of errors.
-    found, advice = "not a readable MATLAB file ({kind})", "save it again with -v7, or remove it"
-    with refusing(source, found, advice, (Exception,)):
-        order = {b"IM": "<", b"MI": ">"}[content[126:128]]
-        bodies = [body for kind, body in _elements(content[128:], order) if kind == _MATRIX]
-        return dict(_parse_matrix(body, order) for body in bodies)
-
-
-def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """Yields type and content of each data element, unpacked; raises a ValueError where one exceeds its container."""
-    while len(data):
-        kind, size = struct.unpack(f"{order}II", data[:8])
-        start, end = 8, 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
-        if kind >> 16:  # The short form: type, size and four bytes of content in eight bytes.
-            kind, size, start, end = kind & 0xFFFF, kind >> 16, 4, 8
-        if start + size > len(data) or (end == 8 and size > 4):
-            raise ValueError("an element is longer than the file")
-        if kind == _COMPRESSED:
-            limit = _LARGEST_COMPRESSION * (size + 64)
-            yield from _elements(zlib.decompressobj().decompress(data[start : start + size], limit), order)
-        else:
-            yield kind, data[start : start + size]
-        data = data[end:]
-
-
-def _parse_matrix(data: bytes, order: str) -> tuple[str, Any]:
-    """Parses name and value of a matrix element."""
-    if not data:
-        return "", np.zeros(0)
-    (_, flags), (_, size), (_, name), *parts = _elements(data, order)
-    shape = tuple(np.frombuffer(size, f"{order}i4").tolist())
-    category = struct.unpack(f"{order}I", flags[:4])[0] & 0xFF
-    return name.decode("latin-1"), _parse_value(category, parts, shape, order)
-
-
-def _parse_value(category: int, parts: list[tuple[int, bytes]], shape: tuple[int, ...], order: str) -> Any:
-    if category == _CELL:
-        return [_parse_matrix(body, order)[1] for _, body in parts]
-    if category == _STRUCT:
-        width = int(_numbers(parts[0], order)[0])
-        words = [parts[1][1][i : i + width] for i in range(0, len(parts[1][1]), width)]
-        names = [word.partition(b"\0")[0].decode("latin-1") for word in words]
-        values = [_parse_matrix(body, order)[1] for _, body in parts[2:]]
-        if len(values) != math.prod(shape) * len(names):
-            raise ValueError("fields are missing")
-        return [dict(zip(names, values[i : i + len(names)], strict=True)) for i in range(0, len(values), len(names))]
-    if category in (_OBJECT, _SPARSE) or min(shape) < 0:
-        raise ValueError("neither numbers nor text")
-    numbers = _numbers(parts[0], order) if parts else np.zeros(0)
-    if category == _CHAR:
-        return "".join(map(chr, numbers.tolist()))
-    return numbers[: math.prod(shape)].reshape(shape, order="F")
-
-
-def _numbers(element: tuple[int, bytes], order: str) -> NDArray[Any]:
-    return np.frombuffer(element[1], order + _STORAGE[element[0]])
+    advice = "save it again with -v7, or remove it"
+    with refusing(source, "not a readable MATLAB file ({kind})", advice, (Exception,)):
+        command = [sys.executable, "-P", "-c", _LOAD_MAT]
+        done = subprocess.run(command, input=content, capture_output=True, check=True, timeout=60)
+        variables: dict[str, Any] = pickle.loads(done.stdout)
+    return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
 def read_depth_png(path: str | Path) -> NDArray[np.int64]:
@@ -368,16 +315,11 @@ def read_depth_png(path: str | Path) -> NDArray[np.int64]:
     """
     from matplotlib.image import imread
 
-    content, advice = read_bytes(path), "copy the picture again"
-    is_png = content.startswith(b"\x89PNG\r\n\x1a\n") and len(content) >= 25
-    require(is_png, path, "not a readable PNG (no PNG header)", advice)
-    width, height, bits = struct.unpack(">IIB", content[16:25])
-    is_small = 0 < width * height <= _MOST_PIXELS
-    require(is_small, path, f"not a readable PNG (a size of {width} x {height})", advice)
-    # Pillow raises many kinds of errors.
-    with refusing(path, "not a readable PNG ({error})", advice, (Exception,)):
+    content = read_bytes(path)
+    # Pillow raises many kinds of errors, one of them for pictures that would fill the memory.
+    with refusing(path, "not a readable PNG ({error})", "copy the picture again", (Exception,)):
         image = np.asarray(imread(io.BytesIO(content), format="png"), np.float64)
-    is_good = image.ndim == 2 and bits == 16
-    require(is_good, path, f"pixels are {image.shape} of {bits} bits", "give a PNG of one channel of 16 bits")
+    found = f"pixels are {image.shape} of {content[24]} bits"
+    require(image.ndim == 2 and content[24] == 16, path, found, "give a PNG of one channel of 16 bits")
     # matplotlib divides by the largest number of 16 bits.
     return np.rint(image * 65535.0).astype(np.int64)

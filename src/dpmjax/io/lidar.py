@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import log_notes, natural_key
-from dpmjax.io.lidar_datasets import LAYOUTS, Drive3D, find_pose_file, read_learned_folder, read_plain_folder
+from dpmjax.io.lidar_datasets import find_pose_file, is_drive, read_drive
 from dpmjax.io.lidar_file import check_size, columns_of_drive, read_point_times, read_timed_cloud, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, order_note
 from dpmjax.io.scan_bags import is_bag, open_lidar_bag
-from dpmjax.io.scan_names import folder_note, scan_files
+from dpmjax.io.scan_names import folder_note
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
 
 _FORMATS = (
@@ -58,7 +58,7 @@ def open_lidar_sequence(
     path, poses = Path(path), None if poses is None else Path(poses)
     is_good = bin_columns is None or bin_columns >= 3
     require(is_good, path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
-    is_recording = is_bag(path) and not _is_drive(path)
+    is_recording = is_bag(path) and not is_drive(path)
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
     whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
     of_poses = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
@@ -85,7 +85,7 @@ def _with_unit_doubt(sequence: LidarSequence) -> Callable[[int], NDArray[np.floa
 
 def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
     """Opens one drive in files."""
-    drive = _read(path, poses)
+    drive = read_drive(path, poses)
     files = drive.files
     require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
     bin_columns, note = columns_of_drive(files, bin_columns)
@@ -128,7 +128,7 @@ def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = No
         InputError: names the first such file.
     """
     files = [Path(source) for source in sequence.sources if source.lower().endswith(".bin")]
-    columns = bin_columns or columns_of_drive(files).num_columns
+    columns = bin_columns or columns_of_drive(files)[0]
     for file in files:
         try:
             size = file.stat().st_size
@@ -147,7 +147,7 @@ def list_lidar_sequences(path: str | Path) -> list[str]:
         Names for `open_lidar_sequence(path, sequence=name)`, in natural order; none where the path is a drive itself.
     """
     path = Path(path)
-    return [] if not path.is_dir() or _is_drive(path) else sorted(_drives(path), key=natural_key)
+    return [] if not path.is_dir() or is_drive(path) else sorted(_drives(path), key=natural_key)
 
 
 def _choose(path: Path, sequence: str | None) -> Path:
@@ -157,15 +157,15 @@ def _choose(path: Path, sequence: str | None) -> Path:
     converter = "convert it to a bag or to .pcd files with ouster-cli (Ouster) or velodyne-decoder (Velodyne)"
     require(capture is None, path, f"a capture of {capture}, which is not read", converter)
     require(not path.is_file(), path, "a single file", "give the folder that holds all scans of the drive")
-    is_drive = _is_drive(path)
-    if sequence is None and is_drive:
+    is_whole = is_drive(path)
+    if sequence is None and is_whole:
         return path
     drives = _drives(path)
     known = ", ".join(sorted(drives, key=natural_key)[:30])
     if sequence is not None:
-        if sequence not in drives and is_drive and path.resolve().name == sequence:
+        if sequence not in drives and is_whole and path.resolve().name == sequence:
             return path
-        held = f"it has {known}" if drives else "it is one drive without a name" if is_drive else "it has no scans"
+        held = f"it has {known}" if drives else "it is one drive without a name" if is_whole else "it has no scans"
         advice = "name one of those" if drives else "leave the name out, or give another folder"
         require(sequence in drives, path, f"no sequence {sequence}, {held}", advice)
         return drives[sequence]
@@ -180,30 +180,11 @@ def _drives(path: Path) -> dict[str, Path]:
         if (path / below).is_dir():
             return _drives(path / below)
     children = _readable_folders(path)
-    found = {child.name: child for child in children if _is_drive(child)}
+    found = {child.name: child for child in children if is_drive(child)}
     deeper = (folder for child in children for folder in _readable_folders(child))
-    return found or {f"{folder.parent.name}/{folder.name}": folder for folder in deeper if _is_drive(folder)}
+    return found or {f"{folder.parent.name}/{folder.name}": folder for folder in deeper if is_drive(folder)}
 
 
 def _readable_folders(path: Path) -> list[Path]:
     # Others, such as lost+found, are no drives.
     return [child for child in sorted(path.iterdir()) if child.is_dir() and os.access(child, os.R_OK | os.X_OK)]
-
-
-def _is_drive(path: Path) -> bool:
-    """Returns True for a folder of a known layout, or with scans in it or in data/."""
-    is_known = any((path / marker).exists() for marker, _, _ in LAYOUTS)
-    return is_known or bool(scan_files(path) or scan_files(path / "data"))
-
-
-def _read(path: Path, poses: Path | None) -> Drive3D:
-    """Lists the drive in a folder; a given pose file replaces that of the data set."""
-    layout = next((layout for layout in LAYOUTS if (path / layout[0]).exists()), None)
-    if layout is not None and poses is None:
-        return layout[1](path, path / layout[2])
-    files = scan_files(path)
-    if files and files[0].suffix.lower() == ".npz" and layout is None and poses is None:
-        return read_learned_folder(path)
-    beside = "" if files or not scan_files(path / "data") else "data"
-    scans = beside if layout is None else layout[2]
-    return read_plain_folder(path / scans, poses=poses)._replace(name=path.resolve().name)

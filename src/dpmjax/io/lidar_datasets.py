@@ -1,10 +1,10 @@
-"""Drives of 3-D scans in files: plain folders, and data sets in their published layouts."""
+"""Drives of 3-D scans in files: plain folders, and a table of data sets in their published layouts."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ import numpy as np
 from dpmjax.geometry import rigid
 from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
 from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
-from dpmjax.io.references import camera_note, match_poses, match_reference, match_times, matching_note, scan_times
-from dpmjax.io.scan_names import POSE_FILES, match_rows, numbers_of, scan_files
+from dpmjax.io.references import camera_note, match_reference, match_rows, matching_note, scan_times
+from dpmjax.io.scan_names import POSE_FILES, last_numbers, scan_files
 from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
 
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
@@ -23,6 +23,7 @@ _EARTH_RADIUS_M = 6378137.0
 _MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
 _MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
 _MULRAN_SLACK_S = 0.5
+_DATE = r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?"
 
 
 class Drive3D(NamedTuple):
@@ -48,13 +49,14 @@ def find_pose_file(*homes: Path) -> Path | None:
     return next((home / name for home in homes for name in POSE_FILES if (home / name).is_file()), None)
 
 
-def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
-    """Lists a folder of scans in the order of their numbers, with a pose file and times.txt beside or above them.
+def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) -> Drive3D:
+    """Adds the poses of a pose file, and times.txt, beside or above the scans.
 
     Args:
-        folder: the scans.
-        poses: the pose file; None looks for the usual names in the folder and the one above. Poses that move as those
-            of a camera come into the lidar's frame where a calib.txt with `Tr` lies beside.
+        folder: folder of the drive; its scans may lie in a folder of it.
+        drive: name and scans.
+        poses: the pose file; None looks for the usual names in the folders. Poses that move as those of a camera come
+            into the lidar's frame where a calib.txt with `Tr` lies beside.
 
     Returns:
         The drive.
@@ -62,37 +64,36 @@ def read_plain_folder(folder: Path, *, poses: Path | None = None) -> Drive3D:
     Raises:
         InputError: broken files, or poses that match the scans neither by time nor by number.
     """
-    files = scan_files(folder)
-    homes = [folder, folder.resolve().parent] if folder.name in ("data", "scans", "lidar", "velodyne") else [folder]
+    scans = drive.files[0].parent
+    is_below = scans.name in ("data", "scans", "lidar", "velodyne")
+    homes = [scans, scans.resolve().parent] if is_below else [scans]
     path = poses or find_pose_file(*homes)
-    times, notes = scan_times(homes, files)
-    drive = Drive3D(folder.resolve().name, files, None, times, notes)
+    times, notes = scan_times(homes, drive.files)
+    drive = drive._replace(times=times, notes=notes)
     if path is None:
         return drive
     try:
-        T, pose_notes = match_reference(read_stamped_poses(path), times, len(files), path)
+        T, pose_notes = match_reference(read_stamped_poses(path), times, len(drive.files), path)
     except InputError:
         log_notes(notes)  # times.txt may be the reason
         raise
     calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
     if calibration is not None and camera_note(T, path) is not None:
-        T_cam0_lidar = _read_camera_calibration(calibration)
-        T = rigid.inverse(T_cam0_lidar) @ T @ T_cam0_lidar
-    return drive._replace(T_world_lidar=T, notes=(*drive.notes, *pose_notes))
+        T = _from_camera(T, calibration)
+    return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
 
 
-def read_learned_folder(folder: Path) -> Drive3D:
-    """Lists a folder of N.npz with lidar_pcd, ego_rotation and ego_translation (DeepPointMap's published data).
+def _read_learned(folder: Path, drive: Drive3D) -> Drive3D:
+    """Adds the poses in N.npz: lidar_pcd, ego_rotation, ego_translation (DeepPointMap's published data).
 
     Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
 
     Returns:
         The drive.
     """
-    files = scan_files(folder, (".npz",))
     keys = ("ego_rotation", "ego_translation")
     poses: list[FloatArray | None] = []
-    for file in files:
+    for file in drive.files:
         try:
             table = load_arrays(file, keys)
         except InputError:  # The scan is damaged, too, and a warning names it when it is read.
@@ -100,18 +101,17 @@ def read_learned_folder(folder: Path) -> Drive3D:
             continue
         parts = [table.get(key, np.zeros(0)) for key in keys]
         if [part.size for part in parts] != [9, 3] or any(part.dtype.kind not in "fiu" for part in parts):
-            return read_plain_folder(folder)
+            return read_plain_drive(folder, drive)
         poses.append(homogeneous(*(part.astype(np.float64).reshape(3, -1).squeeze() for part in parts)))
-    drive = Drive3D(folder.resolve().name, files)
-    known = next((pose for pose in poses if pose is not None), None)
-    if known is None:
+    known = next((pose for pose in poses if pose is not None), np.full((4, 4), np.nan))
+    if np.isnan(known).all():
         return drive
     stacked = np.stack([known if pose is None else pose for pose in poses])
     return drive._replace(T_world_lidar=check_poses(stacked, folder))
 
 
-def read_kitti_odometry(folder: Path, scans: Path) -> Drive3D:
-    """Lists a sequence of KITTI odometry: velodyne/, times.txt, and poses.
+def _read_kitti(folder: Path, drive: Drive3D) -> Drive3D:
+    """Adds poses and times of KITTI odometry.
 
     Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
     poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up; they need `Tr` in calib.txt. Last
@@ -121,57 +121,45 @@ def read_kitti_odometry(folder: Path, scans: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    files = scan_files(scans)
     # As it was given: the folder may be a link, and the poses lie beside the link.
-    in_lidar, given = folder / "poses_lidar.txt", Path(os.path.abspath(folder))
-    name = given.name
-    in_camera = [folder / "poses.txt", given.parent.parent / "poses" / f"{name}.txt"]
-    drive = Drive3D(name, files, times=match_times(folder / "times.txt", files))
-    path = next((p for p in (in_lidar, *in_camera) if p.is_file()), find_pose_file(folder))
-    if path is None or not files:
+    given = Path(os.path.abspath(folder))
+    in_camera = [folder / "poses.txt", given.parent.parent / "poses" / f"{given.name}.txt"]
+    path = next((p for p in (folder / "poses_lidar.txt", *in_camera) if p.is_file()), find_pose_file(folder))
+    times, notes = scan_times([folder], drive.files)
+    drive = drive._replace(times=times, notes=notes)
+    if path is None:
         return drive
     found = read_stamped_poses(path)
     if path in in_camera:
-        T_cam0_lidar = _read_camera_calibration(folder / "calib.txt")
-        found = found._replace(poses=rigid.inverse(T_cam0_lidar) @ found.poses @ T_cam0_lidar)
+        found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
     if found.stamps is None:
-        return drive._replace(T_world_lidar=match_poses(found.poses, files, path))
-    T, notes = match_reference(found, drive.times, len(files), path)
-    return drive._replace(T_world_lidar=T, notes=notes)
+        return drive._replace(T_world_lidar=match_rows(found.poses, drive.files, path))
+    T, pose_notes = match_reference(found, times, len(drive.files), path)
+    return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
 
 
-def read_velodyne_points(folder: Path, scans: Path) -> Drive3D:
-    """Lists a drive of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
-    files = scan_files(scans)
+def _read_kitti_raw(folder: Path, drive: Drive3D) -> Drive3D:
+    """Adds poses and times of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
+    drive = drive._replace(times=_read_dates(folder / "velodyne_points" / "timestamps.txt", drive.files))
     given = Path(os.path.abspath(folder))
-    drive = Drive3D(given.name, files, times=_read_stamps(scans.parent / "timestamps.txt", files))
-    is_kitti_360 = given.parent.name == "data_3d_raw"
-    return _with_kitti_360_poses(drive, folder) if is_kitti_360 else _with_oxts_poses(drive, folder)
-
-
-def _with_oxts_poses(drive: Drive3D, folder: Path) -> Drive3D:
-    """Adds the poses of KITTI raw: oxts/data, and calib_imu_to_velo.txt in the folder of the day."""
+    if given.parent.name == "data_3d_raw":
+        return _with_kitti_360_poses(given.parent.parent, drive)
     home = folder / "oxts" / "data"
     records = sorted(home.glob("*.txt"), key=lambda record: natural_key(record.name))
-    if not records or not drive.files:
+    if not records:
         return drive
-    candidates = [parent / "calib_imu_to_velo.txt" for parent in (folder, folder.resolve().parent)]
-    calibration = next((path for path in candidates if path.is_file()), None)
-    if calibration is None:
-        advice = "put the calibration of the day (calib_imu_to_velo.txt) into the folder above"
-        raise InputError(folder, "GPS/IMU records but no calib_imu_to_velo.txt", advice)
-    entries = read_labelled_numbers(calibration)
-    turn, shift = entries.get("R", np.zeros(0)), entries.get("T", np.zeros(0))
-    is_good = len(turn) == 9 and len(shift) == 3
-    require(is_good, calibration, "no lines 'R:' of 9 and 'T:' of 3 numbers", "take KITTI's calibration file")
-    T_lidar_imu = check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), calibration)[0]
+    day = next((up for up in (folder, folder.resolve().parent) if (up / "calib_imu_to_velo.txt").is_file()), folder)
+    advice = "put the calibration of the day (calib_imu_to_velo.txt) into the folder above"
+    path = day / "calib_imu_to_velo.txt"
+    turn, shift = read_labelled(path, ("R",), 9, advice), read_labelled(path, ("T",), 3, advice)
+    T_lidar_imu = check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), path)[0]
     T_world_imu = _poses_from_oxts(np.vstack([_first_row(record, 6) for record in records]), home)
     # A drive may lack scans that have a record: poses are matched by number.
-    poses = match_poses(T_world_imu @ rigid.inverse(T_lidar_imu), drive.files, home)
+    poses = match_rows(T_world_imu @ rigid.inverse(T_lidar_imu), drive.files, home)
     return drive._replace(T_world_lidar=rigid.inverse(poses[0]) @ poses)
 
 
-def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
+def _with_kitti_360_poses(root: Path, drive: Drive3D) -> Drive3D:
     """Adds the poses of KITTI-360: data_poses/DRIVE/poses.txt and calibration/ beside data_3d_raw/.
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
@@ -180,24 +168,20 @@ def _with_kitti_360_poses(drive: Drive3D, folder: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    root = Path(os.path.abspath(folder)).parent.parent
-    path = root / "data_poses" / drive.name / "poses.txt"
+    path, calibration = root / "data_poses" / drive.name / "poses.txt", root / "calibration"
     if not path.is_file():
         return drive
-    rows = _read_rows(path, "KITTI-360's poses.txt: frame and 12 numbers")
-    calibration = root / "calibration" / "calib_cam_to_pose.txt"
-    numbers = read_labelled_numbers(calibration).get("image_00", np.zeros(0))
-    require(len(numbers) == 12, calibration, "no line 'image_00:' of 12 numbers", "take KITTI-360's calibration folder")
-    T_imu_cam0 = from_rows(numbers, calibration)
-    calibration = root / "calibration" / "calib_cam_to_velo.txt"
-    T_lidar_cam0 = from_rows(_first_row(calibration, 12), calibration)
-    T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
-    frames = np.array(_require_numbers(drive.files), np.float64)
-    return _interpolate(drive, frames, (rows[:, 0], T_world_lidar), path, how="the numbers of the frames")
+    rows = read_table(path, 13)  # frame and pose
+    cameras = calibration / "calib_cam_to_pose.txt"
+    T_imu_cam0 = from_rows(read_labelled(cameras, ("image_00",), 12, "take KITTI-360's calibration folder"), cameras)
+    lidar = calibration / "calib_cam_to_velo.txt"
+    T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(from_rows(_first_row(lidar, 12), lidar))
+    numbers = np.array(last_numbers(drive.files), np.float64)
+    return _interpolate(drive, numbers, (rows[:, 0], T_world_lidar), path, how="the numbers of the frames")
 
 
-def read_kitti_carla(_folder: Path, scans: Path) -> Drive3D:
-    """Lists a drive of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
+def _read_carla(folder: Path, drive: Drive3D) -> Drive3D:
+    """Adds poses and times of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
     during a turn.
@@ -205,20 +189,20 @@ def read_kitti_carla(_folder: Path, scans: Path) -> Drive3D:
     Returns:
         The drive.
     """
-    files, home = scan_files(scans, (".ply",)), scans.parent.resolve()
-    name = home.parent.name if home.name == "generated" else home.name
-    path = scans.parent / "full_poses_lidar.txt"
+    home = drive.files[0].parent.resolve().parent
+    drive = drive._replace(name=home.parent.name if home.name == "generated" else home.name)
+    path = drive.files[0].parent.parent / "full_poses_lidar.txt"
     if not path.is_file():
-        return Drive3D(name, files)
-    rows = _read_rows(path, "KITTI-CARLA's full_poses_lidar.txt: 12 numbers and a time")
-    endings = [(re.findall(r"\d+", file.stem) or [str(index)])[-1] for index, file in enumerate(files)]
-    at = [_CARLA_POSES_PER_FRAME * int(ending[-9:]) for ending in endings]
-    require(max(at, default=0) < len(rows), path, f"{len(rows)} rows for {len(files)} frames", "give 100 rows a frame")
-    return Drive3D(name, files, from_rows(rows[at, :12], path), rows[at, 12])
+        return drive
+    rows = read_table(path, 13)  # pose and time
+    at = _CARLA_POSES_PER_FRAME * np.array(last_numbers(drive.files))
+    found = f"{len(rows)} rows for {len(at)} frames"
+    require(at.max() < len(rows), path, found, f"give {_CARLA_POSES_PER_FRAME} rows a frame")
+    return drive._replace(T_world_lidar=from_rows(rows[at, :12], path), times=rows[at, 12])
 
 
-def read_mulran(folder: Path, scans: Path) -> Drive3D:
-    """Lists a drive of MulRan: Ouster/STAMP.bin (nanoseconds) and global_pose.csv of the car at 100 Hz.
+def _read_mulran(folder: Path, drive: Drive3D) -> Drive3D:
+    """Adds poses and times of MulRan: Ouster/STAMP.bin (nanoseconds), and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame with a pose. Scans half a second or more outside of the poses have no reference.
 
@@ -227,19 +211,16 @@ def read_mulran(folder: Path, scans: Path) -> Drive3D:
     """
     from scipy.spatial.transform import Rotation
 
-    files = scan_files(scans, (".bin",))
-    stamps = np.array(_require_numbers(files), np.int64)
-    times = (stamps - stamps[:1]).astype(np.float64) * 1e-9
-    drive = Drive3D(folder.resolve().name, files, times=times)
-    path = folder / "global_pose.csv"
-    if not path.is_file() or not len(files):
+    stamps = np.array(last_numbers(drive.files))
+    times, path = (stamps - stamps[0]).astype(np.float64) * 1e-9, folder / "global_pose.csv"
+    drive = drive._replace(times=times)
+    if not path.is_file():
         return drive
-    rows = _read_rows(path, "MulRan's global_pose.csv: stamp and 12 numbers")
+    rows = read_table(path, 13)  # stamp and pose
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
-    T_car_lidar = homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    poses = from_rows(rows[:, 1:], path) @ T_car_lidar
+    poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
     return _interpolate(drive, times, (pose_times, poses), path, how="time", slack=_MULRAN_SLACK_S)
 
 
@@ -254,20 +235,12 @@ def _interpolate(
 ) -> Drive3D:
     """Adds interpolated poses, relative to the first, to the scans within `slack` of the times of the poses."""
     times, first = np.unique(stamped[0], return_index=True)
-    kept = np.flatnonzero((wanted >= times[0] - slack) & (wanted <= times[-1] + slack))
-    require(len(kept) > 0, path, "no scan lies within the times of the poses", "give scans and poses of one drive")
-    found = interpolate_poses(times, stamped[1][first], wanted[kept])
-    T_world_lidar = np.full((len(wanted), 4, 4), np.nan)
+    kept = (wanted >= times[0] - slack) & (wanted <= times[-1] + slack)
+    require(kept.any(), path, "no scan lies within the times of the poses", "give scans and poses of one drive")
+    T = interpolate_poses(times, stamped[1][first], wanted)
     # In the frame of the first, without the 1e6 m of national grids.
-    T_world_lidar[kept] = rigid.inverse(found[0]) @ found
-    return drive._replace(T_world_lidar=T_world_lidar, notes=(*drive.notes, matching_note(path, how, T_world_lidar)))
-
-
-def _require_numbers(files: list[Path]) -> list[int]:
-    numbers = numbers_of(files)
-    if numbers is None:
-        raise InputError(files[0].parent, "a file name that is no number", "keep the names of the data set")
-    return numbers
+    T = np.where(kept[:, None, None], rigid.inverse(T[kept.argmax()]) @ T, np.nan)
+    return drive._replace(T_world_lidar=T, notes=(*drive.notes, matching_note(path, how, T)))
 
 
 def _first_row(path: Path, width: int) -> FloatArray:
@@ -277,46 +250,48 @@ def _first_row(path: Path, width: int) -> FloatArray:
     return rows[:1, :width]
 
 
-def _read_rows(path: Path, layout: str) -> FloatArray:
-    """Reads the finite numbers (n, 13) of a pose file."""
-    rows = read_table(path)
-    is_good = rows.shape[1] == 13 and np.isfinite(rows).all()
-    require(is_good, path, f"rows of {rows.shape[1]} numbers, or some not finite", f"give {layout}")
-    return rows
+def read_labelled(path: Path, names: Sequence[str], count: int, advice: str) -> FloatArray:
+    """Reads the first line `name: numbers` of a calibration file that has one of these names.
 
+    Args:
+        path: the file.
+        names: usual names of the line.
+        count: number of its numbers.
+        advice: see `InputError`.
 
-def read_labelled_numbers(path: Path) -> dict[str, FloatArray]:
-    """Reads the lines `key: numbers` of a calibration file; other lines are ignored."""
-    found = {}
-    for key, _, numbers in (line.partition(":") for line in read_lines(path)):
+    Returns:
+        (count,).
+
+    Raises:
+        InputError: no such file, or no such line.
+    """
+    for key, _, words in (line.partition(":") for line in read_lines(path)):
         try:
-            found[key.strip()] = np.array(numbers.split(), np.float64)
+            numbers = np.array(words.split(), np.float64)
         except ValueError:
             continue
-    return found
+        if key.strip() in names and len(numbers) == count:
+            return numbers
+    raise InputError(path, f"no line '{names[0]}:' of {count} numbers", advice)
 
 
-def _read_camera_calibration(path: Path) -> FloatArray:
-    """Reads `Tr`, the lidar's frame to the left grey camera's, `T_cam0_lidar` (4, 4), out of KITTI's calib.txt."""
-    entries = read_labelled_numbers(path)
-    rows = next((entries[k] for k in ("Tr", "Tr_velo_to_cam", "Tr_velo_cam") if len(entries.get(k, ())) == 12), None)
-    if rows is None:
-        advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
-        raise InputError(path, "no line 'Tr:' of 12 numbers", advice)
-    return np.asarray(from_rows(rows, path)[0])
+def _from_camera(T_world_cam0: FloatArray, path: Path) -> FloatArray:
+    """Converts poses of the left grey camera to those of the lidar by `Tr`, T_cam0_lidar, of KITTI's calib.txt."""
+    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+    T_cam0_lidar = from_rows(read_labelled(path, ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"), 12, advice), path)[0]
+    return np.asarray(rigid.inverse(T_cam0_lidar) @ T_world_cam0 @ T_cam0_lidar)
 
 
-def _read_stamps(path: Path, files: list[Path]) -> FloatArray | None:
+def _read_dates(path: Path, files: list[Path]) -> FloatArray | None:
     """Reads KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337), s from the first; None if it does not fit."""
     try:
         lines = [line.strip() for line in read_lines(path) if line.strip()]
-        if not all(re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", line) for line in lines):
+        if not all(re.fullmatch(_DATE, line) for line in lines):
             return None
-        stamps = np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]")
+        dates = match_rows(np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]"), files, path)
     except ValueError:
         return None
-    matched = match_rows(stamps, files)
-    return None if matched is None or not len(matched) else (matched - matched[0]).astype(np.float64) * 1e-9
+    return (dates - dates[0]).astype(np.float64) * 1e-9
 
 
 def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
@@ -344,12 +319,55 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))
 
 
-# What a folder of a layout holds, the reader of the folder and of its scans, and the place of the scans.
-LAYOUTS: tuple[tuple[str, Callable[[Path, Path], Drive3D], str], ...] = (
-    ("generated/frames", read_kitti_carla, "generated/frames"),
-    ("full_poses_lidar.txt", read_kitti_carla, "frames"),
-    ("Ouster", read_mulran, "Ouster"),
-    ("sensor_data/Ouster", read_mulran, "sensor_data/Ouster"),
-    ("velodyne_points", read_velodyne_points, "velodyne_points/data"),
-    ("velodyne", read_kitti_odometry, "velodyne"),
+class _Layout(NamedTuple):
+    """A published layout: what its folder holds, where the scans lie, and the reader of poses and times."""
+
+    marker: str
+    scans: str
+    read: Callable[[Path, Drive3D], Drive3D]
+
+
+_LAYOUTS = (
+    _Layout("generated/frames", "generated/frames", _read_carla),
+    _Layout("full_poses_lidar.txt", "frames", _read_carla),
+    _Layout("Ouster", "Ouster", _read_mulran),
+    _Layout("sensor_data/Ouster", "sensor_data/Ouster", _read_mulran),
+    _Layout("velodyne_points", "velodyne_points/data", _read_kitti_raw),
+    _Layout("velodyne", "velodyne", _read_kitti),
 )
+
+
+def _layout_of(path: Path) -> _Layout:
+    """Returns the layout of a folder: a published one, or scans right in it or in data/."""
+    scans = "data" if not scan_files(path) and scan_files(path / "data") else ""
+    plain = _Layout("", scans, read_plain_drive)
+    return next((layout for layout in _LAYOUTS if (path / layout.marker).exists()), plain)
+
+
+def is_drive(path: Path) -> bool:
+    """Returns True for a folder of a known layout, or with scans in it or in data/."""
+    layout = _layout_of(path)
+    return bool(layout.marker or scan_files(path / layout.scans))
+
+
+def read_drive(path: Path, poses: Path | None) -> Drive3D:
+    """Lists the drive in a folder.
+
+    Args:
+        path: the folder.
+        poses: a pose file, which replaces that of the data set; or None.
+
+    Returns:
+        The drive; without files where the folder has no scans.
+
+    Raises:
+        InputError: broken files, or poses that do not match the scans.
+    """
+    layout = _layout_of(path)
+    drive = Drive3D(Path(os.path.abspath(path)).name, scan_files(path / layout.scans))
+    if not drive.files:
+        return drive
+    if poses is not None:
+        return read_plain_drive(path, drive, poses)
+    is_learned = layout.scans == "" and drive.files[0].suffix.lower() == ".npz"
+    return (_read_learned if is_learned else layout.read)(path, drive)

@@ -9,7 +9,7 @@ import io
 import struct
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +28,9 @@ _LEAST_USUAL_SHARE = 0.05
 _MOST_ROWS_OF_TRANSPOSE = 16
 # Points in map coordinates are nearer to their middle than to the origin by this factor.
 _MAP_RATIO = 5.0
-_LAS_ADVICE = "copy the file again, or save it anew as LAS 1.2 or 1.4"
-# LAZ packs a point of 20 bytes or more to 3, and to less only where all points are alike.
-_MOST_POINTS_PER_BYTE = 100
-# The least length of a variable length record.
-_RECORD_BYTES = 54
-# Types of the compressed items of a point with fixed lengths, in bytes; byte items have any length.
-_ITEM_BYTES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
-_BYTE_ITEMS = (0, 14)
-_COLUMN_COUNTS = (3, 4, 5, 6, 7, 8)
-_USUAL_COLUMNS = 4
+# LAZ packs a point of 20 bytes or more to 3, to less only where all points are alike; a record has 54 bytes or more.
+_MOST_POINTS_PER_BYTE, _RECORD_BYTES = 100, 54
+_COLUMN_COUNTS, _USUAL_COLUMNS = (3, 4, 5, 6, 7, 8), 4
 _NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
 # Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
 _MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
@@ -88,7 +81,7 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
     """
     path = Path(path)
     is_raw = path.suffix.lower() == ".bin"
-    columns = find_columns(path, read_bytes(path), bin_columns).note if is_raw else None
+    columns = find_columns(path, read_bytes(path), bin_columns)[1] if is_raw else None
     return [note for note in (columns, unit_note(points, path)) if note is not None]
 
 
@@ -116,83 +109,76 @@ def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
     require(not path.is_dir(), path, "a folder", "give one scan file")
     found = f"an unknown kind of scan, {suffix or 'without ending'}"
     require(suffix in SCAN_SUFFIXES, path, found, f"give one of {' '.join(SCAN_SUFFIXES)}")
+    if suffix in (".npy", ".npz"):
+        return check_scan(_read_arrays(path), path)
+    content = read_bytes(path)
     if suffix == ".bin":
-        cloud = TimedCloud(_read_bin(path, bin_columns), None)
-    elif suffix in (".npy", ".npz"):
-        cloud = _read_arrays(path)
+        columns = bin_columns or find_columns(path, content)[0]
+        check_size(path, len(content), columns)
+        cloud = TimedCloud(np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3], None)
     else:
-        parse = {".pcd": parse_pcd, ".ply": parse_ply}.get(suffix, _parse_las)
-        cloud = parse(read_bytes(path), str(path))
+        cloud = {".pcd": parse_pcd, ".ply": parse_ply}.get(suffix, _parse_las)(content, str(path))
     return check_scan(cloud, path)
 
 
 def _read_arrays(path: Path) -> TimedCloud:
     """Reads points and times of a NumPy file."""
     table = load_arrays(path, None if path.suffix.lower() == ".npy" else (*_NPZ_KEYS, _NPZ_TIMES))
-    values = next((table[key] for key in _NPZ_KEYS if key in table), None)
-    if values is None:
-        raise InputError(path, "no array of points", f"call it one of {', '.join(_NPZ_KEYS)}")
+    values = next((table[key] for key in _NPZ_KEYS if key in table), np.zeros(0))
+    found = f"an array of {values.shape} {values.dtype}" if values.size else "no array of points"
     is_good = values.ndim in (2, 3) and values.shape[-1] >= 3 and values.dtype.kind in "fiu"
-    found = f"an array of {values.shape} {values.dtype}"
     is_good = is_good and not (values.ndim == 2 and len(values) < _MOST_ROWS_OF_TRANSPOSE < values.shape[1])
-    require(is_good, path, found, "give points (n, 3), or organised (rows, columns, 3): x, y and z in metres")
-    points = values.reshape(-1, values.shape[-1])
-    times = None
-    if _NPZ_TIMES in table:
-        column = table[_NPZ_TIMES]
-        found = f"times {column.shape} {column.dtype} of {len(points)} points"
-        fits = column.shape in (values.shape[:-1], points.shape[:1]) and column.dtype.kind in "fiu"
+    advice = f"give points (n, 3), or organised (rows, columns, 3), in metres, as one of {', '.join(_NPZ_KEYS)}"
+    require(is_good, path, found, advice)
+    points, times = values.reshape(-1, values.shape[-1])[:, :3], table.get(_NPZ_TIMES)
+    if times is not None:
+        fits = times.shape in (values.shape[:-1], points.shape[:1]) and times.dtype.kind in "fiu"
+        found = f"times {times.shape} {times.dtype} of {len(points)} points"
         require(fits, path, found, "give one time a point")
-        times = np.asarray(column, np.float64).ravel()
-    return TimedCloud(to_float32(points[:, :3]), times)
+        times = times.astype(np.float64).ravel()
+    return TimedCloud(to_float32(points), times)
 
 
 def _parse_las(content: bytes, source: str) -> TimedCloud:
     """Reads the points of a LAS or LAZ file by laspy (extra `las`), with GPS times where the point format has them."""
     laspy = import_for(source, "laspy", "las")
-    require(content[:4] == b"LASF", source, "no LAS header", _LAS_ADVICE)
     options = {"laz_backend": (laspy.LazBackend.Lazrs,), "read_evlrs": False}
+    advice = "copy the file again, or save it anew as LAS 1.2 or 1.4"
     try:
         # Damaged headers raise many kinds of errors.
-        with refusing(source, "not a readable LAS file ({kind}: {error})", _LAS_ADVICE, (Exception,)):
+        with (
+            refusing(source, "not a readable LAS file ({kind}: {error})", advice, (Exception,)),
+            np.errstate(all="ignore"),
+        ):
             header_size, start, num_records = struct.unpack_from("<HII", content, 94)
-            if not header_size + num_records * _RECORD_BYTES <= start <= len(content):
-                found = f"{num_records} records before the points, which begin at byte {start} of {len(content)}"
-                raise ValueError(found)
-            with np.errstate(all="ignore"), laspy.open(io.BytesIO(content), **options) as reader:
-                _require_whole(reader.header, content)
+            if content[:4] != b"LASF" or not header_size + num_records * _RECORD_BYTES <= start <= len(content):
+                raise ValueError("no LAS header, or more records than bytes before the points")
+            with laspy.open(io.BytesIO(content), **options) as reader:
+                _require_points(reader.header, content)
                 cloud = reader.read()
-                points = to_float32(np.stack([cloud.x, cloud.y, cloud.z], axis=1))
-                has_times = "gps_time" in cloud.point_format.dimension_names
-                return TimedCloud(points, np.asarray(cloud.gps_time, np.float64) if has_times else None)
+            has_times = "gps_time" in cloud.point_format.dimension_names
+            points = to_float32(np.stack([cloud.x, cloud.y, cloud.z], axis=1))
+            return TimedCloud(points, np.asarray(cloud.gps_time, np.float64) if has_times else None)
     except BaseException as error:
         # A panic of the decompressor, which is written in Rust, is no Exception.
         if type(error).__name__ == "PanicException":
-            raise InputError(source, f"not a readable LAS file ({error})", _LAS_ADVICE) from error
+            raise InputError(source, f"not a readable LAS file ({error})", advice) from error
         raise
 
 
-def _require_whole(header: Any, content: bytes) -> None:
-    """Raises a ValueError where a file is shorter than its header says, or its compression is damaged."""
-    count, size = int(header.point_count), len(content)
-    start, width = int(header.offset_to_point_data), int(header.point_format.size)
-    is_packed = header.are_points_compressed
-    if not (count <= _MOST_POINTS_PER_BYTE * size if is_packed else start + count * width <= size):
+def _require_points(header: Any, content: bytes) -> None:
+    """Raises a ValueError where a file is shorter than its header says, or has no table of its compressed chunks."""
+    start, size, count = int(header.offset_to_point_data), len(content), int(header.point_count)
+    if not header.are_points_compressed:
+        is_good = start + count * int(header.point_format.size) <= size
+    else:
+        # The decompressor reserves memory by the number in the table, and ends the process where it fails.
+        (place,) = struct.unpack_from("<q", content, start)
+        (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
+        version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
+        is_good = count <= _MOST_POINTS_PER_BYTE * size and version == 0 and num_chunks <= size
+    if not is_good:
         raise ValueError(f"truncated: {count} points, {size} bytes are there")
-    if not is_packed:
-        return
-    # The decompressor reserves memory by the number in the table of chunks, and ends the process where it fails.
-    (place,) = struct.unpack_from("<q", content, start)
-    (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
-    version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
-    if version != 0 or num_chunks > size:
-        raise ValueError("no table of its compressed chunks")
-    record = header.vlrs.get("LasZipVlr")[0].record_data
-    (num_items,) = struct.unpack_from("<H", record, 32)
-    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(num_items)]
-    is_known = all(wide == _ITEM_BYTES.get(kind, wide if kind in _BYTE_ITEMS else None) for kind, wide in items)
-    if not items or not is_known or sum(wide for _, wide in items) != width:
-        raise ValueError(f"points of {width} bytes in compressed items {items}")
 
 
 def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
@@ -216,22 +202,17 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
         why = f": all {len(points)} are zero or not finite" if len(points) else ""
         raise EmptyScanError(source, f"no point in the scan{why}", "remove the file, or copy it again")
     ranges = np.linalg.norm(kept, axis=1)
-    median = float(np.median(ranges))
-    require(median <= _FARTHEST_M, source, *_why_too_far(kept, median))
+    found, advice = f"the median range is {np.median(ranges):.4g} m", "convert millimetres or centimetres to metres"
+    if _is_far_place(kept):
+        at = " ".join(f"{value:.0f}" for value in np.median(kept, axis=0))
+        found = f"{found}, around one place far away: coordinates of a map, such as UTM"
+        advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
+    elif np.median(ranges) > 1000 * _FARTHEST_M:
+        advice = "check the number of columns"
+    require(np.median(ranges) <= _FARTHEST_M, source, found, advice)
     is_near = ((ranges > _NEAREST_M) & (ranges < _FARTHEST_M)).any()
     require(is_near, source, f"all {len(kept)} points are out of range", "give metres in the lidar's own frame")
     return TimedCloud(np.ascontiguousarray(kept, np.float32), None if times is None else times[is_kept])
-
-
-def _why_too_far(points: FloatArray, median: float) -> tuple[str, str]:
-    """Returns finding and advice for a too large median range: map coordinates, another unit, or garbage."""
-    found = f"the median range is {median:.4g} m"
-    if _is_far_place(points):
-        at = " ".join(f"{value:.0f}" for value in np.median(points, axis=0))
-        advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
-        return f"{found}, around one place far away: coordinates of a map, such as UTM", advice
-    is_unit = median < 1000 * _FARTHEST_M
-    return found, "convert millimetres or centimetres to metres" if is_unit else "check the number of columns"
 
 
 def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
@@ -262,20 +243,8 @@ class Float64Error(InputError):
     """A raw file of float64, as all files of its drive are."""
 
 
-class Columns(NamedTuple):
-    """The layout of raw files.
-
-    Attributes:
-        num_columns: number of values of each point, x, y and z first.
-        note: source of the layout, or None for the four columns of KITTI.
-    """
-
-    num_columns: int
-    note: Note | None = None
-
-
-def find_columns(path: Path, content: bytes, given: int | None = None) -> Columns:
-    """Infers the columns of a raw file, or compares given ones with the values.
+def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[int, Note | None]:
+    """Infers the number of columns of a raw file, or compares a given one with the values.
 
     The correct layout has values of one kind in each column, and a wrong one mixes them. So the layout with the largest
     mutual information of column and value is taken. `.pcd.bin` files, as those of nuScenes, have five columns unless
@@ -287,84 +256,67 @@ def find_columns(path: Path, content: bytes, given: int | None = None) -> Column
         given: number of columns; None infers it.
 
     Returns:
-        The layout, with a note where it is not KITTI's, where the values fit another as well, or where they contradict
-        the given one.
+        The number of values of each point, x, y and z first; and a note where it is not KITTI's four, where the values
+        fit another as well, or where they contradict the given one.
 
     Raises:
         Float64Error: the file holds float64, and no layout is given.
         InputError: the file has no whole number of points of the layout, or of any.
     """
-    fitting = [n for n in _COLUMN_COUNTS if len(content) % (4 * n) == 0]
-    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")
+    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")[:_MOST_VALUES]
     inferred = _columns_by_values(values)
     if given is not None:
         text = f"{path}: --columns {given}, but the values look like {inferred} columns a point"
-        return Columns(given, None if inferred in (None, given) else Note(text, is_doubt=True))
+        return given, None if inferred in (None, given) else Note(text, is_doubt=True)
     if _are_doubles(values):
         raise Float64Error(path, "the values are float64", "save them as float32, or the points as .npy")
-    is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING)
-    if inferred is None and is_nuscenes and _NUSCENES_COLUMNS in fitting:
-        return Columns(_NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides"))
+    fitting = [n for n in _COLUMN_COUNTS if len(content) % (4 * n) == 0]
+    is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING) and _NUSCENES_COLUMNS in fitting
+    if inferred is None and is_nuscenes:
+        return _NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides")
     check_size(path, len(content), inferred or _USUAL_COLUMNS)
     if inferred is not None:
         text = f"{path}: {inferred} columns a point, inferred from the values; --columns decides"
-        return Columns(inferred, None if inferred == _USUAL_COLUMNS else Note(text))
+        return inferred, None if inferred == _USUAL_COLUMNS else Note(text)
     others = " or ".join(str(n) for n in fitting if n != _USUAL_COLUMNS)
     text = f"{path}: 4 columns a point are assumed, {others} would fit as well; --columns decides"
-    return Columns(_USUAL_COLUMNS, Note(text, is_doubt=True) if others and content else None)
+    return _USUAL_COLUMNS, Note(text, is_doubt=True) if others and content else None
 
 
 def check_size(path: str | Path, size: int, columns: int) -> None:
     """Refuses a raw file whose size in bytes is no whole number of points: it is cut off, or has other columns."""
     found = f"{size} bytes are no whole number of points of {columns} float32: truncated, or other columns"
-    others = [str(n) for n in _COLUMN_COUNTS if n != columns and size % (4 * n) == 0]
+    others = [str(n) for n in _COLUMN_COUNTS if size % (4 * n) == 0]
     advice = "copy the file again" + (f", or say --columns {' or '.join(others)}" if others else "")
     require(size % (4 * columns) == 0, path, found, advice)
 
 
-def _read_bin(path: Path, columns: int | None) -> NDArray[np.float32]:
-    """Reads x, y and z (n, 3) of a raw file; None infers the number of columns from the values."""
-    content = read_bytes(path)
-    if columns is None:
-        columns = find_columns(path, content).num_columns
-    check_size(path, len(content), columns)
-    return np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3]
-
-
-def columns_of_drive(files: Iterable[Path], given: int | None = None) -> Columns:
+def columns_of_drive(files: Iterable[Path], given: int | None = None) -> tuple[int, Note | None]:
     """Infers or compares the columns of raw files by the first one that can be read; KITTI's where none can."""
     for file in files:
-        if file.suffix.lower() != ".bin":
-            break
         try:
-            content = read_bytes(file)
-            if content:
+            if file.suffix.lower() == ".bin" and (content := read_bytes(file)):
                 return find_columns(file, content, given)
         except Float64Error:
             raise
         except InputError:  # named where it is read
             continue
-    return Columns(given or _USUAL_COLUMNS)
+    return given or _USUAL_COLUMNS, None
 
 
 def _are_doubles(values: NDArray[np.float32]) -> bool:
     """Returns True for coordinates in float64, whose lower halves are bits without a meaning."""
-    halves = values[: min(len(values), _MOST_VALUES) // 2 * 2]
+    halves = values[: len(values) // 2 * 2]
     doubles = halves.view("<f8")
-    is_there = doubles != 0
-    if not is_there.any():
-        return False
+    is_there, (least, most) = doubles != 0, _USUAL_SIZES
     with np.errstate(invalid="ignore"):
-        shares = [
-            float(((_USUAL_SIZES[0] < np.abs(numbers)) & (np.abs(numbers) < _USUAL_SIZES[1])).mean())
-            for numbers in (doubles[is_there], halves[::2][is_there])
-        ]
-    return shares[0] >= _LEAST_DOUBLES and shares[1] <= _MOST_HALVES
+        sizes = [np.abs(numbers[is_there]) for numbers in (doubles, halves[::2])]
+        shares = [((least < each) & (each < most)).sum() / max(len(each), 1) for each in sizes]
+    return bool(shares[0] >= _LEAST_DOUBLES and shares[1] <= _MOST_HALVES)
 
 
 def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     """Finds the layout of the largest mutual information of column and value; None where no layout stands out."""
-    values = values[:_MOST_VALUES]
     num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(_COLUMN_COUNTS)))
     if num_bins < 4:
         return None
@@ -373,12 +325,9 @@ def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
     bins = np.searchsorted(edges, finite, side="right")
     bits = {n: _information_bits(bins, n, len(edges) + 1) for n in _COLUMN_COUNTS}
-    for doubled in (6, 8):
-        if bits[doubled] < _DOUBLED_RATIO * bits[doubled // 2]:
-            del bits[doubled]
-    (best, most), (_, second), *_ = sorted(bits.items(), key=lambda entry: -entry[1])
-    is_clear = most >= _LEAST_BITS and most >= _LEAST_RATIO * second
-    return best if is_clear else None
+    layouts = [n for n in _COLUMN_COUNTS if n not in (6, 8) or bits[n] >= _DOUBLED_RATIO * bits[n // 2]]
+    best, second, *_ = sorted(layouts, key=lambda n: -bits[n])
+    return best if bits[best] >= max(_LEAST_BITS, _LEAST_RATIO * bits[second]) else None
 
 
 def _information_bits(bins: NDArray[np.int64], columns: int, num_bins: int) -> float:

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.geometry import se2
 from dpmjax.io.files import load_arrays, read_lines, read_table, write_atomically
-from dpmjax.sequences import FloatArray, InputError, Unit, counted, homogeneous, require
+from dpmjax.sequences import FloatArray, Unit, counted, homogeneous, require
 
 _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), EuRoC (with its line of names), KITTI (12 numbers a row), or .npy of "
@@ -85,11 +85,11 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         InputError: see `read_poses`; or a wrong count, a different unit, or poses that leave the plane.
     """
     path = Path(path)
-    if path.is_file() and path.suffix.lower() != ".npy":
+    if path.suffix.lower() != ".npy":
         comments = " ".join(line for line in read_lines(path) if line.strip().startswith("#"))
         named = re.search(r"(?:\bunit |\bx_)(px|m)\b", comments)
-        if named and named.group(1) != unit:
-            raise InputError(path, f"poses in {named.group(1)}, the scans are in {unit}", f"give poses in {unit}")
+        stated = unit if named is None else named.group(1)
+        require(stated == unit, path, f"poses in {stated}, the scans are in {unit}", f"give poses in {unit}")
     poses, _ = _read(path)
     found = f"{counted(len(poses), 'pose')} for {num_scans} scans"
     require(len(poses) == num_scans, path, found, "give one pose a scan, in the scans' order")
@@ -213,18 +213,37 @@ def check_poses(poses: FloatArray, source: str | Path) -> FloatArray:
     Raises:
         InputError: names the first bad pose.
     """
-    bad = ~np.isfinite(poses).all(axis=tuple(range(1, poses.ndim)))
-    if bad.any():
-        raise InputError(source, f"NaN or infinite values in pose {bad.argmax()}", "give a pose to every scan")
+    bad = np.flatnonzero(~np.isfinite(poses).all(axis=tuple(range(1, poses.ndim))))
+    found = f"NaN or infinite values in pose {next(iter(bad), None)}"
+    require(not len(bad), source, found, "give a pose to every scan, or remove its line")
     if poses.ndim == 3:
-        dim = poses.shape[2] - 1
-        turn = poses[:, :dim, :dim]
+        turn = poses[:, :-1, :-1]
         with np.errstate(over="ignore", invalid="ignore"):
-            off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(dim)).max(axis=(1, 2))
-            bad = ~(off <= 1e-2) | ~(np.linalg.det(turn) > 0)
-        if bad.any():
-            raise InputError(source, f"pose {bad.argmax()} is no rigid motion", "give rotation matrices")
+            off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(turn.shape[1])).max(axis=(1, 2))
+            bad = np.flatnonzero(~(off <= 1e-2) | ~(np.linalg.det(turn) > 0))
+        require(not len(bad), source, f"pose {next(iter(bad), None)} is no rigid motion", "give rotation matrices")
     return poses
+
+
+def planar_rows(values: NDArray[np.generic], num_scans: int, source: str | Path) -> FloatArray:
+    """Converts an array of planar poses to checked rows.
+
+    Args:
+        values: (n, 3) x, y, heading, or homogeneous (n, 3, 3).
+        num_scans: required number of poses.
+        source: source for messages.
+
+    Returns:
+        (n, 3).
+
+    Raises:
+        InputError: another shape, or see `check_poses`.
+    """
+    is_good = values.shape in ((num_scans, 3), (num_scans, 3, 3)) and values.dtype.kind in "fiu"
+    found = f"poses are {values.shape} {values.dtype} for {num_scans} scans"
+    require(is_good, source, found, "give (n, 3) x, y, heading or (n, 3, 3)")
+    poses = check_poses(values.astype(np.float64), source)
+    return poses if poses.ndim == 2 else se2.from_matrix(poses)
 
 
 def interpolate_poses(times: FloatArray, poses: FloatArray, wanted: FloatArray) -> FloatArray:
@@ -257,8 +276,7 @@ def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
     """Reads checked poses of a file, planar (n, 3) or (n, 4, 4), and the stamps of TUM's rows."""
     if path.suffix.lower() == ".npy":
         array = load_arrays(path).get("points", np.zeros(0))
-        require(array.dtype.kind in "fiu", path, f"an array of {array.dtype}", f"give {_LAYOUTS}")
-        values = array.astype(np.float64)
+        values = array.astype(np.float64) if array.dtype.kind in "fiu" else np.zeros(0)
     else:
         values = read_table(path)
         if values.shape[1] >= 8 and any(map(_IS_W_FIRST.search, read_lines(path))):
@@ -268,18 +286,17 @@ def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
     if values.shape[1:] == (4, 4):
         values = values.reshape(-1, 16)
     width = values.shape[1] if values.ndim == 2 else 0
-    found = f"rows of {width} columns" if width else f"an array of {values.shape}"
+    found = f"rows of {width} columns" if width else "no array of poses"
     require(width in (3, 8, 12, 16) and len(values) > 0, path, found, f"give {_LAYOUTS}")
     if width == 8:
-        return check_poses(_from_tum(values, path), path), values[:, 0]
+        return _from_tum(values, path), values[:, 0]
     return (check_poses(values, path) if width == 3 else from_rows(values[:, :12], path)), None
 
 
 def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
-    bad = ~np.isfinite(rows).all(axis=1)
-    require(not bad.any(), path, f"NaN or infinite values in pose {bad.argmax()}", "remove its line")
+    check_poses(rows, path)
     is_unit = (np.abs(np.linalg.norm(np.clip(rows[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all()
     require(is_unit, path, "quaternions of another length than 1", "write TUM rows: stamp tx ty tz qx qy qz qw")
     return homogeneous(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])

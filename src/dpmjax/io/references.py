@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import read_table
 from dpmjax.io.poses import StampedPoses, interpolate_poses, read_poses
-from dpmjax.io.scan_names import match_rows, stamps_in_names
+from dpmjax.io.scan_names import last_numbers, stamps_in_names
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, counted, require
 
 # Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.
@@ -40,25 +41,27 @@ class Reference(NamedTuple):
     notes: tuple[Note, ...] = ()
 
 
-def match_poses(poses: FloatArray, files: Sequence[Path], path: Path) -> FloatArray:
-    """Returns the pose of each scan, see `match_rows`.
+def match_rows(rows: NDArray[Any], files: Sequence[Path], path: Path) -> NDArray[Any]:
+    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
 
     Args:
-        poses: (m, 4, 4).
+        rows: (m, ...) values.
         files: the n scans.
-        path: path of the poses, for messages.
+        path: file of the rows, for messages.
 
     Returns:
-        (n, 4, 4).
+        (n, ...).
 
     Raises:
-        InputError: another number of poses, and names that are no numbers.
+        InputError: there are more or fewer rows, and names that are no numbers of rows.
     """
-    matched = match_rows(poses, files)
-    if matched is None:
-        found = f"{counted(len(poses), 'pose')} for {len(files)} scans"
-        raise InputError(path, found, "give one pose a scan, in their order")
-    return matched
+    if len(rows) == len(files):
+        return rows
+    is_numbered = all(file.stem.isascii() and file.stem.isdecimal() for file in files)
+    numbers = last_numbers(files) if is_numbered else [len(rows)]
+    found = f"{counted(len(rows), 'row')} for {len(files)} scans"
+    require(max(numbers) < len(rows), path, found, "give one pose and time a scan, in their order")
+    return rows[numbers]
 
 
 def to_seconds(stamps: FloatArray) -> FloatArray:
@@ -73,14 +76,12 @@ def to_seconds(stamps: FloatArray) -> FloatArray:
     Returns:
         (n,) s.
     """
-    if not len(stamps) or not _are_times(stamps):
-        return stamps
-    smallest, steps = float(np.abs(stamps).min()), np.diff(stamps)
+    smallest = float(np.abs(stamps).min(initial=np.inf))
     is_whole = bool((stamps == np.round(stamps)).all())
-    step = float(np.median(np.abs(steps))) if len(steps) else 0.0
+    step = float(np.median(np.abs(np.diff(stamps)))) if len(stamps) > 1 else 0.0
     for per_second, least_stamp, least_step in _UNITS:
         is_step = step >= least_step and (is_whole or per_second > 1e3)
-        if smallest >= least_stamp or (smallest < 1e8 and is_step):
+        if least_stamp <= smallest < _LARGEST_STAMP or (smallest < 1e8 and is_step):
             return stamps / per_second
     return stamps
 
@@ -95,43 +96,19 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     Returns:
         (n,) s or None, and a note where times.txt does not fit.
     """
-    named = stamps_in_names(files)
-    in_names = None if named is None else to_seconds(named)
-    path = next((home / "times.txt" for home in homes if (home / "times.txt").is_file()), None)
-    if path is None:
-        return in_names, ()
-    try:
-        stamps = _stamps_of(read_table(path))
-        if len(stamps) == len(files) and _are_times(stamps):
-            return to_seconds(stamps), ()
-        found = f"{len(stamps)} rows, or some that are no times, for {len(files)} scans"
-    except InputError as error:
-        found = error.found
-    return in_names, (Note(f"{path}: {found}; these times are not used", is_doubt=True),)
-
-
-def _stamps_of(table: FloatArray) -> FloatArray:
-    """Returns the first column of a table that does not number its rows, from 0 or 1; else the first."""
-    rows = np.arange(len(table))
-    columns = (column for column in table.T if not any(np.array_equal(column, rows + first) for first in (0, 1)))
-    return next(columns, table[:, 0])
-
-
-def match_times(path: Path, files: Sequence[Path]) -> FloatArray | None:
-    """Reads the times of the scans of a data set, see `match_rows`; a file that does not fit is ignored.
-
-    Args:
-        path: path of times.txt.
-        files: the n scans.
-
-    Returns:
-        (n,) s, or None.
-    """
-    try:
-        times = match_rows(_stamps_of(read_table(path)), files)
-    except InputError:
-        return None
-    return to_seconds(times) if times is not None and _are_times(times) else None
+    stamps, notes = stamps_in_names(files), []
+    for path in [home / "times.txt" for home in homes if (home / "times.txt").is_file()][:1]:
+        try:
+            table = read_table(path)
+            # A column that numbers the rows from 0 or 1 is no time.
+            numbers = [np.arange(len(table)) + first for first in (0, 1)]
+            columns = (column for column in table.T if not any(np.array_equal(column, each) for each in numbers))
+            stamps = match_rows(next(columns, table[:, 0]), files, path)
+            require(_are_times(stamps), path, "rows that are no times", "give seconds")
+        except InputError as error:
+            stamps = stamps_in_names(files)
+            notes = [Note(f"{path}: {error.found}; these times are not used", is_doubt=True)]
+    return None if stamps is None else to_seconds(stamps), tuple(notes)
 
 
 def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path) -> Reference:
@@ -153,8 +130,9 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
     Raises:
         InputError: no times to match by, and another number of poses than of scans.
     """
-    count = len(found.poses)
-    stamps = found.stamps if found.stamps is not None and _are_times(found.stamps) else None
+    count, stamps = len(found.poses), found.stamps
+    if stamps is not None and not _are_times(stamps):
+        stamps = None
     if stamps is not None and _are_numbers(stamps, times, num_scans):
         T = np.full((num_scans, 4, 4), np.nan)
         T[stamps.astype(np.int64)] = found.poses
@@ -207,10 +185,9 @@ def order_note(times: FloatArray, source: str | Path) -> Note | None:
         The note, or None.
     """
     rows = 1 + np.flatnonzero(np.diff(times) <= 0)
-    if not len(rows):
-        return None
-    found = f"{len(rows)} of {len(times)} times are not later than the one before, the first is that of scan {rows[0]}"
-    return Note(f"{source}: {found}; scans stay in the order of their names, check their times", is_doubt=True)
+    found = f"{len(rows)} of {len(times)} times are not later than the one before, the first is that of scan"
+    advice = "scans stay in the order of their names, check their times"
+    return Note(f"{source}: {found} {rows[0]}; {advice}", is_doubt=True) if len(rows) else None
 
 
 def read_lidar_trajectory(path: str | Path) -> FloatArray:
@@ -290,10 +267,7 @@ def read_relations(path: str | Path) -> Relations:
         InputError: the file is missing, has another number of columns, holds words that are no numbers, or relations
             that leave the plane.
     """
-    table = read_table(path)
-    advice = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
-    require(table.shape[1] == 8, path, f"{table.shape[-1]} numbers a line, not 8", advice)
-    require(bool(np.isfinite(table).all()), path, "NaN or infinite values", "remove the line")
+    table = read_table(path, 8)  # t1 t2 x y z roll pitch yaw
     is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
     require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")
     return Relations(table[:, 0], table[:, 1], table[:, [2, 3, 7]])

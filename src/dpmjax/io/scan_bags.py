@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import se2
@@ -20,9 +19,11 @@ from dpmjax.io.lidar_file import check_scan
 from dpmjax.io.poses import interpolate_poses
 from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, homogeneous, pad_scans, require
 
-_POINT_CLOUD, _LASER_SCAN = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan"
 _LIVOX_CLOUDS = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+_CLOUDS = ("sensor_msgs/msg/PointCloud2", *_LIVOX_CLOUDS)
 _MULTI_ECHO_SCAN = "sensor_msgs/msg/MultiEchoLaserScan"
+_PLANAR_SCANS = ("sensor_msgs/msg/LaserScan", _MULTI_ECHO_SCAN)
+_ODOMETRY, _TRANSFORMS = ("nav_msgs/msg/Odometry",), ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _ADVICE = "copy the bag again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
 # Advice for bags without scans of the wanted kind, by the types that they have.
@@ -33,27 +34,14 @@ _OTHER_KINDS = {
         "raw packets are not read: play them through the driver and record its PointCloud2"
     ),
 }
-_ODOMETRY, _TRANSFORMS = "nav_msgs/msg/Odometry", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 # sensor_msgs/PointField: the numbers of its data types.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Frames whose motion against the robot is the result of a mapping, not odometry.
 _MAP_FRAMES = ("map", "world", "earth")
 # Odometry may end this long before or after a scan, s, for this share of the scans at least.
 _SLACK_S, _LEAST_SHARE = 0.2, 0.9
+_SAME_POSE = 1e-9  # Largest difference of the numbers of poses that count as the same.
 _KINDS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError)
-
-
-class _Topic(NamedTuple):
-    """A topic of a bag: its name, type and number of messages, such as /points of sensor_msgs/msg/PointCloud2."""
-
-    name: str
-    kind: str
-    num_messages: int
-
-    @property
-    def short_kind(self) -> str:
-        """The type without its package."""
-        return self.kind.rpartition("/")[2]
 
 
 class _Place(NamedTuple):
@@ -62,6 +50,19 @@ class _Place(NamedTuple):
     stamp_ns: int
     recorded_ns: int
     number: int
+
+
+class _Motion(NamedTuple):
+    """Poses of a frame in its parent: `T_parent_child` (n, 4, 4) at times (n,) s."""
+
+    parent: str
+    times: FloatArray
+    T_parent_child: FloatArray
+
+    @property
+    def is_constant(self) -> bool:
+        """True for a mounting, also where it is published again and again."""
+        return float(np.ptp(self.T_parent_child, axis=0).max()) < _SAME_POSE
 
 
 def is_bag(path: Path) -> bool:
@@ -98,31 +99,28 @@ class _Bag:
             self._reader: Any = highlevel.AnyReader(_bag_files(path), default_typestore=types)
             self._reader.open()
             weakref.finalize(self, self._reader.close)
-            topics = self._reader.topics.items()
-            self.topics = [_Topic(name, str(info.msgtype), int(info.msgcount)) for name, info in topics]
+            # Type and number of messages by name.
+            self.topics = {name: (str(it.msgtype), int(it.msgcount)) for name, it in self._reader.topics.items()}
 
-    def of_kinds(self, kinds: Collection[str]) -> list[_Topic]:
+    def of_kinds(self, kinds: Collection[str]) -> list[str]:
         """Finds the topics of these types that have messages."""
-        return [each for each in self.topics if each.kind in kinds and each.num_messages > 0]
+        return [name for name, (kind, count) in self.topics.items() if kind in kinds and count > 0]
 
-    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> _Topic:
-        """Chooses the topic of scans of these types: the one that the user names, else the only one."""
-        held = ", ".join(f"{each.name} ({each.short_kind})" for each in self.topics) or "none"
-        fitting = self.of_kinds(kinds)
-        if topic is not None:
-            named = [each for each in self.topics if each.name.strip("/") == topic.strip("/")]
-            found = f"no topic {topic}, it has {held}"
-            require(len(named) > 0, self.path, found, "name one of those with --topic")
-            found = f"topic {topic} has messages {named[0].kind} ({named[0].num_messages})"
-            require(named[0] in fitting, self.path, found, f"name a topic of {what}; the bag has {held}")
-            return named[0]
-        present = {each.short_kind for each in self.topics}
-        advices = (advice for others, advice in _OTHER_KINDS.items() if present.intersection(others))
-        advice = next(advices, "record LaserScan, PointCloud2 or Livox's CustomMsg")
-        require(len(fitting) > 0, self.path, f"no {what}; its topics are {held}", advice)
-        names = ", ".join(each.name for each in fitting)
-        require(len(fitting) == 1, self.path, f"{len(fitting)} topics of {what}: {names}", "name one with --topic")
-        return fitting[0]
+    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> tuple[str, str]:
+        """Chooses the topic of scans of these types, and its type: the one that the user names, else the only one."""
+        types = {name: kind.rpartition("/")[2] for name, (kind, _) in self.topics.items()}
+        held = ", ".join(f"{name} ({kind})" for name, kind in types.items()) or "none"
+        named = [name for name in types if topic is None or name.strip("/") == topic.strip("/")]
+        found = f"no topic {topic}, it has {held}"
+        require(topic is None or len(named) > 0, self.path, found, "name one of those with --topic")
+        fitting = [name for name in self.of_kinds(kinds) if name in named]
+        others = (advice for others, advice in _OTHER_KINDS.items() if {types[name] for name in named} & set(others))
+        advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
+        found = f"no {what}{'' if topic is None else f' in topic {topic}'}; its topics are {held}"
+        require(len(fitting) > 0, self.path, found, advice)
+        found = f"{len(fitting)} topics of {what}: {', '.join(fitting)}"
+        require(len(fitting) == 1, self.path, found, "name one with --topic")
+        return fitting[0], self.topics[fitting[0]][0]
 
     def read(self, topic: str, place: _Place) -> Any:
         """Reads a message at one of the `places` of its topic."""
@@ -168,36 +166,6 @@ def _refusing_bag(path: Path) -> Any:
     return refusing(path, "cannot be read as a bag of ROS ({kind}: {error})", _ADVICE, (Exception,))
 
 
-class _Motions(NamedTuple):
-    """Poses of a frame in its parent: `T_parent_child` (n, 4, 4) at times (n,) s."""
-
-    times: FloatArray
-    T_parent_child: FloatArray
-
-    @classmethod
-    def of(cls, rows: list[tuple[float, FloatArray]]) -> _Motions:
-        times, first = np.unique([time for time, _ in rows], return_index=True)
-        return cls(times, np.array([rows[i][1] for i in first]))
-
-    def once_if_constant(self) -> _Motions:
-        """Returns a single row where all poses are the same, as of a mounting that is published again and again."""
-        is_constant = float(np.ptp(self.T_parent_child, axis=0).max()) < _SAME_POSE
-        return _Motions(self.times[:1], self.T_parent_child[:1]) if is_constant else self
-
-    def at(self, wanted: FloatArray) -> FloatArray:
-        return interpolate_poses(self.times, self.T_parent_child, wanted)
-
-    def covers(self, wanted: FloatArray) -> bool:
-        is_near = (wanted >= self.times[0] - _SLACK_S) & (wanted <= self.times[-1] + _SLACK_S)
-        return len(self.times) > 1 and float(is_near.mean()) >= _LEAST_SHARE
-
-
-# Largest difference of the numbers of poses that count as the same.
-_SAME_POSE = 1e-9
-
-_Edges = dict[str, tuple[str, _Motions]]
-
-
 def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
     """Reads the planar scans of a bag.
 
@@ -216,28 +184,22 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
         InputError: a damaged bag, no topic of planar scans, or several.
     """
     bag = _Bag(path)
-    chosen = bag.choose((_LASER_SCAN, _MULTI_ECHO_SCAN), topic, "planar scans")
+    chosen, kind = bag.choose(_PLANAR_SCANS, topic, "planar scans")
     with refusing(path, "a broken message ({error})", "record the topic again", _KINDS):
-        frames, stamps, scans = [], [], []
-        for message in bag.messages(chosen.name):
-            frames.append(message.header.frame_id.strip("/"))
-            stamps.append(_stamp_of(message))
-            scans.append(_ends_of(message, chosen.kind))
+        messages = [
+            (_stamp_of(message), message.header.frame_id.strip("/"), _ends_of(message, kind))
+            for message in bag.messages(chosen)
+        ]
+        stamps, frames, scans = zip(*messages, strict=True)
         if min(stamps) <= 0:
-            stamps = [place.stamp_ns * 1e-9 for place in bag.places(chosen.name)]
+            stamps = tuple(place.stamp_ns * 1e-9 for place in bag.places(chosen))
         order = np.argsort(stamps, kind="stable")
-        times, frame = np.array(stamps)[order], frames[order[0]]
-        edges = _transforms(bag)
-        T_odom_laser, note = _odometry(bag, edges, frame, times)
+        times = np.array(stamps)[order]
+        T_odom_laser, is_upside_down, notes = _odometry(bag, frames[order[0]], times)
     points, mask = pad_scans([scans[index] for index in order])
-    odometry = None
-    # The z axis of the laser points down, in the odometry or on the robot.
-    upright = edges[frame][1].T_parent_child if frame in edges else np.eye(4)[None]
-    if T_odom_laser is not None:
-        upright, odometry = T_odom_laser, se2.from_matrix(T_odom_laser[:, [[0], [1], [3]], [0, 1, 3]])
-    if np.median(upright[:, 2, 2]) < 0:
+    if is_upside_down:
         points = points * np.array([1, -1], np.float32)
-    notes = () if note is None else (note,)
+    odometry = None if T_odom_laser is None else se2.from_matrix(T_odom_laser[:, [[0], [1], [3]], [0, 1, 3]])
     return ScanSequence(path.resolve().stem, points, mask, "m", None, odometry, times, notes)
 
 
@@ -281,47 +243,59 @@ def _pose_of(position: Any, orientation: Any) -> FloatArray:
     return homogeneous(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
 
 
-def _transforms(bag: _Bag) -> _Edges:
-    """Reads the parent of each frame, and the pose of the frame in the parent, from /tf and /tf_static."""
+def _motion_of(parent: str, rows: list[tuple[float, FloatArray]]) -> _Motion:
+    times, first = np.unique([time for time, _ in rows], return_index=True)
+    return _Motion(parent, times, np.array([rows[i][1] for i in first]))
+
+
+def _transforms(bag: _Bag) -> dict[str, _Motion]:
+    """Reads the motion of each frame in its parent, from /tf and /tf_static; of several parents, that of the most."""
     rows: dict[tuple[str, str], list[tuple[float, FloatArray]]] = {}
     for topic in bag.of_kinds(_TRANSFORMS):
-        for message in bag.messages(topic.name):
+        for message in bag.messages(topic):
             for each in message.transforms:
                 T = _pose_of(each.transform.translation, each.transform.rotation)
                 ends = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
                 rows.setdefault(ends, []).append((_stamp_of(each), T))
-    # Of a frame with several parents, the one of the most transforms.
     ordered = sorted(rows.items(), key=lambda entry: len(entry[1]))
-    return {child: (parent, _Motions.of(found).once_if_constant()) for (parent, child), found in ordered}
+    return {child: _motion_of(parent, found) for (parent, child), found in ordered}
 
 
-def _odometry(bag: _Bag, edges: _Edges, frame: str, times: FloatArray) -> tuple[FloatArray | None, Note | None]:
-    """Returns `T_odom_laser` at the times of the scans, None where the bag has no odometry, and a note on it."""
-    T, moving, seen, top = np.tile(np.eye(4), (len(times), 1, 1)), False, {frame}, frame
-    while top in edges and edges[top][0] not in (*_MAP_FRAMES, *seen):
-        parent, motions = edges[top]
-        if len(motions.times) > 1:
-            if not motions.covers(times):
-                break
-            moving = True
-        T = motions.at(times) @ T
-        top = parent
-        seen.add(top)
-    if moving:
-        return T, Note(f"{bag.path}: odometry of the transforms from {top} to {frame}")
-    topics = bag.of_kinds((_ODOMETRY,))
-    if len(topics) != 1:
-        names = ", ".join(topic.name for topic in topics)
-        text = f"{bag.path}: {len(topics)} topics of odometry ({names}), none is used"
-        return None, Note(text, is_doubt=True) if topics else None
-    name = topics[0].name
-    poses = [(_stamp_of(message), message.pose.pose) for message in bag.messages(name)]
-    motions = _Motions.of([(stamp, _pose_of(pose.position, pose.orientation)) for stamp, pose in poses])
-    if not motions.covers(times):
-        text = f"{bag.path}: the odometry of {name} is not of the times of the scans; it is not used"
-        return None, Note(text, is_doubt=True)
-    # The traversed transforms are constant: the pose of the laser on the robot.
-    return np.asarray(motions.at(times) @ T), Note(f"{bag.path}: odometry of {name}")
+def _odometry(bag: _Bag, frame: str, times: FloatArray) -> tuple[FloatArray | None, bool, tuple[Note, ...]]:
+    """Computes the odometry of the laser: the motion of the robot after the chain of constant transforms to the laser.
+
+    The motion of the robot is that of the transforms where they have the times of the scans, else that of the only
+    topic of Odometry.
+
+    Returns:
+        T_odom_laser at the times of the scans, None where the bag has no odometry; True where the laser is upside down;
+        and notes.
+    """
+    motions, T_top_laser, top = _transforms(bag), np.eye(4), frame
+    is_upside_down = frame in motions and bool(np.median(motions[frame].T_parent_child[:, 2, 2]) < 0)
+    for _ in range(len(motions)):  # transforms may form a circle
+        if top in motions and motions[top].is_constant and motions[top].parent not in _MAP_FRAMES:
+            T_top_laser, top = motions[top].T_parent_child[0] @ T_top_laser, motions[top].parent
+    found, what = motions.get(top), f"odometry of the transforms to {frame}"
+    if found is None or found.is_constant or found.parent in _MAP_FRAMES or not _covers(found.times, times):
+        topics = bag.of_kinds(_ODOMETRY)
+        names = ", ".join(topics)
+        if len(topics) != 1:
+            text = f"{bag.path}: {len(topics)} topics of odometry ({names}), none is used"
+            return None, is_upside_down, (Note(text, is_doubt=True),) if topics else ()
+        poses = [(_stamp_of(message), message.pose.pose) for message in bag.messages(names)]
+        found = _motion_of("odom", [(stamp, _pose_of(pose.position, pose.orientation)) for stamp, pose in poses])
+        what = f"odometry of {names}"
+    if not _covers(found.times, times):
+        text = f"{bag.path}: the {what} is not of the times of the scans; it is not used"
+        return None, is_upside_down, (Note(text, is_doubt=True),)
+    T = np.asarray(interpolate_poses(found.times, found.T_parent_child, times) @ T_top_laser)
+    return T, bool(np.median(T[:, 2, 2]) < 0), (Note(f"{bag.path}: {what}"),)
+
+
+def _covers(times: FloatArray, wanted: FloatArray) -> bool:
+    is_near = (wanted >= times[0] - _SLACK_S) & (wanted <= times[-1] + _SLACK_S)
+    return len(times) > 1 and float(is_near.mean()) >= _LEAST_SHARE
 
 
 def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
@@ -340,15 +314,15 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
         InputError: a damaged bag, or no topic of clouds, or several.
     """
     bag = _Bag(path)
-    chosen = bag.choose((_POINT_CLOUD, *_LIVOX_CLOUDS), topic, "point clouds")
-    places = bag.places(chosen.name)
+    chosen, kind = bag.choose(_CLOUDS, topic, "point clouds")
+    places = bag.places(chosen)
     times = np.array([place.stamp_ns for place in places], np.float64) * 1e-9
-    sources = tuple(f"{path} {chosen.name} {index}" for index in range(len(places)))
+    sources = tuple(f"{path} {chosen} {index}" for index in range(len(places)))
 
     def read(index: int) -> TimedCloud:
-        message = bag.read(chosen.name, places[index])
+        message = bag.read(chosen, places[index])
         with refusing(sources[index], "a broken message ({error})", "record the topic again", _KINDS):
-            cloud = _cloud_of(message, chosen.kind)
+            cloud = _cloud_of(message, kind)
         return check_scan(cloud, sources[index])
 
     name = path.resolve().stem
@@ -361,26 +335,15 @@ def _cloud_of(message: Any, kind: str) -> TimedCloud:
         rows = [(point.x, point.y, point.z, point.offset_time) for point in message.points]
         table = np.array(rows, np.float64).reshape(-1, 4)
         return TimedCloud(to_float32(table[:, :3]), table[:, 3])
-    records = _records(message)
-    columns = {name: records[name] for name in records.dtype.names or ()}
-    if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(f"a cloud without {' '.join(missing)}, its fields are {' '.join(columns) or 'none'}")
-    return cloud_of(columns)
-
-
-def _records(message: Any) -> NDArray[Any]:
-    """Reads the points of a PointCloud2 as records of their fields."""
     step, width, height = int(message.point_step), int(message.width), int(message.height)
     order = ">" if message.is_bigendian else "<"
     fields = {f.name: (order + _TYPES[f.datatype], int(f.offset)) for f in message.fields if f.datatype in _TYPES}
-    formats, offsets = zip(*fields.values(), strict=True) if fields else ((), ())
-    layout = np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": step})
-    data = np.ascontiguousarray(message.data, np.uint8)
-    row = width * step
+    if not {"x", "y", "z"} <= set(fields):
+        raise ValueError(f"a cloud without x, y or z, its fields are {' '.join(fields) or 'none'}")
+    formats, offsets = zip(*fields.values(), strict=True)
+    record = np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": step})
     # A row may have a tail; drivers leave row_step unset for clouds of one row.
-    row_step = int(message.row_step) if height > 1 and int(message.row_step) > row else row
-    needed = row_step * (height - 1) + row if height else 0
-    if len(data) < needed or step < 1:
-        raise ValueError(f"{height} x {width} points of {step} bytes need {needed} bytes, {len(data)} are there")
-    rows = [data[i * row_step : i * row_step + row] for i in range(height)] if row else []
-    return (np.concatenate(rows) if rows else data[:0]).view(layout)
+    row_step = max(int(message.row_step), width * step) if height > 1 else width * step
+    data = np.ascontiguousarray(message.data, np.uint8)
+    records = np.ndarray((height, width), record, data, strides=(row_step, step)).ravel()
+    return cloud_of({name: records[name] for name in fields})

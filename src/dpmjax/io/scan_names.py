@@ -6,14 +6,12 @@ import collections
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dpmjax.io.files import natural_key
 from dpmjax.io.lidar_file import SCAN_SUFFIXES
-from dpmjax.sequences import FloatArray, Note
+from dpmjax.sequences import FloatArray, Note, require
 
 # Usual names of files of reference poses in the lidar's frame.
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
@@ -21,8 +19,8 @@ POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "t
 _NUMBER = re.compile(r"\d+(?:\.\d+)?|\.\d+")
 # A number of that many digits is a time stamp: seconds since 1970, or a smaller unit.
 _STAMP_DIGITS = 10
-# Seconds since 1970 with a fraction, and with nanoseconds as a number of their own.
-_FRACTION, _SPLIT_STAMP = re.compile(r"(\d{10,})\.(\d+)"), re.compile(r"(?<!\d)(\d{10})[_-](\d{9})$")
+# Seconds since 1970 with nanoseconds as a number of their own.
+_SPLIT_STAMP = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})$")
 # Least ratio of the spreads of the steps of stamps of which one reading is wrong.
 _LEAST_SPREAD_RATIO = 2.0
 _LEAST_NUMBERED = 3
@@ -30,17 +28,16 @@ _LEAST_NUMBERED = 3
 _NUM_KINDS = 4
 
 
-def scan_files(folder: Path, suffixes: tuple[str, ...] = SCAN_SUFFIXES) -> list[Path]:
+def scan_files(folder: Path) -> list[Path]:
     """Lists the scans of a folder in the order of their numbers: the files of the most frequent ending.
 
     Args:
         folder: searched folder, without its subfolders.
-        suffixes: endings of scans.
 
     Returns:
         The files, without those that `folder_note` names; none where there is no such folder.
     """
-    most = _files_of_one_ending(folder, suffixes)
+    most = _files_of_one_ending(folder, SCAN_SUFFIXES)
     strays = strays_among(most)
     return sort_scans([file for file in most if file not in strays])
 
@@ -97,19 +94,14 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
     Returns:
         The files in order.
     """
-    stems = [_stem_of(file) for file in files]
-    fractions = [piece.partition(".")[2] for stem in stems for piece in _NUMBER.findall(stem) if "." in piece]
+    numbers = [_NUMBER.findall(_stem_of(file)) for file in files]
+    fractions = [piece.partition(".")[2] for found in numbers for piece in found if "." in piece]
     is_decimal = len({len(fraction) for fraction in fractions}) > 1 and not any(
         len(fraction) > 1 and fraction.endswith("0") for fraction in fractions
     )
-    is_decimal = is_decimal and _counted_stamps([_NUMBER.findall(stem)[-1:] for stem in stems]) is None
-    return sorted(files, key=lambda file: _decimal_key(_stem_of(file)) if is_decimal else natural_key(file.name))
-
-
-def _decimal_key(stem: str) -> tuple[tuple[int, float, str], ...]:
-    """Returns a sort key under which numbers, with their fractions, compare as numbers and come before text."""
-    pieces = [piece for piece in re.split(f"({_NUMBER.pattern})", stem) if piece]
-    return tuple((0, float(p), p) if _NUMBER.fullmatch(p) else (1, 0.0, p) for p in pieces)
+    if is_decimal and _counted_stamps([found[-1] if found else "" for found in numbers]) is None:
+        return sorted(files, key=lambda file: natural_key(_stem_of(file), _NUMBER.pattern))
+    return sorted(files, key=lambda file: natural_key(file.name))
 
 
 def strays_among(files: Sequence[Path]) -> list[Path]:
@@ -141,55 +133,41 @@ def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
     last = [numbers[-1] if numbers else "" for numbers in found]
     if not last or not all("." in number or _STAMP_DIGITS <= len(number) < 20 for number in last):
         return None
-    counted = _counted_stamps(found)
-    stamps = np.array([float(number) for number in last]) if counted is None else counted
+    counted = _counted_stamps(last)
+    stamps = np.array(last, np.float64) if counted is None else counted
     return stamps if bool((np.diff(stamps) > 0).all()) else None
 
 
-def _counted_stamps(numbers: Sequence[Sequence[str]]) -> FloatArray | None:
-    """Reads stamps whose nanoseconds have no leading zeros, so that 5.7 is 5 s and 7 ns.
+def _counted_stamps(numbers: Sequence[str]) -> FloatArray | None:
+    """Reads stamps (n,) s whose nanoseconds have no leading zeros, so that 5.7 is 5 s and 7 ns.
 
-    Args:
-        numbers: numbers in each of n names, the stamp last.
-
-    Returns:
-        (n,) s; None where these are no such stamps, or where their steps are no more even than those of decimals.
+    None where these are no such stamps, or where their steps are no more even than those of decimals.
     """
-    parts = [_FRACTION.fullmatch(found[-1]) if found else None for found in numbers]
-    pairs = [part.groups() for part in parts if part is not None]
-    if len(pairs) < max(len(parts), _LEAST_NUMBERED):
+    pairs = [number.split(".") for number in numbers]
+    is_stamp = all(len(pair) == 2 and len(pair[0]) >= _STAMP_DIGITS for pair in pairs)
+    if len(pairs) < _LEAST_NUMBERED or not is_stamp:
         return None
     digits = max(len(fraction) for _, fraction in pairs)
-    counted = np.array([int(seconds) + int(fraction) / 10.0**digits for seconds, fraction in pairs])
-    decimals = np.array([float(f"{seconds}.{fraction}") for seconds, fraction in pairs])
-    spread, spread_of_decimals = (np.diff(np.sort(stamps)).std() for stamps in (counted, decimals))
-    return counted if _LEAST_SPREAD_RATIO * spread < spread_of_decimals else None
+    readings = np.array(
+        [[f"{seconds}.{part.zfill(digits)}", f"{seconds}.{part}"] for seconds, part in pairs], np.float64
+    )
+    spread, spread_of_decimals = np.diff(np.sort(readings, axis=0), axis=0).std(axis=0)
+    return readings[:, 0] if _LEAST_SPREAD_RATIO * spread < spread_of_decimals else None
 
 
-def numbers_of(files: Sequence[Path], largest: float = 2.0**62) -> list[int] | None:
-    """Returns the numbers in the names of files.
+def last_numbers(files: Sequence[Path]) -> list[int]:
+    """Returns the last number in each name.
 
     Args:
         files: the scans.
-        largest: largest valid number.
 
     Returns:
-        One number a file, or None where a name is no number or too large.
+        One number a file.
+
+    Raises:
+        InputError: a name has no number, or one that is too large.
     """
-    names = [_stem_of(file) for file in files]
-    is_good = all(name.isascii() and name.isdecimal() and len(name) < 20 and int(name) <= largest for name in names)
-    return [int(name) for name in names] if is_good else None
-
-
-def match_rows(rows: NDArray[Any], files: Sequence[Path]) -> NDArray[Any] | None:
-    """Returns the row of each scan of a data set: in order if the counts are equal, else by the file's number.
-
-    Args:
-        rows: (m, ...) values.
-        files: the n scans.
-
-    Returns:
-        (n, ...), or None where there are more or fewer rows, and names that are no numbers of rows.
-    """
-    numbers = range(len(files)) if len(rows) == len(files) else numbers_of(files, len(rows) - 1)
-    return None if numbers is None else rows[list(numbers)]
+    found = [re.findall(r"[0-9]+", _stem_of(file))[-1:] for file in files]
+    bad = next((file for file, number in zip(files, found, strict=True) if not number or int(number[0]) > 2**62), None)
+    require(bad is None, bad or "", "a file name without a number of a scan", "keep the names of the data set")
+    return [int(number) for (number,) in found]

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import logging
+import tarfile
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.geometry import se2
 from dpmjax.io.carmen import read_carmen_log
-from dpmjax.io.deepmapping_folder import read_deepmapping_folder
-from dpmjax.io.files import load_arrays, log_notes, read_bytes, to_float32
-from dpmjax.io.poses import check_poses
+from dpmjax.io.clouds import parse_pcd
+from dpmjax.io.files import load_arrays, load_mat, log_notes, natural_key, read_bytes, refusing, to_float32
+from dpmjax.io.poses import planar_rows
 from dpmjax.io.scan_bags import is_bag, read_scan_bag
-from dpmjax.sequences import BoolArray, FloatArray, InputError, Note, ScanSequence, Unit, counted, require
+from dpmjax.sequences import FloatArray, Note, ScanSequence, Unit, counted, pad_scans, require
 
 Table = Mapping[str, NDArray[np.generic]]
-_log = logging.getLogger(__name__)
 _FORMATS = "a folder or .tar of .pcd files, a CARMEN .log, .clf or .log.gz, a bag of ROS, or .npy / .npz arrays"
-_KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask, poses, odometry, times, unit"
-# Endings of the kinds of files; a folder of scans is of the first kind.
-_ENDINGS = {"folder": (".tar", ".tar.gz", ".tgz"), "arrays": (".npy", ".npz")}
-_ENDINGS |= {"CARMEN log": (".log", ".clf", ".log.gz", ".clf.gz")}
+_ARCHIVES, _ARRAYS, _LOGS = (".tar", ".tar.gz", ".tgz"), (".npy", ".npz"), (".log", ".clf", ".log.gz", ".clf.gz")
 # Median ranges outside of these are a mistaken unit: millimetres, or pixels / 512.
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
@@ -34,9 +29,13 @@ _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
 # their number, their share of all beams and the number of scans with them reach the limits. The last limit is the least
 # share of scans that also have other beams.
 _SAME_RANGE, _LEAST_MAXIMA, _LEAST_SHARE, _LEAST_SCANS, _LEAST_OTHERS = 1e-5, 20, 0.005, 3, 0.5
+_KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask (n, b), times (n,), poses, odometry, unit"
 # Largest difference between the third coordinates of planar points.
 _LARGEST_HEIGHT = 1e-3
 _LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
+# The DeepMapping authors' files: coordinates of PCD files are pixels / 512, so that a picture of 2048 pixels has a
+# diagonal of 5.7. Poses are pixels and radians, in the variable `pose`.
+_PIXELS_PER_UNIT, _LARGEST_STORED, _LARGEST_LENGTH, _POSE_FILE = 512.0, 8.0, 1e7, "gt_pose.mat"
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
@@ -64,53 +63,42 @@ def read_sequence(
     """
     path = Path(path)
     start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
-    chosen = f"start {start}, stop {stop}, stride {stride}"
     is_good = start >= 0 and stride >= 1 and (stop is None or stop >= 0)
+    chosen = f"start {start}, stop {stop}, stride {stride}"
     require(is_good, path, chosen, "start and stop count from 0, stride from 1")
     whole = _without_maxima(_read(path, unit, topic), path)
     sequence = _without_constant_odometry(whole, path).take(slice(start, stop, stride))
     is_part = len(sequence) < len(whole)
     found = f"{len(sequence)} of {len(whole)} scans chosen" if is_part else counted(len(whole), "scan")
     require(len(sequence) >= 2, path, found, "give two or more")
-    _check_beams(sequence, path, start, stride)
+    _check_beams(sequence, path, range(start, len(whole), stride))
     sequence = replace(sequence, notes=(*sequence.notes, *_check_unit(sequence, path)))
-    if whole.odometry_poses is None and whole.unit == "m":
-        _log.info("%s: no raw odometry", path)
     log_notes(sequence.notes)
     return sequence
 
 
 def _read(path: Path, unit: Unit | None, topic: str | None) -> ScanSequence:
+    """Reads a whole file or folder; its ending decides on the reader, else its first bytes."""
     require(path.exists(), path, "no such file or folder", "check the path")
-    kind = _detect(path)
-    require(topic is None or kind == "bag", path, "no bag of ROS", "leave the topic out")
-    if kind == "folder":
-        return read_deepmapping_folder(path, unit=unit)
-    if kind == "arrays":
-        return read_arrays(path, unit=unit)
-    require(unit != "px", path, f"a {kind} is in metres, not px", "leave the unit out")
-    return read_scan_bag(path, topic) if kind == "bag" else read_carmen_log(path)
-
-
-def _detect(path: Path) -> str:
-    """Returns "folder", "arrays", "bag" or "CARMEN log", by the ending of the path, else by its first bytes."""
     has_scans = path.is_dir() and any(file.suffix.lower() == ".pcd" for file in path.iterdir())
+    is_metric, advice = unit != "px", "leave the unit out"
     if is_bag(path) and not has_scans:
-        return "bag"
+        require(is_metric, path, "a bag is in metres, not px", advice)
+        return read_scan_bag(path, topic)
+    require(topic is None, path, "no bag of ROS", "leave the topic out")
     require(has_scans or not path.is_dir(), path, "a folder without .pcd files", f"give {_FORMATS}")
-    name = path.name.lower()
-    for kind, endings in _ENDINGS.items():
-        if has_scans or name.endswith(endings):
-            return kind
-    require(not name.endswith(".pcd"), path, "a single scan", "give the folder that holds all of its .pcd files")
-    head = read_bytes(path)[:65536]
-    if head[257:262] == b"ustar":
-        return "folder"
-    if head[:6] == b"\x93NUMPY" or head[:2] == b"PK":
-        return "arrays"
-    found = "no known format" if head else "an empty file"
-    require(b"FLASER" in head or b"ROBOTLASER1" in head, path, found, f"give {_FORMATS}")
-    return "CARMEN log"
+    name, head = path.name.lower(), b"" if has_scans else read_bytes(path)[:65536]
+    is_single = name.endswith(".pcd") and not has_scans
+    require(not is_single, path, "a single scan", "give the folder that holds all of its .pcd files")
+    is_log = name.endswith(_LOGS)
+    if has_scans or name.endswith(_ARCHIVES) or (head[257:262] == b"ustar" and not is_log):
+        return read_deepmapping_folder(path, unit=unit)
+    if name.endswith(_ARRAYS) or (head.startswith((b"\x93NUMPY", b"PK")) and not is_log):
+        return read_arrays(path, unit=unit)
+    is_log = is_log or b"FLASER" in head or b"ROBOTLASER1" in head
+    require(is_log, path, "no known format" if head else "an empty file", f"give {_FORMATS}")
+    require(is_metric, path, "a CARMEN log is in metres, not px", advice)
+    return read_carmen_log(path)
 
 
 def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
@@ -118,14 +106,15 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     if not sequence.mask.any():
         return sequence
     ranges = np.where(sequence.mask, np.linalg.norm(sequence.points.astype(np.float64), axis=2), 0.0)
-    limit = (1.0 - _SAME_RANGE) * ranges.max()
-    is_maximum = ranges >= limit
-    num_maxima, share = int(is_maximum.sum()), is_maximum.sum() / max(sequence.mask.sum(), 1)
-    is_code = num_maxima >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
-    if not is_code or (sequence.mask & ~is_maximum).any(axis=1).mean() < _LEAST_OTHERS:
+    is_maximum = ranges >= (1.0 - _SAME_RANGE) * ranges.max()
+    share = is_maximum.sum() / sequence.mask.sum()
+    is_code = (
+        is_maximum.sum() >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
+    )
+    mask = sequence.mask & ~is_maximum
+    if not is_code or mask.any(axis=1).mean() < _LEAST_OTHERS:
         return sequence
     found = f"{100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
-    mask = sequence.mask & (np.linalg.norm(sequence.points, axis=2) < limit)
     points = np.where(mask[..., None], sequence.points, np.float32(0))
     return replace(sequence, mask=mask, points=points, notes=(*sequence.notes, Note(f"{path}: {found}")))
 
@@ -139,17 +128,17 @@ def _without_constant_odometry(sequence: ScanSequence, path: Path) -> ScanSequen
     return replace(sequence, odometry_poses=None, notes=(*sequence.notes, note))
 
 
-def _check_beams(sequence: ScanSequence, path: Path, start: int, stride: int) -> None:
+def _check_beams(sequence: ScanSequence, path: Path, numbers: range) -> None:
+    """Refuses scans of too few beams, or of no valid one; the numbers are those of the scans in the file."""
     num_beams = sequence.mask.shape[1]
     advice = f"give {_LEAST_BEAMS} beams or more; arrays are (scans, beams, 2)"
     require(num_beams >= _LEAST_BEAMS, path, f"scans of {num_beams} beams", advice)
-    empty = np.flatnonzero(~sequence.mask.any(axis=1))
-    found = "every beam of every scan is invalid or at maximum range"
-    require(len(empty) < len(sequence), path, found, "check the ranges")
-    if len(empty):
-        first = start + stride * empty[0]
-        found = f"{len(empty)} of {len(sequence)} scans have no valid beam, the first is scan {first}"
-        raise InputError(path, found, "remove such scans, or choose others")
+    empty = np.flatnonzero(~sequence.mask.any(axis=1)).tolist()
+    first = [numbers[scan] for scan in empty[:1]]
+    found = (
+        f"{len(empty)} of {len(sequence)} scans have no valid beam below the maximum range, the first is scan {first}"
+    )
+    require(not empty, path, found, "check the ranges, remove such scans, or choose others")
     points = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
     differ = (sequence.points != points[:, None]).any(axis=2) & sequence.mask
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
@@ -194,72 +183,109 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
             other than for invalid beams.
     """
     table = load_arrays(path)
-    (points, mask), notes = (_points(table, path), ()) if "points" in table else _from_ranges(table, path)
-    given = table.get("mask", mask)
-    is_good = given.shape == mask.shape and given.dtype.kind in "biu"
-    require(is_good, path, f"mask is {given.shape} {given.dtype}", f"give {mask.shape} booleans")
-    mask &= given.astype(bool)
+    notes: tuple[Note, ...] = ()
+    if "points" in table:
+        points = _take(table, "points", [(-1, -1, 2), (-1, -1, 3)], path)
+        heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:]
+        is_planar = not heights.size or float(np.ptp(heights)) <= _LARGEST_HEIGHT
+        found = "the third coordinates of the points differ"
+        require(is_planar, path, found, "give planar scans, or 3-D scans to `dpmjax slam`")
+        points = points[..., :2]
+    else:
+        points, notes = _points_of_ranges(table, path)
+    n, b = points.shape[:2]
+    mask = (np.isnan(points).sum(axis=2) < 2) & ~np.isinf(points).any(axis=2) & points.any(axis=2)
+    if "mask" in table:
+        mask &= _take(table, "mask", [(n, b)], path) != 0
     stored = np.where(mask[..., None], to_float32(points), np.float32(0))
-    bad = ~np.isfinite(stored).all(axis=2)
-    if bad.any():
-        scan, beam = np.argwhere(bad)[0]
-        advice = "mark an invalid beam by NaN in both coordinates"
-        raise InputError(path, f"{bad.sum()} NaN or infinite points, the first in scan {scan}, beam {beam}", advice)
-    times = table.get("times", np.zeros(len(points)))
-    is_good = _is_numeric(times, (len(points),)) and bool(np.isfinite(times).all())
-    require(is_good, path, f"times are {times.shape} {times.dtype}", f"give ({len(points)},) finite seconds")
+    bad = np.argwhere(~np.isfinite(stored).all(axis=2))
+    found = f"{len(bad)} NaN or infinite points, the first in scan, beam {bad[:1].tolist()}"
+    require(not len(bad), path, found, "mark an invalid beam by NaN in both coordinates")
+    times = _take(table, "times", [(n,)], path) if "times" in table else None
+    require(times is None or np.isfinite(times).all(), path, "times that are not finite", "give finite seconds")
     stated = str(table.get("unit", "m"))
     require(stated in ("px", "m"), path, f"unit is {stated!r}", "say 'px' or 'm'")
-    name, length_unit = Path(path).stem, unit or cast(Unit, stated)
-    seconds = times.astype(np.float64) if "times" in table else None
-    poses, odometry = (_planar(table, key, len(points), path) for key in ("poses", "odometry"))
-    return ScanSequence(name, stored, mask, length_unit, poses, odometry, seconds, notes)
+    poses, odometry = (
+        planar_rows(table[key], n, f"{path}: {key}") if key in table else None for key in ("poses", "odometry")
+    )
+    return ScanSequence(Path(path).stem, stored, mask, unit or cast(Unit, stated), poses, odometry, times, notes)
 
 
-def _is_numeric(array: NDArray[np.generic], *shapes: tuple[int, ...]) -> bool:
-    return array.shape in shapes and array.dtype.kind in "fiu"
+def _take(table: Table, key: str, shapes: list[tuple[int, ...]], path: str | Path) -> FloatArray:
+    """Returns an array of numbers of one of these shapes, in which -1 stands for any length."""
+    require(key in table, path, f"no array {key} among {', '.join(table) or 'none'}", f"give {_KEYS}")
+    array = table[key]
+    fits = any(
+        len(shape) == array.ndim and all(a in (-1, b) for a, b in zip(shape, array.shape, strict=True))
+        for shape in shapes
+    )
+    is_good = fits and array.dtype.kind in ("biu" if key == "mask" else "fiu")
+    require(is_good, path, f"{key} are {array.shape} {array.dtype}", f"give {_KEYS}")
+    return array.astype(np.float64)
 
 
-def _points(table: Table, path: str | Path) -> tuple[FloatArray, BoolArray]:
-    points = table["points"]
-    is_good = _is_numeric(points, (*points.shape[:2], 2), (*points.shape[:2], 3)) and points.ndim == 3
-    require(is_good, path, f"points are {points.shape} {points.dtype}", "give (n, b, 2): scans, beams, x and y")
-    heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:].astype(np.float64)
-    is_planar = not heights.size or float(np.ptp(heights)) <= _LARGEST_HEIGHT
-    advice = "give planar scans, or 3-D scans to `dpmjax slam`"
-    require(is_planar, path, "the third coordinates of the points differ", advice)
-    planar = points[..., :2].astype(np.float64)
-    is_measured = (np.isnan(planar).sum(axis=2) < 2) & ~np.isinf(planar).any(axis=2) & planar.any(axis=2)
-    return planar, is_measured
-
-
-def _from_ranges(table: Table, path: str | Path) -> tuple[tuple[FloatArray, BoolArray], tuple[Note, ...]]:
-    found = f"keys are {', '.join(table) or 'none'}"
-    require("ranges" in table and "angles" in table, path, found, f"give {_KEYS}")
-    ranges, angles = table["ranges"], table["angles"]
-    is_good = ranges.ndim == 2 and _is_numeric(ranges, ranges.shape)
-    is_good &= _is_numeric(angles, ranges.shape, ranges.shape[1:])
-    found = f"ranges are {ranges.shape} {ranges.dtype}, angles {angles.shape} {angles.dtype}"
-    require(is_good, path, found, "give numbers, (n, b) and (b,) or (n, b)")
-    distance, theta = ranges.astype(np.float64), angles.astype(np.float64)
+def _points_of_ranges(table: Table, path: str | Path) -> tuple[FloatArray, tuple[Note, ...]]:
+    """Computes end points, NaN for beams without a hit, with a note where the angles are taken as degrees."""
+    ranges = _take(table, "ranges", [(-1, -1)], path)
+    angles = _take(table, "angles", [ranges.shape, ranges.shape[1:]], path)
     found = "angles hold NaN, infinite or huge values"
-    require((np.abs(theta) < 1e6).all(), path, found, "give a direction to every beam, in radians")
+    require((np.abs(angles) < 1e6).all(), path, found, "give a direction to every beam, in radians")
     notes: tuple[Note, ...] = ()
-    if theta.size and np.ptp(theta, axis=-1).max() > _LARGEST_SPAN:
-        theta = np.radians(theta)
+    if angles.size and np.ptp(angles, axis=-1).max() > _LARGEST_SPAN:
+        angles = np.radians(angles)
         text = f"{path}: the angles span more than one turn in radians; taken as degrees"
         notes = (Note(text, is_doubt=True),)
-    mask = np.isfinite(distance) & (distance > 0)
-    distance = np.where(mask, distance, 0.0)
-    return (distance[..., None] * np.stack([np.cos(theta), np.sin(theta)], axis=-1), mask), notes
+    ranges = np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.nan)
+    return ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1), notes
 
 
-def _planar(table: Table, key: str, num_scans: int, path: str | Path) -> FloatArray | None:
-    """Reads poses (n, 3) x, y, heading from (n, 3) or homogeneous (n, 3, 3)."""
-    if key not in table:
-        return None
-    poses = table[key]
-    is_good = _is_numeric(poses, (num_scans, 3), (num_scans, 3, 3))
-    require(is_good, path, f"{key} are {poses.shape} for {num_scans} scans", "give (n, 3) x, y, heading or (n, 3, 3)")
-    values = check_poses(poses.astype(np.float64), f"{path}: {key}")
-    return values if values.ndim == 2 else se2.from_matrix(values)
+def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
+    """Reads a folder or an uncompressed or compressed tar archive of `*.pcd` and `gt_pose.mat`.
+
+    Args:
+        path: the folder, or the archive.
+        unit: "px" (or None) multiplies coordinates by 512, as the authors' files need; "m" takes them unchanged, for
+            other PCD scans.
+
+    Returns:
+        The scans in natural order of their names; scans with fewer points than the longest are padded with masked
+        beams; reference poses where there is a `gt_pose.mat`.
+
+    Raises:
+        InputError: no such path, no PCD file, a damaged PCD file, a pose file that does not fit, or
+            coordinates too large for their unit.
+    """
+    files = _list_files(Path(path))
+    names = sorted((name for name in files if name.lower().endswith(".pcd")), key=natural_key)
+    require(len(names) > 0, path, "no .pcd file in it", "give the authors' folder or .tar of .pcd files")
+    scans = [parse_pcd(files[name], f"{path}/{name}").points[:, :2] for name in names]
+    for scan in scans:
+        scan[~np.isfinite(scan).all(axis=1) | (scan == 0).all(axis=1)] = np.nan
+    points, mask = pad_scans(scans)
+    largest = float(np.abs(points).max(initial=0.0))
+    found = f"coordinates up to {largest:g}, too large for {unit or 'pixels / 512'}"
+    is_small = largest <= (_LARGEST_STORED if unit is None else _LARGEST_LENGTH)
+    require(is_small, path, found, "give pixels / 512, or name the unit m if they are metres")
+    if unit != "m":
+        points *= np.float32(_PIXELS_PER_UNIT)
+    source = next((name for name in files if PurePosixPath(name).name == _POSE_FILE), None)
+    reference = None
+    if source is not None:
+        variables = load_mat(files[source], f"{path}/{source}")
+        found = f"variables are {', '.join(variables) or 'none'}"
+        require("pose" in variables, f"{path}/{source}", found, "the file needs a variable 'pose'")
+        reference = planar_rows(np.asarray(variables["pose"]), len(names), f"{path}/{source}")
+    return ScanSequence(Path(path).stem, points, mask, unit or "px", reference)
+
+
+def _list_files(path: Path) -> dict[str, bytes]:
+    """Reads the PCD and MAT files by name; archives are read in memory and never unpacked."""
+    if path.is_dir():
+        chosen = [file for file in path.iterdir() if file.name.lower().endswith((".pcd", ".mat"))]
+        return {file.name: read_bytes(file) for file in chosen if file.is_file()}
+    # The parsers of tar, gzip, bzip2 and xz raise many kinds of errors.
+    found, advice = "not a readable tar archive ({error})", "copy the archive again"
+    with refusing(path, found, advice, (Exception,)), tarfile.open(path) as archive:
+        members = [m for m in archive if m.isfile() and not m.issparse() and m.name.lower().endswith((".pcd", ".mat"))]
+        members = [m for m in members if not PurePosixPath(m.name).name.startswith("._")]
+        return {m.name: file.read() for m in members if (file := archive.extractfile(m)) is not None}

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from dpmjax.types import AnyArray
 
@@ -52,8 +51,6 @@ def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -
     """
     from scipy import stats
 
-    if not 0 <= num_right <= num_all:
-        raise ValueError(f"num_right: expected 0 to num_all = {num_all}, got {num_right}")
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence: expected a number between 0 and 1, got {confidence}")
     if num_all == 0:
@@ -78,11 +75,13 @@ def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray,
     Raises:
         ValueError: the shapes are not the same (n,).
     """
+    from scipy import stats
+
     a, b = np.asarray(is_right_a, bool), np.asarray(is_right_b, bool)
     if a.ndim != 1 or a.shape != b.shape:
         raise ValueError(f"expected two arrays of the same shape (n,), got {a.shape} and {b.shape}")
-    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
-    return min(1.0, 2.0 * float(special.bdtr(min(only_a, only_b), only_a + only_b, 0.5)))
+    num_differ = int((a != b).sum())
+    return float(stats.binomtest(int((a & ~b).sum()), num_differ).pvalue) if num_differ else 1.0
 
 
 def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, " n"]) -> float:
@@ -95,11 +94,16 @@ def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, "
     Returns:
         In [0, 1]; ties count half; NaN without an example of each label.
     """
-    scores, labels = np.asarray(score), np.asarray(is_positive, bool)
+    from scipy import stats
+
+    scores, labels = np.asarray(score, np.float64), np.asarray(is_positive, bool)
     positive, negative = scores[labels], scores[~labels]
     if min(len(positive), len(negative)) == 0:
         return float("nan")
-    return float(((positive[:, None] > negative) + 0.5 * (positive[:, None] == negative)).mean())
+    # Mann and Whitney's U counts the pairs in which the positive example scores higher.
+    return float(
+        stats.mannwhitneyu(positive, negative, method="asymptotic").statistic / (len(positive) * len(negative))
+    )
 
 
 def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"]) -> float:
@@ -128,11 +132,9 @@ def expected_calibration_error(probability: Float[AnyArray, " n"], is_true: Bool
         calibrated forecast; NaN without events.
     """
     probabilities, labels = np.asarray(probability, np.float64), np.asarray(is_true, np.float64)
-    if len(labels) == 0:
-        return float("nan")
     bins = np.minimum((probabilities * _NUM_BINS).astype(int), _NUM_BINS - 1)
     gaps = np.bincount(bins, probabilities - labels, _NUM_BINS)
-    return float(np.abs(gaps).sum() / len(labels))
+    return float(np.abs(gaps).sum() / len(labels)) if len(labels) else float("nan")
 
 
 def position_bound(
