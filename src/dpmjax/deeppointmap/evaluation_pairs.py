@@ -75,9 +75,8 @@ def split_places(drive: LidarSequence) -> PlaceSplit:
     is_held_out = path > (1 - HELD_OUT_SHARE) * length_m
     margin_m = min(HELD_OUT_MARGIN_M, HELD_OUT_SHARE * length_m)
     positions = poses[:, :3, 3]
-    is_near = np.zeros(len(rows), bool)
-    if is_held_out.any():
-        is_near = cKDTree(positions[is_held_out]).query(positions)[0] < margin_m
+    # Without held-out scans all distances are infinite.
+    is_near = np.asarray(cKDTree(positions[is_held_out]).query(positions)[0]) < margin_m
     is_trained = ~is_held_out & ~is_near
     if np.sum(is_trained) < len(rows) / 2 or np.sum(is_held_out) < 2:
         return PlaceSplit(rows, rows[:0])
