@@ -85,7 +85,8 @@ def find_consensus(
     Args:
         source: metres, source frame.
         target: metres, target frame, row for row.
-        mask: False for pairs that are not there; they may hold anything.
+        mask: False for pairs that are not there; they may hold anything. A pair with a coordinate that is not a number
+            from -1e15 to 1e15 is not there either.
         config: numbers of motions.
 
     Returns:

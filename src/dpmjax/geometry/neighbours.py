@@ -41,7 +41,8 @@ def k_nearest(
         queries: where to search, in the frame and unit of `points`.
         points: the searched points.
         k: number of neighbours; may exceed the number of points.
-        mask: False for points that are not there; they may hold anything.
+        mask: False for points that are not there; they may hold anything. A point with a coordinate that
+            is not a number from -1e15 to 1e15 is not there either.
 
     Returns:
         Neighbours (m, k). With fewer than k valid points, the remaining columns are masked: index 0, distance infinite.
@@ -72,7 +73,8 @@ def radius_search(
         points: the searched points.
         radius: largest distance of a neighbour.
         max_neighbours: largest number of neighbours that are kept.
-        mask: False for points that are not there; they may hold anything.
+        mask: False for points that are not there; they may hold anything. A point with a coordinate that
+            is not a number from -1e15 to 1e15 is not there either.
 
     Returns:
         Neighbours (m, max_neighbours), nearest first; masked where there are fewer.

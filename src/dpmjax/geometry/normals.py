@@ -69,7 +69,8 @@ def estimate_normals(
     Args:
         points: (n, 2) or (n, 3), in the sensor's frame.
         k: number of neighbours; more average more noise away and round more corners.
-        mask: False for points that are not there; they may hold anything.
+        mask: False for points that are not there; they may hold anything. A point with a coordinate that
+            is not a number from -1e15 to 1e15 is not there either.
         radius: neighbours farther away than this do not count; unlimited by default.
 
     Returns:

@@ -27,7 +27,8 @@ def farthest_point_sample(
     Args:
         points: candidates, n >= 1.
         num_samples: number of points to choose.
-        mask: False for points that are not there; they may hold anything.
+        mask: False for points that are not there; they may hold anything. A point with a coordinate that
+            is not a number from -1e15 to 1e15 is not there either.
 
     Returns:
         (num_samples,) int32 rows of the points.
@@ -53,7 +54,8 @@ def voxel_sample(
     Args:
         points: the points.
         voxel_size: edge of a voxel, in the unit of the points.
-        mask: False for points that are not there; they may hold anything.
+        mask: False for points that are not there; they may hold anything. A point with a coordinate that
+            is not a number from -1e15 to 1e15 is not there either.
 
     Returns:
         (n,) True for the points that are kept.

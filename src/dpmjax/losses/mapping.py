@@ -31,7 +31,8 @@ def chamfer_distance(
     Args:
         a: points, in the same frame and unit as `b`.
         b: points.
-        mask_a: False for points of `a` that are not there; they may hold anything.
+        mask_a: False for points of `a` that are not there; they may hold anything. A point with a coordinate that
+            is not a number from -1e15 to 1e15 is not there either.
         mask_b: the same for `b`.
         max_distance: larger distances count as this one and have no derivative; None: no limit.
 
