@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import as_mask, require_count
+from dpmjax.checks import as_float, as_mask, require_count
 from dpmjax.geometry.implicit import solution_tangent
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.pose_graph.residuals import as_arrays, move, normal_blocks
+from dpmjax.pose_graph.residuals import as_arrays, joined_nodes, move, normal_blocks
 from dpmjax.types import AnyArray
 
 # Levenberg-Marquardt damping at the start, as a share of the diagonal, and its limit.
@@ -78,9 +78,10 @@ def solve_dense(
     [0.0, 1.100000023841858, 2.200000047683716]
     """
     require_count("num_steps", num_steps)
-    arrays = as_arrays(poses, edges, edge_mask)
+    start, edges = as_arrays(poses, edges, edge_mask)
     fixed = jnp.arange(len(poses)) == 0 if is_fixed is None else as_mask("is_fixed", is_fixed, (len(poses),))
-    return _solve_dense(*arrays, fixed, num_steps=num_steps)
+    found = _solve_dense(start, edges, fixed, num_steps=num_steps)
+    return found._replace(poses=jnp.where(joined_nodes(start, edges), found.poses, as_float("poses", poses)))
 
 
 @partial(jax.jit, static_argnames="num_steps")
