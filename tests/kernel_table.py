@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import dpmjax
-from dpmjax import deepmapping, deeppointmap, geometry, losses
-from dpmjax.geometry import rigid
+from dpmjax import deepmapping, deeppointmap, geometry, losses, pose_graph
+from dpmjax.geometry import rigid, se2
 from tests.deeppointmap import toy
 
 Arrays = dict[str, Any]
@@ -175,6 +175,26 @@ def seeds(rng: np.random.Generator) -> Arrays:
     return {"seed": rng.integers(0, 99, dtype=np.int32), "x": np.float32(rng.normal())}
 
 
+def planar_graph(rng: np.random.Generator) -> Arrays:
+    """A loop of six poses and one more edge across it, measured with noise."""
+    poses = np.column_stack([np.cumsum(rng.uniform(0.5, 1.5, (6, 2)), axis=0), 0.3 * rng.normal(size=6)])
+    source, target = np.array([1, 2, 3, 4, 5, 5, 3]), np.array([0, 1, 2, 3, 4, 0, 0])
+    relative = np.asarray(se2.compose(se2.inverse(poses[target]), poses[source]))
+    return {
+        "poses": (poses + 0.05 * rng.normal(size=poses.shape)).astype(np.float32),
+        "source": source,
+        "target": target,
+        "measured": (relative + 0.02 * rng.normal(size=relative.shape)).astype(np.float32),
+        "information": (np.eye(3) * rng.uniform(0.5, 2.0, (7, 1, 1))).astype(np.float32),
+        "edge_mask": np.ones(7, bool),
+    }
+
+
+def edges_of(source: Any, target: Any, measured: Any, information: Any) -> pose_graph.Edges:
+    return pose_graph.Edges(source, target, measured, information)
+
+
+EDGES = {"source": 0, "target": 0} | masked("measured", "information", edge_mask="edge_mask")
 BOTH = {"source_mask": "source_mask", "target_mask": "target_mask"}
 CLOUDS = masked("a", "b", "at_a", "at_b", is_a="is_a", is_b="is_b")
 KERNELS = {
@@ -300,6 +320,18 @@ KERNELS = {
     ),
     "correlate": Kernel(correlate, descriptors, ("a", "b"), CLOUDS, is_exact=False, dtypes=("float32",)),
     "match_hypotheses": Kernel(match, descriptors, ("a", "b", "at_a", "at_b"), CLOUDS, dtypes=("float32",)),
+    "pose_graph.residuals": Kernel(
+        lambda poses, edge_mask, **edges: pose_graph.residuals(poses, edges_of(**edges), edge_mask),
+        planar_graph,
+        ("poses", "measured"),
+        EDGES,
+    ),
+    "pose_graph.solve_dense": Kernel(
+        lambda poses, edge_mask, **edges: pose_graph.solve_dense(poses, edges_of(**edges), edge_mask=edge_mask).poses,
+        planar_graph,
+        ("measured",),
+        EDGES,
+    ),
     "deepmapping.step": Kernel(step_toy, seeds, ("x",), is_exact=False, dtypes=None),
     "deepmapping.solve": Kernel(lambda seed, x: solve_toy(seed), seeds, dtypes=None),
 }

@@ -41,13 +41,16 @@ def test_minimum_is_that_of_the_sparse_solver(tangent: int, float64) -> None:
     assert not solve_dense(*arrays_of(0, tangent), num_steps=1).converged
 
 
-def test_nodes_that_are_fixed_stay() -> None:
+def test_fixed_nodes_and_those_without_an_edge_stay() -> None:
     poses, edges = arrays_of(1, 3)
     is_fixed = jnp.isin(jnp.arange(8), jnp.array([3, 7]))
     found = solve_dense(poses, edges, is_fixed=is_fixed)
     np.testing.assert_array_equal(found.poses[is_fixed], poses[is_fixed])
     assert np.abs(found.poses - poses)[~is_fixed].min() > 0
     np.testing.assert_array_equal(solve_dense(poses, edges, is_fixed=jnp.ones(8, bool)).poses, poses)
+    none = solve_dense(poses, edges, edge_mask=jnp.zeros(len(edges.source), bool))
+    np.testing.assert_array_equal(none.poses, poses)
+    assert (float(none.chi2), bool(none.converged)) == (0.0, True)
 
 
 def padded(poses: jax.Array, edges: Edges, extra: int = 2) -> tuple[jax.Array, Edges, jax.Array]:

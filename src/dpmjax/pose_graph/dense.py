@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import as_mask, require_count
+from dpmjax.checks import as_float, as_mask, require_count
 from dpmjax.geometry.implicit import solution_tangent
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.pose_graph.residuals import as_arrays, move, normal_blocks
+from dpmjax.pose_graph.residuals import as_arrays, joined_nodes, move, normal_blocks
 from dpmjax.types import AnyArray
 
 # Levenberg-Marquardt damping at the start, as a share of the diagonal, and its limit.
@@ -78,15 +77,16 @@ def solve_dense(
     [0.0, 1.100000023841858, 2.200000047683716]
     """
     require_count("num_steps", num_steps)
-    arrays = as_arrays(poses, edges, edge_mask)
+    start, edges = as_arrays(poses, edges, edge_mask)
     fixed = jnp.arange(len(poses)) == 0 if is_fixed is None else as_mask("is_fixed", is_fixed, (len(poses),))
-    return _solve_dense(*arrays, fixed, num_steps=num_steps)
+    found = _solve_dense(start, edges, fixed, num_steps=num_steps)
+    return found._replace(poses=jnp.where(joined_nodes(start, edges), found.poses, as_float("poses", poses)))
 
 
 @partial(jax.jit, static_argnames="num_steps")
 def _solve_dense(poses: Array, edges: Edges, is_fixed: Array, *, num_steps: int) -> DenseSolution:
     found, converged = _solve(num_steps, poses, edges, is_fixed)
-    return DenseSolution(found, normal_blocks(found, edges)[0].sum(), converged)
+    return DenseSolution(found, normal_blocks(found, edges)[0].sum(), converged > 0)
 
 
 class _State(NamedTuple):
@@ -112,7 +112,7 @@ def _linearised(poses: Array, edges: Edges) -> _State:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(num_steps: int, poses: Array, edges: Edges, is_fixed: Array) -> tuple[Array, Array]:
-    """Returns the poses after all steps, and True where they have converged."""
+    """Returns the poses after all steps, and 1.0 where they have converged: the tangent of a float has its axes."""
     now = _linearised(poses, edges)
     # The loop's state depends on all arguments from the start, so that its type stays the same under `shard_map`.
     now = now._replace(poses=move(poses, 0 * now.gradient * ~is_fixed[:, None]))
@@ -132,7 +132,7 @@ def _solve(num_steps: int, poses: Array, edges: Edges, is_fixed: Array) -> tuple
         return (kept, jnp.where(is_better, less, more), converged), None
 
     (last, _, converged), _ = jax.lax.scan(iterate, (now, damping, now.cost < 0), length=num_steps)
-    return last.poses, converged
+    return last.poses, converged.astype(last.cost.dtype)
 
 
 def _damped_step(now: _State, damping: Array, edges: Edges, is_fixed: Array) -> Float[Array, "n d"]:
@@ -197,4 +197,4 @@ def _solve_jvp(num_steps: int, primals: Any, tangents: Any) -> tuple[tuple[Array
         open_share=20 * float(jnp.finfo(scale.dtype).eps),
     )
     _, moving = jax.jvp(moved, (jnp.zeros_like(step), poses), (step, tangents[0]))
-    return (found, converged), (moving, np.zeros(converged.shape, jax.dtypes.float0))
+    return (found, converged), (moving, jnp.zeros_like(converged))

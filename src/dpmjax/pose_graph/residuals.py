@@ -10,6 +10,8 @@ in the frame where the edge puts it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -94,9 +96,24 @@ def as_arrays(
     measured = jnp.where(mask.reshape(-1, *[1] * len(pose)), measured.astype(dtype), identity)
     information = jnp.where(mask[:, None, None], information.astype(dtype), 0)
     source, target = (jnp.where(mask, rows, 0) for rows in (source, target))
-    is_joined = jnp.zeros(len(poses), bool).at[source].max(source != target).at[target].max(source != target)
-    poses = jnp.where(is_joined.reshape(-1, *[1] * len(pose)), poses.astype(dtype), identity)
-    return poses, Edges(source, target, measured, information)
+    arrays: Any = source, target, measured, information  # the record is typed for the host
+    edges = Edges(*arrays)
+    return jnp.where(joined_nodes(poses, edges), poses.astype(dtype), identity), edges
+
+
+def joined_nodes(poses: Array, edges: Edges) -> Bool[Array, "n *s"]:
+    """Returns True for nodes that an edge joins to another one; the axes after the first have size one.
+
+    Args:
+        poses: `T_world_node`; only its shape is used.
+        edges: of JAX; a padding edge joins a node to itself.
+
+    Returns:
+        The mask, which broadcasts with the poses.
+    """
+    is_edge = edges.source != edges.target
+    is_joined = jnp.zeros(len(poses), bool).at[edges.source].max(is_edge).at[edges.target].max(is_edge)
+    return is_joined.reshape(-1, *[1] * (poses.ndim - 1))
 
 
 def normal_blocks(
