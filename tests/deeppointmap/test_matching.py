@@ -45,6 +45,12 @@ def dual_softmax_in_numpy(similarity: np.ndarray, temperature: float) -> np.ndar
     return powers / powers.sum(axis=0) * (powers / powers.sum(axis=1, keepdims=True))
 
 
+@pytest.mark.parametrize(("num", "expected"), [(256, 128), (1100, 550)])
+def test_the_number_of_pairs_is_the_published_one_for_maps_too(num: int, expected: int) -> None:
+    similarity, mask = jax.random.uniform(jax.random.key(0), (num, num)), jnp.ones(num, bool)
+    assert int(best_pairs(similarity, mask, mask, config=MatchConfig()).mask.sum()) == expected
+
+
 @pytest.mark.parametrize("shape", [(30, 30), (20, 50)])
 def test_best_pairs_have_the_highest_dual_softmax(shape: tuple[int, int]) -> None:
     similarity = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from dpmjax import cli, load_model
+from dpmjax import load_model
+from dpmjax.cli.slam import Config, slam_methods
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
 from dpmjax.metrics import absolute_trajectory_error
@@ -351,12 +352,12 @@ def test_the_head_predicts_overlap_where_it_is_trained(caplog) -> None:
     assert ("overlap head of these weights is untrained" in caplog.text) == ("overlap" not in trained)
 
 
-def test_the_proposer_is_no_option_of_the_paper(as_user) -> None:
-    from dpmjax.cli.slam import Config
-
+def test_options_of_one_method_are_refused_with_the_other(as_user) -> None:
     with pytest.raises(ValueError, match="--odometry"):
         Config(preset="paper", odometry="network")
-    assert issubclass(Config, cli.DriveOptions)
+    with pytest.raises(ValueError, match="--max-rmse"):
+        Config(max_rmse=2.5)
+    assert slam_methods(Config(preset="paper", max_rmse=2.5)).config.descriptors == DescriptorConfig(max_rmse_m=2.5)
 
 
 def test_submaps_are_in_the_frame_of_their_first_keyframe() -> None:

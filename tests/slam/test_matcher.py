@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.prepared_scans import expand_elements
+from dpmjax.deeppointmap.scan_registration import match_clouds
 from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry, ThinnedScan
+from dpmjax.slam.model_methods import union_of
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
 
@@ -83,3 +86,23 @@ def test_a_pair_has_a_match_and_a_target_an_overlap(matcher, scans, assert_compi
     four = Submap((*three.scans, first), np.concatenate([three.T_submap_keyframe, three.T_submap_keyframe[1:2]]))
     with assert_compiles_nothing():
         matcher.register([(one, four)])
+
+
+@pytest.mark.slow
+def test_submaps_are_matched_as_published_by_their_plain_unions(matcher, scans, assert_compiles_nothing) -> None:
+    first, second, third = map(matcher.encode, scans)
+    one, three = (Submap((first,), np.eye(4)[None]), Submap((second, first, third), np.linalg.inv(POSES[1]) @ POSES))
+    found = matcher.match(one, three)
+    model = dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
+    clouds = one.scans[0].cloud.described, union_of(three)
+    assert int(clouds[1].mask.sum()) == sum(int(scan.cloud.described.mask.sum()) for scan in three.scans)
+    expected = match_clouds(model, *clouds, config=MatchConfig())
+    np.testing.assert_allclose(found.T_target_source, expected.T_target_source[0], atol=1e-4)
+    assert found.probability == pytest.approx(float(expected.mean_score[0]))
+    assert found.rmse == pytest.approx(float(expected.rmse[0]))
+    assert np.linalg.eigvalsh(found.information).min() > 0
+    assert found.verification is None
+    # The number of scans is filled up: a submap of four needs no new program.
+    four = Submap((*three.scans, first), np.concatenate([three.T_submap_keyframe, three.T_submap_keyframe[1:2]]))
+    with assert_compiles_nothing():
+        matcher.match(one, four)

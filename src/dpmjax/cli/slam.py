@@ -51,6 +51,9 @@ class Config(cli.DriveOptions):
     odometry: Literal["prediction", "network"] | None = None
     """Source of the first guess of a pose: the motion of before, or the network for every scan; without it, the preset
     decides."""
+    max_rmse: float | None = None
+    """With --preset paper: largest error of an accepted registration, metres. The published 0.5 needs a decoder with
+    exact offsets; 2.5 suits dpm_small."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
     refine: FlagCreatePairsOff[bool] = False
@@ -66,6 +69,8 @@ class Config(cli.DriveOptions):
         self.check_data(self.data, self.sequence)
         if self.preset == "paper" and self.odometry is not None:
             raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
+        if self.preset != "paper" and self.max_rmse is not None:
+            raise ValueError("--max-rmse: give it with --preset paper")
 
 
 def main(config: Config) -> None:
@@ -137,6 +142,8 @@ def slam_methods(config: Config) -> slam.SlamMethods:
     settings = slam.slam_preset(config.preset)
     if config.odometry is not None:
         settings = replace(settings, odometry=replace(settings.odometry, proposer=config.odometry))
+    if config.max_rmse is not None:
+        settings = replace(settings, descriptors=replace(settings.descriptors, max_rmse_m=config.max_rmse))
     if config.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
     return slam.make_methods(weights.load_model(config.weights), settings, weights=config.weights)

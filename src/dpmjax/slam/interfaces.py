@@ -1,6 +1,6 @@
 """The parts of SLAM that are arguments: a matcher, the geometry of odometry, and settings.
 
-`model_methods` has those of a trained model: `SurfaceGeometry` aligns scans with the local map, `NetworkMatcher`
+`model_methods` makes those of a trained model: `SurfaceGeometry` aligns scans with the local map, `NetworkMatcher`
 recognises places.
 """
 
