@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import AbstractMesh
+from jax.sharding import AbstractMesh, AxisType
 from jax.sharding import PartitionSpec as P
 
 import dpmjax
@@ -161,7 +161,8 @@ def test_half_precision_gives_the_numbers_of_float32(kernel: Kernel) -> None:
 @each(KERNELS)
 def test_kernels_are_split_over_devices(kernel: Kernel) -> None:
     """`jax.shard_map` with its default checks, where the first array is split alone; nothing is compiled."""
-    mesh, arrays = AbstractMesh((8,), ("scans",)), example(kernel)
+    mesh = AbstractMesh((8,), ("scans",), axis_types=(AxisType.Auto,))
+    arrays = example(kernel)
     first, *others = arrays
     many = arrays | {first: jnp.stack([arrays[first]] * 8)}
     axes, specs = {first: 0} | dict.fromkeys(others), {first: P("scans")} | dict.fromkeys(others, P())

