@@ -16,6 +16,7 @@ from tqdm import tqdm
 from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.sequences import LidarSequence
 
 # Largest number of scans of an evaluation, all drives together.
@@ -146,7 +147,7 @@ class Records:
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
         self.run_s, self._pace_s = self.earlier_s, math.nan
-        self._seen: set[dpm.CurriculumStage] = set()
+        self._seed, self._seen = seed, set[Layout]()
         self._tell_compilation(self.start.state)
 
     def evaluate(self, model: dpm.Model) -> float:
@@ -235,10 +236,12 @@ class Records:
         return replace(start, state=found.state, best_params=found.state.params)
 
     def _tell_compilation(self, state: dpm.TrainingState) -> None:
-        stage = self._settings.stage_at(int(state.step))
-        if int(state.step) < int(state.end) and stage not in self._seen:
-            self._seen.add(stage)
-            self._bar.set_postfix_str(f"compiling {_stage_name(stage)}")
+        step = int(state.step)
+        capacity = layout_capacity(self._settings.layout_at(step, seed=self._seed), self._settings.sampling)
+        if step < int(state.end) and capacity not in self._seen:
+            self._seen.add(capacity)
+            maps = f"maps of {capacity.num_source} and {capacity.num_target} scans"
+            self._bar.set_postfix_str(f"{_stage_name(self._settings.stage_at(step))}, compiling {maps}")
 
     def __enter__(self) -> Records:
         return self

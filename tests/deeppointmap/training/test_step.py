@@ -210,6 +210,27 @@ def rate(state: TrainingState, step: int, config: TrainingConfig) -> float:
     return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config))
 
 
+def test_uniform_parameters_are_those_of_pytorchs_linear_layers() -> None:
+    params = init_training(jax.random.key(0), replace(toy.TRAINING, initialization="uniform")).params
+    of_path = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree.leaves_with_path(params)}
+    kernels = {path.removesuffix("['kernel']"): leaf for path, leaf in of_path.items() if path.endswith("['kernel']")}
+    assert len(kernels) > 10
+    scaled = []
+    for path, kernel in kernels.items():
+        bound = 1 / np.sqrt(kernel.shape[0])
+        for leaf in (kernel, of_path[f"{path}['bias']"]):
+            assert np.abs(leaf).max() <= bound
+            assert np.any(leaf != 0)
+            scaled.append((leaf / bound).ravel())
+    drawn = np.concatenate(scaled)
+    # Of the uniform distribution from -1 to 1, within four standard errors.
+    assert abs(drawn.mean()) < 4 * np.sqrt(1 / 3 / len(drawn))
+    assert abs(drawn.var() - 1 / 3) < 4 * np.sqrt(4 / 45 / len(drawn))
+    norms = [leaf for path, leaf in of_path.items() if "norm" in path]
+    assert norms
+    assert all(np.all(leaf == leaf.flat[0]) for leaf in norms)
+
+
 EIGHT_DEVICES = """
 import jax, numpy as np
 from dpmjax.deeppointmap import SampleMaker, init_training
