@@ -77,7 +77,7 @@ def split_places(drive: LidarSequence) -> PlaceSplit:
     positions = poses[:, :3, 3]
     is_near = np.zeros(len(rows), bool)
     if is_held_out.any():
-        is_near = cKDTree(positions[is_held_out]).query(positions)[0] < margin_m
+        is_near = np.asarray(cKDTree(positions[is_held_out]).query(positions)[0] < margin_m)
     is_trained = ~is_held_out & ~is_near
     if np.sum(is_trained) < len(rows) / 2 or np.sum(is_held_out) < 2:
         return PlaceSplit(rows, rows[:0])
