@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import (
+    ObjectiveConfig,
     PairKind,
     draw_evaluation_pairs,
     evaluate_registration,
@@ -17,8 +17,8 @@ from dpmjax.deeppointmap import (
     measure_offsets,
     offset_quality,
 )
+from dpmjax.deeppointmap.training import evaluation as evaluation_module
 from dpmjax.deeppointmap.training.step import encode_sample
-from dpmjax.geometry.pyramid import PyramidStage
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
@@ -50,19 +50,19 @@ def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(asse
 
 
 @pytest.mark.slow
-def test_offsets_of_an_evaluation_are_those_of_its_pairs() -> None:
-    # As many descriptors as points, so that many are close.
-    stages = (PyramidStage(128, (0.2,), 8), PyramidStage(8, (0.4,), 4))
-    config = replace(toy.MODEL, pyramid=replace(toy.MODEL.pyramid, stages=stages))
-    model = init_model(jax.random.key(0), config)
-    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, config)
+@pytest.mark.slow
+def test_offsets_of_an_evaluation_are_those_of_its_pairs(monkeypatch) -> None:
+    wide = ObjectiveConfig(offset_radius_m=10.0)  # the points of the toy lie far apart
+    monkeypatch.setattr(evaluation_module, "TRAINED", wide)
+    model = init_model(jax.random.key(0), toy.SLAM_MODEL)
+    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, toy.SLAM_MODEL)
     evaluation, some = evaluate_registration(model, pairs), pairs.pairs[0]
     sources, targets = (
         [jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in rows[:, 0]]
         for rows in (some.sources, some.targets)
     )
     motions = pairs.true_motions(some).astype(np.float32)
-    expected = offset_quality(model, zip(sources, targets, motions, strict=True))
+    expected = offset_quality(model, zip(sources, targets, motions, strict=True), config=wide)
     found = measure_offsets(evaluation.offsets)
     assert found.num_pairs == expected.num_pairs > 0
     np.testing.assert_allclose(found.r2, expected.r2, **ACCUMULATED)
