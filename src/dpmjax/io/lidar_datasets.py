@@ -49,7 +49,9 @@ def find_pose_file(*homes: Path) -> Path | None:
     return next((home / name for home in homes for name in POSE_FILES if (home / name).is_file()), None)
 
 
-def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) -> Drive3D:
+def read_plain_drive(
+    folder: Path, drive: Drive3D, poses: Path | None = None, in_camera: Sequence[Path] = ()
+) -> Drive3D:
     """Adds the poses of a pose file, and times.txt, beside or above the scans.
 
     Args:
@@ -57,6 +59,8 @@ def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) ->
         drive: name and scans.
         poses: the pose file; None looks for the usual names in the folders. Poses that move as those of a camera come
             into the lidar's frame where a calib.txt with `Tr` lies beside.
+        in_camera: KITTI's places of poses of its left camera, after poses_lidar.txt. They need `Tr` in calib.txt, and
+            rows without times are matched by the numbers of the scans.
 
     Returns:
         The drive.
@@ -67,18 +71,24 @@ def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) ->
     scans = drive.files[0].parent
     is_below = scans.name in ("data", "scans", "lidar", "velodyne")
     homes = [scans, scans.resolve().parent] if is_below else [scans]
-    path = poses or find_pose_file(*homes)
+    in_lidar = [home / "poses_lidar.txt" for home in homes]
+    path = poses or next((file for file in (*in_lidar, *in_camera) if file.is_file()), find_pose_file(*homes))
     times, notes = scan_times(homes, drive.files)
     drive = drive._replace(times=times, notes=notes)
     if path is None:
         return drive
+    found = read_stamped_poses(path)
+    if path in in_camera:
+        found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
     try:
-        T, pose_notes = match_reference(read_stamped_poses(path), times, len(drive.files), path)
+        if in_camera and found.stamps is None:
+            found = found._replace(poses=match_rows(found.poses, drive.files, path))
+        T, pose_notes = match_reference(found, times, len(drive.files), path)
     except InputError:
         log_notes(notes)  # times.txt may be the reason
         raise
     calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
-    if calibration is not None and camera_note(T, path) is not None:
+    if calibration is not None and path not in in_camera and camera_note(T, path) is not None:
         T = _from_camera(T, calibration)
     return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
 
@@ -113,29 +123,15 @@ def _read_learned(folder: Path, drive: Drive3D) -> Drive3D:
 def _read_kitti(folder: Path, drive: Drive3D) -> Drive3D:
     """Adds poses and times of KITTI odometry.
 
-    Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
-    poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up; they need `Tr` in calib.txt. Last
-    come files of other usual names, in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the
-    scans.
+    Poses of the left camera are searched in poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders
+    up: of the folder as it was given, because it may be a link, and the poses lie beside the link.
 
     Returns:
         The drive.
     """
-    # As it was given: the folder may be a link, and the poses lie beside the link.
     given = Path(os.path.abspath(folder))
-    in_camera = [folder / "poses.txt", given.parent.parent / "poses" / f"{given.name}.txt"]
-    path = next((p for p in (folder / "poses_lidar.txt", *in_camera) if p.is_file()), find_pose_file(folder))
-    times, notes = scan_times([folder], drive.files)
-    drive = drive._replace(times=times, notes=notes)
-    if path is None:
-        return drive
-    found = read_stamped_poses(path)
-    if path in in_camera:
-        found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
-    if found.stamps is None:
-        return drive._replace(T_world_lidar=match_rows(found.poses, drive.files, path))
-    T, pose_notes = match_reference(found, times, len(drive.files), path)
-    return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
+    above = given.parent.parent / "poses" / f"{given.name}.txt"
+    return read_plain_drive(folder, drive, in_camera=(folder / "poses.txt", above))
 
 
 def _read_kitti_raw(folder: Path, drive: Drive3D) -> Drive3D:
