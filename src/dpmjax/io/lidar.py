@@ -90,15 +90,9 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
     columns, note = columns_of_drive(files, bin_columns)
     notes = tuple(each for each in (folder_note(files[0].parent), *drive.notes, note) if each is not None)
-    return LidarSequence(
-        name=drive.name,
-        sources=tuple(map(str, files)),
-        read_scan=lambda index: read_timed_cloud(files[index], columns).points,
-        T_world_lidar=drive.T_world_lidar,
-        times=drive.times,
-        read_times=lambda index: read_point_times(files[index]),
-        notes=notes,
-    )
+    sources, T, times = tuple(map(str, files)), drive.T_world_lidar, drive.times
+    read_scan, read_times = lambda i: read_timed_cloud(files[i], columns).points, lambda i: read_point_times(files[i])
+    return LidarSequence(drive.name, sources, read_scan, T, times, read_times, notes)
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:

@@ -12,7 +12,7 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
+from dpmjax.io.poses import StampedPoses, check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, match_rows, matching_note, scan_times
 from dpmjax.io.scan_names import POSE_FILES, last_numbers, scan_files
 from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
@@ -173,7 +173,7 @@ def _with_kitti_360_poses(root: Path, drive: Drive3D) -> Drive3D:
     lidar = calibration / "calib_cam_to_velo.txt"
     T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(from_rows(_first_row(lidar, 12), lidar))
     numbers = np.array(last_numbers(drive.files), np.float64)
-    return _interpolate(drive, numbers, (rows[:, 0], T_world_lidar), path, how="the numbers of the frames")
+    return _interpolate(drive, numbers, StampedPoses(T_world_lidar, rows[:, 0]), path, slack=0.0)
 
 
 def _read_carla(folder: Path, drive: Drive3D) -> Drive3D:
@@ -217,25 +217,18 @@ def _read_mulran(folder: Path, drive: Drive3D) -> Drive3D:
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
     poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    return _interpolate(drive, times, (pose_times, poses), path, how="time", slack=_MULRAN_SLACK_S)
+    return _interpolate(drive, times, StampedPoses(poses, pose_times), path, slack=_MULRAN_SLACK_S)
 
 
-def _interpolate(
-    drive: Drive3D,
-    wanted: FloatArray,
-    stamped: tuple[FloatArray, FloatArray],
-    path: Path,
-    *,
-    how: str,
-    slack: float = 0.0,
-) -> Drive3D:
-    """Adds interpolated poses, relative to the first, to the scans within `slack` of the times of the poses."""
-    times, first = np.unique(stamped[0], return_index=True)
-    kept = (wanted >= times[0] - slack) & (wanted <= times[-1] + slack)
+def _interpolate(drive: Drive3D, wanted: FloatArray, found: StampedPoses, path: Path, slack: float) -> Drive3D:
+    """Adds interpolated poses, relative to the first, to the scans within `slack` of the stamps of the poses."""
+    stamps, first = np.unique(np.asarray(found.stamps), return_index=True)
+    kept = (wanted >= stamps[0] - slack) & (wanted <= stamps[-1] + slack)
     require(kept.any(), path, "no scan lies within the times of the poses", "give scans and poses of one drive")
-    T = interpolate_poses(times, stamped[1][first], wanted)
+    T = interpolate_poses(stamps, found.poses[first], wanted)
     # In the frame of the first, without the 1e6 m of national grids.
     T = np.where(kept[:, None, None], rigid.inverse(T[kept.argmax()]) @ T, np.nan)
+    how = "time" if slack else "the numbers of the frames"
     return drive._replace(T_world_lidar=T, notes=(*drive.notes, matching_note(path, how, T)))
 
 
