@@ -226,6 +226,18 @@ def test_a_mounting_that_is_published_again_stays_one(
     np.testing.assert_allclose(scans.odometry_poses, se2.compose(POSES, T_BASE_LASER), atol=1e-6)
 
 
+def test_a_laser_that_moves_on_a_moving_robot_has_no_odometry(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a", "bag") as bag:
+        for index, pose in enumerate(POSES):
+            stamp = EPOCH_NS + index * STEP_NS
+            bag.write_transform(("odom", "base_link"), pose, stamp)
+            bag.write_transform(("base_link", "laser"), np.array([0, 0, 0.1 * index]), stamp)
+            bag.write_scan(room(pose), stamp)
+    scans = read_sequence(bag.path)
+    assert scans.odometry_poses is None
+    assert "laser moves in base_link, and this in odom" in scans.notes[0].text
+
+
 def test_a_laser_upside_down_is_turned(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
         bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS, topic="/tf_static", is_upside_down=True)

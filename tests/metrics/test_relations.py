@@ -62,10 +62,10 @@ def test_files_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3\n", "3 numbers a line"),
+        ("1 2 3\n", "not finite; a line reads t1 t2"),
         ("", "no row"),
         ("1 2 3 4 5 0 0 0\n", "a height or a tilt"),
-        ("1 2 nan 4 0 0 0 0\n", "NaN"),
+        ("1 2 nan 4 0 0 0 0\n", "not finite; a line reads t1 t2"),
         ("1 2 x 4 0 0 0 0\n", "not a number"),
     ],
 )

@@ -197,9 +197,9 @@ def test_a_simulated_sequence_is_written_and_read_as_kitti(tmp_path):
 
 def test_a_street_is_laid_along_a_real_drive(real_data):
     from dpmjax.io import read_poses
-    from dpmjax.io.lidar_datasets import read_labelled_numbers
+    from dpmjax.io.lidar_datasets import read_labelled
 
-    tr = read_labelled_numbers(real_data / "poses" / "kitti_00_calib.txt")["Tr"]
+    tr = read_labelled(real_data / "poses" / "kitti_00_calib.txt", ("Tr",), 12, "give Tr")
     T_cam0_lidar = np.vstack([tr.reshape(3, 4), [0, 0, 0, 1]])
     real = np.linalg.inv(T_cam0_lidar) @ read_poses(real_data / "poses" / "kitti_07.txt") @ T_cam0_lidar
     town = make_town(0, trajectory=real)

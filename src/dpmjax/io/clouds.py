@@ -118,8 +118,7 @@ def parse_pcd(content: bytes, source: str) -> TimedCloud:
         kinds = zip(names, entries["TYPE"], sizes, counts, strict=True)
         record = np.dtype([(f"{i}", f"<{_PCD_TYPES[t]}{size}", (n,)) for i, (_, t, size, n) in enumerate(kinds)])
         count = math.prod(map(int, entries.get("POINTS") or [*entries["WIDTH"], *entries["HEIGHT"]]))
-        if count < 0:
-            raise ValueError(f"{count} points")
+    require(count >= 0, source, f"broken PCD header ({count} points)", advice)
     for name in ("x", "y"):
         is_there = name in names and counts[names.index(name)] > 0
         require(is_there, source, f"fields are {' '.join(names)}", f"the file needs a column {name}")

@@ -174,8 +174,9 @@ def _read_clouds(
 
 
 def _read_matrix(path: Path, size: int) -> FloatArray:
-    matrix = read_table(path, size)
-    require(len(matrix) == size, path, f"a matrix of {matrix.shape}", f"give {size} x {size} finite numbers")
+    matrix = read_table(path)
+    is_good = matrix.shape == (size, size) and bool(np.isfinite(matrix).all())
+    require(is_good, path, f"a matrix of {matrix.shape}", f"give {size} x {size} finite numbers")
     return matrix
 
 
@@ -210,9 +211,9 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
 
 
 def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    kinds = (ValueError, AttributeError, RecursionError)
+    content, kinds = read_bytes(path), (ValueError, AttributeError, RecursionError)
     with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
-        links = json.loads(read_bytes(path))
+        links = json.loads(content)
         return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
 
 

@@ -201,14 +201,14 @@ def to_numbers(rows: Sequence[tuple[int, Sequence[str]]], source: str | Path) ->
     require(len(rows) > 0, source, "no row", "write rows of numbers")
     try:
         return np.array([[float(word) for word in words] for _, words in rows])
-    except ValueError:
+    except ValueError as error:
         for line, words in rows:
             found = f"line {line} has {len(words)} columns, line {rows[0][0]} has {len(rows[0][1])}"
             require(len(words) == len(rows[0][1]), source, found, "give rows of equal length")
             for column, word in enumerate(words, 1):
                 found = f"line {line}, column {column}: {word[:40]!r} is not a number"
                 require(is_number(word), source, found, "write plain decimal numbers")
-        raise
+        raise InputError(source, f"no table of numbers ({error})", "write plain decimal numbers") from error
 
 
 def read_table(path: str | Path, width: int | None = None) -> FloatArray:
@@ -258,13 +258,13 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     require(not Path(path).is_dir(), path, "a folder", "give one file")
     content = read_bytes(path)
     require(len(content) > 0, path, "an empty file of 0 bytes", "copy it again")
-    found, advice = "not a readable NumPy file ({error})", "save it again with numpy.save or numpy.savez"
+    advice = "save it again with numpy.save or numpy.savez"
+    is_numpy = content.startswith((npy_format.MAGIC_PREFIX, b"PK"))
+    require(is_numpy, path, "not a readable NumPy file (it has no header of NumPy)", advice)
     # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
-    with refusing(path, found, advice, (Exception,)):
+    with refusing(path, "not a readable NumPy file ({error})", advice, (Exception,)):
         if content.startswith(npy_format.MAGIC_PREFIX):
             return {"points": _parse_npy(content)}
-        if not content.startswith(b"PK"):
-            raise ValueError("it has no header of NumPy")
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {name.removesuffix(".npy"): name for name in archive.namelist()}
             chosen = [key for key in (members if keys is None else keys) if key in members]

@@ -17,7 +17,7 @@ from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, order_note
 from dpmjax.io.scan_bags import is_bag, open_lidar_bag
 from dpmjax.io.scan_names import folder_note
-from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
+from dpmjax.sequences import InputError, LidarSequence, Note, require
 
 _FORMATS = (
     "a KITTI sequence (velodyne/, calib.txt), a KITTI raw or KITTI-360 drive (velodyne_points/data), a MulRan folder "
@@ -88,17 +88,11 @@ def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lid
     drive = read_drive(path, poses)
     files = drive.files
     require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    bin_columns, note = columns_of_drive(files, bin_columns)
-    notes = (folder_note(files[0].parent), *drive.notes, note)
-
-    def read_scan(index: int) -> NDArray[np.float32]:
-        return read_timed_cloud(files[index], bin_columns).points
-
-    def read_times(index: int) -> FloatArray | None:
-        return read_point_times(files[index])
-
-    sources, kept = tuple(map(str, files)), tuple(note for note in notes if note is not None)
-    return LidarSequence(drive.name, sources, read_scan, drive.T_world_lidar, drive.times, read_times, kept)
+    columns, note = columns_of_drive(files, bin_columns)
+    notes = tuple(each for each in (folder_note(files[0].parent), *drive.notes, note) if each is not None)
+    sources, T, times = tuple(map(str, files)), drive.T_world_lidar, drive.times
+    read_scan, read_times = lambda i: read_timed_cloud(files[i], columns).points, lambda i: read_point_times(files[i])
+    return LidarSequence(drive.name, sources, read_scan, T, times, read_times, notes)
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
@@ -130,11 +124,8 @@ def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = No
     files = [Path(source) for source in sequence.sources if source.lower().endswith(".bin")]
     columns = bin_columns or columns_of_drive(files)[0]
     for file in files:
-        try:
-            size = file.stat().st_size
-        except OSError as error:
-            raise InputError(file, f"cannot be read ({error.strerror})", "check the file") from error
-        check_size(file, size, columns)
+        require(file.is_file(), file, "no such file", "copy it again")
+        check_size(file, file.stat().st_size, columns)
 
 
 def list_lidar_sequences(path: str | Path) -> list[str]:
@@ -157,17 +148,13 @@ def _choose(path: Path, sequence: str | None) -> Path:
     converter = "convert it to a bag or to .pcd files with ouster-cli (Ouster) or velodyne-decoder (Velodyne)"
     require(capture is None, path, f"a capture of {capture}, which is not read", converter)
     require(not path.is_file(), path, "a single file", "give the folder that holds all scans of the drive")
-    is_whole = is_drive(path)
-    if sequence is None and is_whole:
+    if is_drive(path) and sequence in (None, path.resolve().name):
         return path
     drives = _drives(path)
     known = ", ".join(sorted(drives, key=natural_key)[:30])
     if sequence is not None:
-        if sequence not in drives and is_whole and path.resolve().name == sequence:
-            return path
-        held = f"it has {known}" if drives else "it is one drive without a name" if is_whole else "it has no scans"
-        advice = "name one of those" if drives else "leave the name out, or give another folder"
-        require(sequence in drives, path, f"no sequence {sequence}, {held}", advice)
+        found = f"no sequence {sequence}, it has {known or 'none'}"
+        require(sequence in drives, path, found, "name one of those, or leave the name out")
         return drives[sequence]
     require(len(drives) > 0, path, "a folder without scans", f"give {_FORMATS}")
     require(len(drives) == 1, path, f"{len(drives)} sequences: {known}", "name one of them, or give its folder")

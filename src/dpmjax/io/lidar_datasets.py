@@ -12,7 +12,7 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
-from dpmjax.io.poses import check_poses, from_rows, interpolate_poses, read_stamped_poses
+from dpmjax.io.poses import StampedPoses, check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, match_rows, matching_note, scan_times
 from dpmjax.io.scan_names import POSE_FILES, last_numbers, scan_files
 from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
@@ -49,7 +49,9 @@ def find_pose_file(*homes: Path) -> Path | None:
     return next((home / name for home in homes for name in POSE_FILES if (home / name).is_file()), None)
 
 
-def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) -> Drive3D:
+def read_plain_drive(
+    folder: Path, drive: Drive3D, poses: Path | None = None, in_camera: Sequence[Path] = ()
+) -> Drive3D:
     """Adds the poses of a pose file, and times.txt, beside or above the scans.
 
     Args:
@@ -57,6 +59,8 @@ def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) ->
         drive: name and scans.
         poses: the pose file; None looks for the usual names in the folders. Poses that move as those of a camera come
             into the lidar's frame where a calib.txt with `Tr` lies beside.
+        in_camera: KITTI's places of poses of its left camera, after poses_lidar.txt. They need `Tr` in calib.txt, and
+            rows without times are matched by the numbers of the scans.
 
     Returns:
         The drive.
@@ -67,18 +71,24 @@ def read_plain_drive(folder: Path, drive: Drive3D, poses: Path | None = None) ->
     scans = drive.files[0].parent
     is_below = scans.name in ("data", "scans", "lidar", "velodyne")
     homes = [scans, scans.resolve().parent] if is_below else [scans]
-    path = poses or find_pose_file(*homes)
+    in_lidar = [home / "poses_lidar.txt" for home in homes]
+    path = poses or next((file for file in (*in_lidar, *in_camera) if file.is_file()), find_pose_file(*homes))
     times, notes = scan_times(homes, drive.files)
     drive = drive._replace(times=times, notes=notes)
     if path is None:
         return drive
+    found = read_stamped_poses(path)
+    if path in in_camera:
+        found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
     try:
-        T, pose_notes = match_reference(read_stamped_poses(path), times, len(drive.files), path)
+        if in_camera and found.stamps is None:
+            found = found._replace(poses=match_rows(found.poses, drive.files, path))
+        T, pose_notes = match_reference(found, times, len(drive.files), path)
     except InputError:
         log_notes(notes)  # times.txt may be the reason
         raise
     calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
-    if calibration is not None and camera_note(T, path) is not None:
+    if calibration is not None and path not in in_camera and camera_note(T, path) is not None:
         T = _from_camera(T, calibration)
     return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
 
@@ -113,29 +123,15 @@ def _read_learned(folder: Path, drive: Drive3D) -> Drive3D:
 def _read_kitti(folder: Path, drive: Drive3D) -> Drive3D:
     """Adds poses and times of KITTI odometry.
 
-    Poses in the lidar's frame are searched in poses_lidar.txt. Poses in the left camera's frame are searched in
-    poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders up; they need `Tr` in calib.txt. Last
-    come files of other usual names, in the lidar's frame. Rows of TUM are matched by time, others by the numbers of the
-    scans.
+    Poses of the left camera are searched in poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders
+    up: of the folder as it was given, because it may be a link, and the poses lie beside the link.
 
     Returns:
         The drive.
     """
-    # As it was given: the folder may be a link, and the poses lie beside the link.
     given = Path(os.path.abspath(folder))
-    in_camera = [folder / "poses.txt", given.parent.parent / "poses" / f"{given.name}.txt"]
-    path = next((p for p in (folder / "poses_lidar.txt", *in_camera) if p.is_file()), find_pose_file(folder))
-    times, notes = scan_times([folder], drive.files)
-    drive = drive._replace(times=times, notes=notes)
-    if path is None:
-        return drive
-    found = read_stamped_poses(path)
-    if path in in_camera:
-        found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
-    if found.stamps is None:
-        return drive._replace(T_world_lidar=match_rows(found.poses, drive.files, path))
-    T, pose_notes = match_reference(found, times, len(drive.files), path)
-    return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
+    above = given.parent.parent / "poses" / f"{given.name}.txt"
+    return read_plain_drive(folder, drive, in_camera=(folder / "poses.txt", above))
 
 
 def _read_kitti_raw(folder: Path, drive: Drive3D) -> Drive3D:
@@ -177,7 +173,7 @@ def _with_kitti_360_poses(root: Path, drive: Drive3D) -> Drive3D:
     lidar = calibration / "calib_cam_to_velo.txt"
     T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(from_rows(_first_row(lidar, 12), lidar))
     numbers = np.array(last_numbers(drive.files), np.float64)
-    return _interpolate(drive, numbers, (rows[:, 0], T_world_lidar), path, how="the numbers of the frames")
+    return _interpolate(drive, numbers, StampedPoses(T_world_lidar, rows[:, 0]), path, slack=0.0)
 
 
 def _read_carla(folder: Path, drive: Drive3D) -> Drive3D:
@@ -221,25 +217,18 @@ def _read_mulran(folder: Path, drive: Drive3D) -> Drive3D:
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
     poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    return _interpolate(drive, times, (pose_times, poses), path, how="time", slack=_MULRAN_SLACK_S)
+    return _interpolate(drive, times, StampedPoses(poses, pose_times), path, slack=_MULRAN_SLACK_S)
 
 
-def _interpolate(
-    drive: Drive3D,
-    wanted: FloatArray,
-    stamped: tuple[FloatArray, FloatArray],
-    path: Path,
-    *,
-    how: str,
-    slack: float = 0.0,
-) -> Drive3D:
-    """Adds interpolated poses, relative to the first, to the scans within `slack` of the times of the poses."""
-    times, first = np.unique(stamped[0], return_index=True)
-    kept = (wanted >= times[0] - slack) & (wanted <= times[-1] + slack)
+def _interpolate(drive: Drive3D, wanted: FloatArray, found: StampedPoses, path: Path, slack: float) -> Drive3D:
+    """Adds interpolated poses, relative to the first, to the scans within `slack` of the stamps of the poses."""
+    stamps, first = np.unique(np.asarray(found.stamps), return_index=True)
+    kept = (wanted >= stamps[0] - slack) & (wanted <= stamps[-1] + slack)
     require(kept.any(), path, "no scan lies within the times of the poses", "give scans and poses of one drive")
-    T = interpolate_poses(times, stamped[1][first], wanted)
+    T = interpolate_poses(stamps, found.poses[first], wanted)
     # In the frame of the first, without the 1e6 m of national grids.
     T = np.where(kept[:, None, None], rigid.inverse(T[kept.argmax()]) @ T, np.nan)
+    how = "time" if slack else "the numbers of the frames"
     return drive._replace(T_world_lidar=T, notes=(*drive.notes, matching_note(path, how, T)))
 
 

@@ -267,7 +267,10 @@ def read_relations(path: str | Path) -> Relations:
         InputError: the file is missing, has another number of columns, holds words that are no numbers, or relations
             that leave the plane.
     """
-    table = read_table(path, 8)  # t1 t2 x y z roll pitch yaw
+    table = read_table(path)
+    is_good = table.shape[1] == 8 and bool(np.isfinite(table).all())
+    advice = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
+    require(is_good, path, f"rows of {table.shape[1]} numbers, or some not finite", advice)
     is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
     require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")
     return Relations(table[:, 0], table[:, 1], table[:, [2, 3, 7]])

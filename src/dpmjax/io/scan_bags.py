@@ -277,6 +277,14 @@ def _odometry(bag: _Bag, frame: str, times: FloatArray) -> tuple[FloatArray | No
         if top in motions and motions[top].is_constant and motions[top].parent not in _MAP_FRAMES:
             T_top_laser, top = motions[top].T_parent_child[0] @ T_top_laser, motions[top].parent
     found, what = motions.get(top), f"odometry of the transforms to {frame}"
+    above = None if found is None else motions.get(found.parent)
+    if (
+        found
+        and above
+        and not (found.is_constant or above.is_constant or {found.parent, above.parent} & {*_MAP_FRAMES})
+    ):
+        text = f"{bag.path}: {top} moves in {found.parent}, and this in {above.parent}; such odometry is not used"
+        return None, is_upside_down, (Note(text, is_doubt=True),)
     if found is None or found.is_constant or found.parent in _MAP_FRAMES or not _covers(found.times, times):
         topics = bag.of_kinds(_ODOMETRY)
         names = ", ".join(topics)

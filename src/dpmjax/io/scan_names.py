@@ -139,9 +139,10 @@ def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
 
 
 def _counted_stamps(numbers: Sequence[str]) -> FloatArray | None:
-    """Reads stamps (n,) s whose nanoseconds have no leading zeros, so that 5.7 is 5 s and 7 ns.
+    """Reads stamps whose nanoseconds have no leading zeros, so that 5.7 is 5 s and 7 ns.
 
-    None where these are no such stamps, or where their steps are no more even than those of decimals.
+    Returns:
+        (n,) s; None where these are no such stamps, or where their steps are no more even than those of decimals.
     """
     pairs = [number.split(".") for number in numbers]
     is_stamp = all(len(pair) == 2 and len(pair[0]) >= _STAMP_DIGITS for pair in pairs)

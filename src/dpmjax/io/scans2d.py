@@ -185,7 +185,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     table = load_arrays(path)
     notes: tuple[Note, ...] = ()
     if "points" in table:
-        points = _take(table, "points", [(-1, -1, 2), (-1, -1, 3)], path)
+        points = _take_array(table, "points", [(-1, -1, 2), (-1, -1, 3)], path)
         heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:]
         is_planar = not heights.size or float(np.ptp(heights)) <= _LARGEST_HEIGHT
         found = "the third coordinates of the points differ"
@@ -196,12 +196,12 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     n, b = points.shape[:2]
     mask = (np.isnan(points).sum(axis=2) < 2) & ~np.isinf(points).any(axis=2) & points.any(axis=2)
     if "mask" in table:
-        mask &= _take(table, "mask", [(n, b)], path) != 0
+        mask &= _take_array(table, "mask", [(n, b)], path) != 0
     stored = np.where(mask[..., None], to_float32(points), np.float32(0))
     bad = np.argwhere(~np.isfinite(stored).all(axis=2))
     found = f"{len(bad)} NaN or infinite points, the first in scan, beam {bad[:1].tolist()}"
     require(not len(bad), path, found, "mark an invalid beam by NaN in both coordinates")
-    times = _take(table, "times", [(n,)], path) if "times" in table else None
+    times = _take_array(table, "times", [(n,)], path) if "times" in table else None
     require(times is None or np.isfinite(times).all(), path, "times that are not finite", "give finite seconds")
     stated = str(table.get("unit", "m"))
     require(stated in ("px", "m"), path, f"unit is {stated!r}", "say 'px' or 'm'")
@@ -211,7 +211,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
     return ScanSequence(Path(path).stem, stored, mask, unit or cast(Unit, stated), poses, odometry, times, notes)
 
 
-def _take(table: Table, key: str, shapes: list[tuple[int, ...]], path: str | Path) -> FloatArray:
+def _take_array(table: Table, key: str, shapes: list[tuple[int, ...]], path: str | Path) -> FloatArray:
     """Returns an array of numbers of one of these shapes, in which -1 stands for any length."""
     require(key in table, path, f"no array {key} among {', '.join(table) or 'none'}", f"give {_KEYS}")
     array = table[key]
@@ -226,8 +226,8 @@ def _take(table: Table, key: str, shapes: list[tuple[int, ...]], path: str | Pat
 
 def _points_of_ranges(table: Table, path: str | Path) -> tuple[FloatArray, tuple[Note, ...]]:
     """Computes end points, NaN for beams without a hit, with a note where the angles are taken as degrees."""
-    ranges = _take(table, "ranges", [(-1, -1)], path)
-    angles = _take(table, "angles", [ranges.shape, ranges.shape[1:]], path)
+    ranges = _take_array(table, "ranges", [(-1, -1)], path)
+    angles = _take_array(table, "angles", [ranges.shape, ranges.shape[1:]], path)
     found = "angles hold NaN, infinite or huge values"
     require((np.abs(angles) < 1e6).all(), path, found, "give a direction to every beam, in radians")
     notes: tuple[Note, ...] = ()
