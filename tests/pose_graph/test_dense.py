@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -95,7 +93,7 @@ def test_batch_is_the_call_and_compiles_once(assert_compiles_nothing) -> None:
 @pytest.mark.slow
 @KINDS
 def test_gradient_is_that_of_differences(tangent: int, float64) -> None:
-    poses, edges = arrays_of(3, tangent, noise=0.03, start=0.05)
+    poses, edges = arrays_of(3, tangent, count=6, noise=0.03, start=0.05)
     rng = np.random.default_rng(4)
     reading = jnp.asarray(rng.normal(size=poses.shape))
     num_edges = len(edges.source)
@@ -121,9 +119,6 @@ def test_gradient_is_that_of_differences(tangent: int, float64) -> None:
         slope = float((ends[0] - ends[1]) / 2e-5)
         assert abs(slope) > 1e-3
         assert float(jnp.sum(gradient[name] * direction)) == pytest.approx(slope, rel=1e-6, abs=1e-6), name
-    along_all: Callable[[dict[str, jax.Array]], Any] = partial(jax.jvp, function, (still,))
-    total = sum(float(jnp.sum(gradient[name] * along[name])) for name in along)
-    assert float(along_all((along,))[1]) == pytest.approx(total, rel=1e-9)
 
 
 def test_start_of_free_nodes_has_no_gradient() -> None:
