@@ -200,7 +200,8 @@ class Records:
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys(RECALLS, math.nan)
         self.run_s = self.earlier_s
         self._seen: set[dpm.CurriculumStage] = set()
-        self._tell_compilation(self.start.state)
+        if total:
+            self._tell_compilation(self.start.state)
 
     def evaluate(self, model: dpm.Model) -> float:
         """Returns the mean recall of the pairs of scans that choose the model."""
