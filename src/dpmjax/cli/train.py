@@ -162,8 +162,10 @@ def main(config: Config) -> None:
             settings = for_devices(settings, len(store.table))
             records = None
             if folder is not None:
-                print(f"{len(store.table)} scans; {config.preset}: {settings.num_steps} steps at most")
                 settings = without_impossible_stage(settings, store)
+                steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(len(store.table))}
+                of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
+                print(f"{len(store.table)} scans; {config.preset}: at most {of_stages}")
                 selection = select_pairs(config, settings, sources, on_wait)
                 is_last = config.preset == "paper"
                 records = Records(folder, settings, selection, seed=config.seed, weights=first, takes_last=is_last)

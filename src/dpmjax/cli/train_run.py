@@ -148,7 +148,8 @@ class Records:
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
         self.run_s, self._pace_s = self.earlier_s, math.nan
         self._seed, self._seen = seed, set[Layout]()
-        self._tell_compilation(self.start.state)
+        if total:
+            self._tell_compilation(self.start.state)
 
     def evaluate(self, model: dpm.Model) -> float:
         """Returns the mean recall of the pairs of scans that choose the model, and measures their offsets."""
