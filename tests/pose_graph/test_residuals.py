@@ -100,7 +100,7 @@ def test_wrong_shapes_are_named() -> None:
         residuals(poses, edges._replace(information=edges.information[1:]))
 
 
-def test_host_solver_refuses_traced_arrays_and_names_the_solver_that_takes_them() -> None:
+def test_host_solver_refuses_traced_arrays_and_names_the_solver_that_takes_them(as_user) -> None:
     graph = random_graph(0, 3)
     for call in (
         lambda poses: optimize_pose_graph(PoseGraph.create(poses, graph.edges)).chi2,
