@@ -33,7 +33,7 @@ def runs_on_host(instead: str) -> Callable[[Callable[Arguments, Result]], Callab
         @functools.wraps(function)
         def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
-                name = function.__name__
+                name = function.__qualname__
                 raise ValueError(f"{name}: runs on the host and cannot be traced by jit, vmap or grad; {instead}")
             return function(*args, **kwargs)
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
+
+from dpmjax.checks import runs_on_host
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -82,6 +83,7 @@ class PoseGraph:
     ids: Indices
 
     @classmethod
+    @runs_on_host("call pose_graph.residuals or pose_graph.solve_dense there")
     def create(
         cls, poses: ArrayLike, edges: Edges, *, is_fixed: ArrayLike | None = None, ids: ArrayLike | None = None
     ) -> PoseGraph:
@@ -100,7 +102,6 @@ class PoseGraph:
             ValueError: the shapes do not match, a number is not finite, an edge joins no two nodes of the graph, an
                 information matrix is not symmetric and positive semidefinite, or an array is traced.
         """
-        require_untraced("PoseGraph", poses, edges, is_fixed, ids)
         poses = np.asarray(poses, np.float64)
         source, target = (np.asarray(rows, np.int64) for rows in edges[:2])
         edges = Edges(source, target, *(np.asarray(values, np.float64) for values in edges[2:]))
@@ -126,20 +127,6 @@ class PoseGraph:
         held = self.is_fixed.copy()
         held[first[~has_fixed]] = True
         return held
-
-
-def require_untraced(name: str, *arguments: Any) -> None:
-    """Refuses traced arrays, which the host cannot read.
-
-    Args:
-        name: name of what was called, for the message.
-        *arguments: its arguments.
-
-    Raises:
-        ValueError: one of them is traced, as inside of `jax.jit`, `jax.grad` or `jax.vmap`.
-    """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
-        raise ValueError(f"{name}: runs on the host and cannot be traced; `pose_graph.solve_dense` can")
 
 
 def _require(is_right: bool | np.bool_, name: str, expected: str, got: Any) -> None:

@@ -18,10 +18,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from dpmjax.checks import require_count, require_positive
+from dpmjax.checks import require_count, require_positive, runs_on_host
 from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
-from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph, require_untraced
+from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph
 from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
 
 LOGGER = logging.getLogger(__name__)
@@ -95,6 +95,7 @@ class _State(NamedTuple):
     is_converged: bool = False
 
 
+@runs_on_host("call pose_graph.solve_dense there")
 def optimize_pose_graph(
     graph: PoseGraph, config: PoseGraphConfig | None = None, *, trust: Floats | float = 1.0
 ) -> OptimizedPoseGraph:
@@ -115,7 +116,6 @@ def optimize_pose_graph(
     Raises:
         ValueError: the cost of the given poses is not a finite number, `trust` is not positive, or an array is traced.
     """
-    require_untraced("optimize_pose_graph", graph.poses, graph.edges, trust)
     config = config or PoseGraphConfig()
     if not (np.asarray(trust) > 0).all():
         raise ValueError("trust: expected numbers above 0, got others")
