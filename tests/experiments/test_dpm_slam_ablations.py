@@ -36,7 +36,7 @@ def model() -> dpmjax.Model:
 
 @pytest.mark.slow
 def test_every_setting_gets_a_row_and_a_resumed_run_computes_nothing_again(model, tmp_path, monkeypatch) -> None:
-    settings = (ablations.WHOLE, ablations.PAPER, "16 elements")
+    settings = (ablations.WHOLE, ablations.PAPER, "64 elements")
     dpmjax.save_model(model, tmp_path / "model.safetensors")
     folder = write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(1, num_scans=NUM_SCANS))
     out = tmp_path / "out"
