@@ -72,7 +72,7 @@ def test_planar_motions_turn_about_the_vertical_axis() -> None:
 @pytest.mark.slow
 def test_published_batches_of_images_follow_each_other_in_time(walk) -> None:
     config = dm.preset("paper", "depth")
-    phase = replace(config.cold_phases[0], scans_per_step=3, num_free=2)
+    phase = replace(config.cold_phases[0], scans_per_step=2, num_free=2)
     config = replace(
         config,
         cold_phases=(phase,),
@@ -87,12 +87,16 @@ def test_published_batches_of_images_follow_each_other_in_time(walk) -> None:
     problem = mapping_problem(config, whole)
     assert problem.phases[0].num_steps == 6000  # two batches of 3,000 epochs
     params = init(problem, whole, key=KEY).params
-    for rows, step in ((slice(0, 3), 0), (slice(3, 4), 1)):
+    for step, rows in enumerate((slice(0, 2), slice(2, 4))):
         some, own = data_of(rows), replace(params, start=params.start[rows])
-        expected, terms = problem.loss(config, problem.phases[0], own, some, jnp.int32(0), KEY)
+        expected, _ = problem.loss(config, problem.phases[0], own, some, jnp.int32(0), KEY)
         found, _ = problem.loss(config, problem.phases[0], params, whole, jnp.int32(step), KEY)
         np.testing.assert_allclose(found, expected, rtol=1e-4)
-        assert (float(terms.chamfer) > 0.0) == (step == 0)  # one image has no neighbour
+    # The second batch of three has one image, which has no neighbour.
+    short = replace(problem.phases[0], scans_per_step=3)
+    loss, terms = problem.loss(config, short, params, whole, jnp.int32(1), KEY)
+    assert np.isfinite(loss)
+    assert float(terms.chamfer) == 0.0
 
 
 @pytest.mark.slow
