@@ -167,7 +167,7 @@ def with_head(model: Model) -> Model:
     Returns:
         The model; unchanged, with a warning, where the head is untrained.
     """
-    if "overlap" in getattr(model.config, "trained", ()):
+    if "overlap" in model.config.trained:
         return replace(model, config=replace(model.config, overlap=None))
     log.warning("the overlap head of these weights is untrained: a regression on the matches detects loops instead")
     return model
