@@ -216,7 +216,7 @@ def test_one_scan_in_ten_is_occluded_as_the_paper_says() -> None:
     angles = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     ring = jnp.asarray(np.stack([40 * np.cos(angles), 40 * np.sin(angles), np.full(720, -1.0)], 1), jnp.float32)
     config = replace(NOTHING, sector_probability=0.05, box_probability=0.05)
-    assert (AugmentConfig().sector_probability, AugmentConfig().box_probability) == (0.05, 0.05)
+    assert (AugmentConfig().sector_probability, AugmentConfig().box_probability) == (0.0, 0.1)
     scan = PointCloud(ring, jnp.ones(720, bool))
     kept = jax.jit(jax.vmap(lambda key: augment_scan(scan, config, key=key).cloud.mask.all()))
     share = 1 - np.mean(kept(jax.random.split(jax.random.key(7), 2000)))

@@ -64,14 +64,14 @@ TURN = (-math.pi, math.pi)
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Strength of the augmentation (defaults: DeepPointMap's published configuration, the boxes excepted).
+    """Strength of the augmentation (defaults: DeepPointMap section 3.3 and its published configuration).
 
     Attributes:
         max_drop_ratio: largest share of points that a scan loses; the share is uniform from 0 to this.
         sparse_probability: probability that a scan is thinned further, as by a lidar of few beams.
-        sector_probability: probability that sectors occlude a scan. A scan has sectors or boxes, never both; one
-            scan in ten is occluded, by either at equal odds.
-        box_probability: probability that boxes occlude a scan.
+        sector_probability: probability that sectors occlude a scan, as in the published program. A scan has sectors or
+            boxes, never both.
+        box_probability: probability that boxes occlude a scan, as in the paper.
         max_yaw_rad: largest rotation about z, to either side.
         max_tilt_rad: largest rotation about x and about y, to either side.
         tilt_power: exponent of the uniform number of a tilt; above 1, most scans stand upright.
@@ -81,8 +81,8 @@ class AugmentConfig:
 
     max_drop_ratio: float = 0.5
     sparse_probability: float = 0.0
-    sector_probability: float = 0.05
-    box_probability: float = 0.05
+    sector_probability: float = 0.0
+    box_probability: float = 0.1
     max_yaw_rad: float = math.pi
     max_tilt_rad: float = math.pi / 10
     tilt_power: float = 1.0

@@ -311,8 +311,10 @@ def training_preset(name: Preset) -> TrainingConfig:
 
 
 # For frames that turn with the scan: after a large motion rays do not start at the lidar, and after a large tilt
-# normals of walls are not horizontal.
-NEAR_THE_LIDAR = AugmentConfig(max_tilt_rad=0.05, translation_sigma_m=0.3)
+# normals of walls are not horizontal. Sectors and boxes occlude at equal odds.
+NEAR_THE_LIDAR = AugmentConfig(
+    sector_probability=0.05, box_probability=0.05, max_tilt_rad=0.05, translation_sigma_m=0.3
+)
 
 PRESETS = {
     "tiny": TrainingConfig(
