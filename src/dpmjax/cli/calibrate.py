@@ -112,7 +112,7 @@ def measure_overlap(
     num_pairs: int,
     seed: int,
     *,
-    anchors: Sequence[Int[np.ndarray, " a"]] | None = None,
+    anchors: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> Row | None:
     """Matches pairs of which half are less than 20 m apart, each scan turned by a random yaw.
 
