@@ -6,7 +6,7 @@ simulated places, too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -73,12 +73,13 @@ def draw_calibration_pairs(
         yield from dpm.read_scan_pairs(drive, drawn, seed=seed)
 
 
-def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> Row:
+def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair], on_pair: Callable[[], object] = lambda: None) -> Row:
     """Registers pairs as scans, and as clouds of surface elements.
 
     Args:
         model: encoder and decoder.
         pairs: the pairs.
+        on_pair: called before each registration.
 
     Returns:
         Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
@@ -88,6 +89,7 @@ def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> Row:
     found: Row = {name: [] for name in (*KINDS, *gaps, "is_right_of_clouds", "is_right", "distance_m")}
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
     for pair in pairs:
+        on_pair()
         result = dpm.register_in_stages(model, pair)
         clouds = [dpm.encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
         T_of_clouds, evidence_of_clouds = dpm.register_clouds(model, *clouds)
@@ -169,13 +171,20 @@ class MeasuredDrives(NamedTuple):
     tested_overlap: Row | None
 
 
-def measure_drives(model: dpm.Model, drives: Sequence[LidarSequence], seed: int) -> MeasuredDrives:
+def measure_drives(
+    model: dpm.Model,
+    drives: Sequence[LidarSequence],
+    seed: int,
+    *,
+    on_pair: Callable[[], object] = lambda: None,
+) -> MeasuredDrives:
     """Measures pairs of the training part of drives, and pairs with a scan of their held-out places.
 
     Args:
         model: encoder and decoder.
         drives: drives with poses.
         seed: seed of the pairs.
+        on_pair: called before each registration; an error of it ends the measurement.
 
     Returns:
         The measurements.
@@ -188,15 +197,14 @@ def measure_drives(model: dpm.Model, drives: Sequence[LidarSequence], seed: int)
     def numbers(num_pairs: int) -> int:
         return max(2, -(-num_pairs // (len(drives) * len(DRIVE_BANDS_M))))
 
+    def measure(drive: LidarSequence, num: int, anchors: Int[np.ndarray, " a"] | None = None) -> Row:
+        return measure_pairs(model, draw_calibration_pairs(drive, DRIVE_BANDS_M, num, seed, anchors=anchors), on_pair)
+
     num, num_tested = numbers(NUM_CONFIDENCE_PAIRS), numbers(NUM_TESTED_CONFIDENCE_PAIRS)
-    tested = [
-        measure_pairs(model, draw_calibration_pairs(drive, DRIVE_BANDS_M, num_tested, seed, anchors=split.held_out))
-        for drive, split in zip(drives, splits, strict=True)
-    ]
     held_out = [split.held_out for split in splits]
     return MeasuredDrives(
-        [measure_pairs(model, draw_calibration_pairs(drive, DRIVE_BANDS_M, num, seed)) for drive in of_training],
-        tested,
+        [measure(drive, num) for drive in of_training],
+        [measure(drive, num_tested, rows) for drive, rows in zip(drives, held_out, strict=True)],
         measure_overlap(model, of_training, NUM_OVERLAP_PAIRS, seed),
         measure_overlap(model, drives, NUM_TESTED_OVERLAP_PAIRS, seed + 1, anchors=held_out),
     )

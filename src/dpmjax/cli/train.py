@@ -35,6 +35,7 @@ from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import cli, deeppointmap, io, simulation, weights
+from dpmjax.cli import train_files
 from dpmjax.sequences import LidarSequence
 
 if TYPE_CHECKING:
@@ -163,9 +164,7 @@ def main(config: Config) -> None:
             records = None
             if folder is not None:
                 settings = without_impossible_stage(settings, store)
-                steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(len(store.table))}
-                of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
-                print(f"{len(store.table)} scans; {config.preset}: at most {of_stages}")
+                print(f"{config.preset}: {describe_plan(settings, len(store.table))}")
                 selection = select_pairs(config, settings, sources, on_wait)
                 is_last = config.preset == "paper"
                 records = Records(folder, settings, selection, seed=config.seed, weights=first, takes_last=is_last)
@@ -177,32 +176,29 @@ def main(config: Config) -> None:
         bad = merged(store.bad)
         if folder is None or records is None:
             return
-        # The evaluation takes minutes, which a stopped run does not have.
-        evaluation = None if stop.is_requested else evaluate(trained, records)
-        calibrated, numbers = trained.model, dict[str, Any]()
-        if config.calibrate and not stop.is_requested:
-            calibrated, numbers = calibrate(trained.model, chosen_sources(config, sources), config.seed)
+        ended = evaluate_and_calibrate(config, trained, records, chosen_sources(config, sources), stop)
         metrics = {
             **training_numbers(trained, records),
-            **({} if evaluation is None else evaluation.numbers),
-            "calibration": numbers,
+            **ended.numbers,
             "num_scans": len(store.table),
             "bad_scans": bad,
             "wall_s": time.perf_counter() - started,
             "status": stop.status,
             "seed": config.seed,
         }
-        from dpmjax.cli import train_files
+        train_files.write_results(records, trained, ended, metrics, origin=origin_of(config))
 
-        # Numbers first, so that they are written even if a picture fails.
-        cli.write_metrics(folder, metrics)
-        origin = f"{config.preset}, trained on {', '.join(config.data)}"
-        train_files.write_model(folder / train_files.MODEL, calibrated, metrics, origin=origin)
-        train_files.write_other_model(folder, trained, records, metrics, origin=origin)
-        train_files.draw_curves(folder)
-        if evaluation is not None and evaluation.trained is not None and records.selection.pairs is not None:
-            train_files.draw_matches(folder, evaluation.trained, records.selection.pairs)
-        train_files.print_summary(folder, metrics)
+
+def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
+    """Returns the number of scans, and the largest number of steps of each stage."""
+    steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
+    of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
+    return f"{num_scans} scans; at most {of_stages}"
+
+
+def origin_of(config: Config) -> str:
+    """Returns the beginning of the description of a model."""
+    return f"{config.preset}, trained on {', '.join(config.data)}"
 
 
 def training_sources(config: Config, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
@@ -285,11 +281,13 @@ def without_impossible_stage(
 
 
 def calibrate(
-    model: deeppointmap.Model, sources: Sequence[cli.Source], seed: int
+    model: deeppointmap.Model, sources: Sequence[cli.Source], seed: int, on_wait: Callable[[], object]
 ) -> tuple[deeppointmap.Model, dict[str, Any]]:
     """Returns the model with regressions of confidence and overlap, and their numbers on held-out places."""
-    print("calibrating confidence and overlap ...", flush=True)
-    calibrated, numbers = cli.calibrate(model, cli.measure_drives(model, [source() for source in sources], seed))
+    with tqdm(desc="calibrate confidence, then overlap", unit=" pairs", dynamic_ncols=True) as bar:
+        on_pair = lambda: (on_wait(), bar.update(1))  # noqa: E731
+        measured = cli.measure_drives(model, [source() for source in sources], seed, on_pair=on_pair)
+    calibrated, numbers = cli.calibrate(model, measured)
     if calibrated.config.calibration is None:
         print("the confidence is not calibrated: all registrations of the data are right, or all are wrong")
     if calibrated.config.overlap is None:
@@ -330,11 +328,32 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 
-class Measured(NamedTuple):
-    """Evaluation of the trained network, None without pairs, and the numbers of both networks for `metrics.json`."""
+class Ended(NamedTuple):
+    """A trained model at the end of a run.
 
-    trained: deeppointmap.Evaluation | None
+    Attributes:
+        model: the model, calibrated if `--calibrate` says so.
+        evaluation: its registrations of the pairs that chose it; None without such pairs, and after a stop.
+        numbers: numbers of the evaluation and of the calibration for `metrics.json`.
+    """
+
+    model: deeppointmap.Model
+    evaluation: deeppointmap.Evaluation | None
     numbers: dict[str, Any]
+
+
+def evaluate_and_calibrate(
+    config: Config, trained: deeppointmap.Trained, records: Records, sources: Sequence[cli.Source], stop: cli.StopFlag
+) -> Ended:
+    """Evaluates and calibrates, unless a signal came: both take minutes, which a stopped run does not have."""
+    evaluation, numbers = (None, {}) if stop.is_requested else evaluate(trained, records)
+    model, calibration = trained.model, dict[str, Any]()
+    if config.calibrate and not stop.is_requested:
+        # A signal that comes from here on loses the calibration alone.
+        so_far = {**training_numbers(trained, records), **numbers, "num_scans": "all", "seed": config.seed}
+        train_files.write_model(records.folder / train_files.MODEL, model, so_far, origin=origin_of(config))
+        model, calibration = calibrate(model, sources, config.seed, stop.end_if_requested)
+    return Ended(model, evaluation, {**numbers, "calibration": calibration})
 
 
 def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[str, Any]:
@@ -352,13 +371,13 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[st
     }
 
 
-def evaluate(trained: deeppointmap.Trained, records: Records) -> Measured:
+def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, dict[str, Any]]:
     """Returns recall and errors of the trained and of the untrained network, of the latter for pairs of scans alone."""
     from dpmjax.cli.train_run import KIND_NAMES
 
     pairs, of_scans = records.selection.pairs, records.selection.of_scans
     if pairs is None or of_scans is None:
-        return Measured(None, {})
+        return None, {}
     models = {"": (trained.model, pairs), "_untrained": (records.untrained, of_scans)}
     metrics: dict[str, Any] = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
     evaluations = {}
@@ -369,4 +388,4 @@ def evaluate(trained: deeppointmap.Trained, records: Records) -> Measured:
         metrics |= {f"{KIND_NAMES[of_kind.kind]}{suffix}": recall.recall for of_kind, recall in of_kinds}
         metrics[f"translation_error_median{suffix}_m"] = float(np.median(near.translation_errors_m))
         metrics[f"rotation_error_median{suffix}_deg"] = float(np.median(near.rotation_errors_deg))
-    return Measured(evaluations[""], metrics)
+    return evaluations[""], metrics

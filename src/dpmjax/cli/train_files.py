@@ -11,12 +11,27 @@ import numpy as np
 from dpmjax import cli, deeppointmap, viz, weights
 
 if TYPE_CHECKING:
+    from dpmjax.cli.train import Ended
     from dpmjax.cli.train_run import Records
 
 MODEL, LAST, BEST = "model.safetensors", "last.safetensors", "best.safetensors"
 # Largest number of listed damaged scans; further ones are only counted.
 MAX_LISTED = 10
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "overlap_loss")
+
+
+def write_results(
+    records: Records, trained: deeppointmap.Trained, ended: Ended, metrics: dict[str, Any], *, origin: str
+) -> None:
+    """Writes all files of a run; numbers first, so that they are written even if a picture fails."""
+    folder, pairs = records.folder, records.selection.pairs
+    cli.write_metrics(folder, metrics)
+    write_model(folder / MODEL, ended.model, metrics, origin=origin)
+    write_other_model(folder, trained, records, metrics, origin=origin)
+    draw_curves(folder)
+    if ended.evaluation is not None and pairs is not None:
+        draw_matches(folder, ended.evaluation, pairs)
+    print_summary(folder, metrics)
 
 
 def write_other_model(

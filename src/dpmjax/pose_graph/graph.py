@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
