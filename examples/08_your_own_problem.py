@@ -13,7 +13,7 @@ from dpmjax.geometry import se2
 
 @dataclass(frozen=True)
 class Phase:
-    """Settings of the only phase; they are static, so they are hashable."""
+    """Settings of the only phase."""
 
     name: str = "free poses"
     num_steps: int = 600

@@ -28,7 +28,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -328,23 +328,9 @@ def training_settings(config: Config, first: deeppointmap.Model | None = None) -
     return settings if config.steps is None else settings.with_steps(config.steps)
 
 
-class Ended(NamedTuple):
-    """A trained model at the end of a run.
-
-    Attributes:
-        model: the model, calibrated if `--calibrate` says so.
-        evaluation: its registrations of the pairs that chose it; None without such pairs, and after a stop.
-        numbers: numbers of the evaluation and of the calibration for `metrics.json`.
-    """
-
-    model: deeppointmap.Model
-    evaluation: deeppointmap.Evaluation | None
-    numbers: dict[str, Any]
-
-
 def evaluate_and_calibrate(
     config: Config, trained: deeppointmap.Trained, records: Records, sources: Sequence[cli.Source], stop: cli.StopFlag
-) -> Ended:
+) -> train_files.Ended:
     """Evaluates and calibrates, unless a signal came: both take minutes, which a stopped run does not have."""
     evaluation, numbers = (None, {}) if stop.is_requested else evaluate(trained, records)
     model, calibration = trained.model, dict[str, Any]()
@@ -353,7 +339,7 @@ def evaluate_and_calibrate(
         so_far = {**training_numbers(trained, records), **numbers, "num_scans": "all", "seed": config.seed}
         train_files.write_model(records.folder / train_files.MODEL, model, so_far, origin=origin_of(config))
         model, calibration = calibrate(model, sources, config.seed, stop.end_if_requested)
-    return Ended(model, evaluation, {**numbers, "calibration": calibration})
+    return train_files.Ended(model, evaluation, {**numbers, "calibration": calibration})
 
 
 def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[str, Any]:

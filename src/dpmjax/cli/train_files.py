@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from dpmjax import cli, deeppointmap, viz, weights
 
 if TYPE_CHECKING:
-    from dpmjax.cli.train import Ended
     from dpmjax.cli.train_run import Records
 
 MODEL, LAST, BEST = "model.safetensors", "last.safetensors", "best.safetensors"
 # Largest number of listed damaged scans; further ones are only counted.
 MAX_LISTED = 10
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "overlap_loss")
+
+
+class Ended(NamedTuple):
+    """A trained model at the end of a run.
+
+    Attributes:
+        model: the model, calibrated if `--calibrate` says so.
+        evaluation: its registrations of the pairs that chose it; None without such pairs, and after a stop.
+        numbers: numbers of the evaluation and of the calibration for `metrics.json`.
+    """
+
+    model: deeppointmap.Model
+    evaluation: deeppointmap.Evaluation | None
+    numbers: dict[str, Any]
 
 
 def write_results(

@@ -48,6 +48,7 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
             for intrinsics of images of another size, poses that are no rigid motions, and images without valid pixels.
     """
     folder = Path(path)
+    require(folder.is_dir(), folder, "no such folder", "check the path")
     images = sorted(folder.glob("*.depth.png"), key=lambda file: natural_key(file.name))
     require(len(images) >= 2, folder, f"{len(images)} .depth.png files", "give a folder of at least two")
     named = sorted(folder.glob("*intrinsics*.txt"))
