@@ -36,6 +36,7 @@ SLOW = (
     "icp",
     "icp to points",
     "match_hypotheses",
+    "pose_graph.solve_dense",
 )
 WITH_MASKS = {name: kernel for name, kernel in KERNELS.items() if kernel.padding}
 WITH_GRADIENT = {name: kernel for name, kernel in KERNELS.items() if kernel.by}

@@ -133,6 +133,7 @@ def test_paper_preset_has_the_published_numbers() -> None:
     assert (phase.num_free, phase.scans_per_step, phase.num_epochs) == (35, 8, 3000)
 
 
+@pytest.mark.slow
 def test_loss_of_a_short_last_batch_is_that_of_its_scans_alone(tiny_data) -> None:
     config = dm.preset("paper")
     phase = replace(config.cold_phases[0], scans_per_step=8)
@@ -179,6 +180,7 @@ def test_a_unit_that_is_none_of_the_scans_is_refused(tiny_walk, as_user) -> None
 FAST_LOSSES = {("L-Net", True): 0.1781985, ("free poses", True): 0.7525633, ("free poses", False): 0.7428900}
 
 
+@pytest.mark.slow
 def test_losses_of_the_fast_preset_do_not_change(tiny_walk, shaken) -> None:
     for (name, is_cold), expected in FAST_LOSSES.items():
         data, _ = dm.mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask), None if is_cold else shaken)

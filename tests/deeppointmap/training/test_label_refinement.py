@@ -49,6 +49,7 @@ def test_scans_that_share_nothing_keep_the_given_motion(num: int) -> None:
     np.testing.assert_array_equal(aligned_motion(other, room(rng), given), given)
 
 
+@pytest.mark.slow
 def test_samples_of_a_drive_with_wrong_poses_have_better_labels() -> None:
     """The second map is the frame: motions between the maps, and the scans within each, are nearer to the truth."""
     rng = np.random.default_rng(3)

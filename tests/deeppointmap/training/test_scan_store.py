@@ -77,6 +77,7 @@ def test_descriptors_are_placed_where_the_encoder_finds_them() -> None:
 FRESH = replace(toy.TRAINING, num_variants=0, thins_as_in_use=False)
 
 
+@pytest.mark.slow
 def test_scans_that_are_prepared_anew_need_no_file_and_depend_on_seed_and_step_alone(tmp_path) -> None:
     calls: list[int] = []
     prepared = prepare_drive(short(bad=2), FRESH, folder=tmp_path, on_scan=lambda: calls.append(0))
