@@ -90,7 +90,7 @@ class Config(ProcessOptions):
     scans: Annotated[int | None, arg(metavar="N")] = None
     """How many scans a step takes; more keep a GPU busy, which computes all of them at once. Without it, the preset
     decides."""
-    num_towns: Annotated[int, arg(metavar="N")] = 4
+    num_towns: Annotated[int, arg(metavar="N")] = 3
     """How many towns to train on, where town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M")] = 400.0
     """Length of the drive through each town."""
@@ -113,7 +113,7 @@ class Config(ProcessOptions):
     """Pairs of scans at each distance that choose the model, all drives together."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
     """Folders of scans with poses whose pairs choose the model, instead of held-out places of --data."""
-    recall_every: Annotated[int, arg(metavar="N")] = 200
+    recall_every: Annotated[int, arg(metavar="N")] = 100
     """Measure recall every N steps, and at the end."""
 
     def __post_init__(self) -> None:

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from dpmjax import cli
 from dpmjax import deeppointmap as dpm
+from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.deeppointmap.training.processes import together
 from dpmjax.types import Poses
 
@@ -142,6 +143,7 @@ def _workers(work: Preparation) -> Iterator[ProcessPoolExecutor]:
 def _begin_worker() -> None:
     # The device belongs to the process that trains, and so does the answer to Ctrl-C.
     jax.config.update("jax_platforms", "cpu")
+    enable_compile_cache()  # the caster of each lidar compiles for ten seconds
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
