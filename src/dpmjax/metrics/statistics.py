@@ -55,6 +55,8 @@ def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -
         raise ValueError(f"confidence: expected a number between 0 and 1, got {confidence}")
     if num_all == 0:
         return Proportion(np.nan, 0.0, 1.0)
+    if not 0 <= num_right <= num_all:
+        raise ValueError(f"num_right: expected 0 to {num_all}, got {num_right}")
     low, high = stats.binomtest(num_right, num_all).proportion_ci(confidence, method="wilson")
     return Proportion(num_right / num_all, float(low), float(high))
 
