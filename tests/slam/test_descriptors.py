@@ -32,7 +32,7 @@ from dpmjax.slam.descriptor_odometry import neighbours_of, next_ratio
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, steps_from
 from dpmjax.slam.loops import Loop
-from dpmjax.slam.model_methods import UNKNOWN, point_information, with_head
+from dpmjax.slam.model_methods import UNKNOWN, point_information, without_regression
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose, scans_of
 
 PAPER = slam_preset("paper")
@@ -347,7 +347,7 @@ def test_a_later_drive_extends_a_map_as_soon_as_it_meets_it() -> None:
 def test_the_head_predicts_overlap_where_it_is_trained(caplog) -> None:
     model = load_model("dpm_small")
     trained = getattr(model.config, "trained", ())
-    found = with_head(model)
+    found = without_regression(model)
     assert (found.config.overlap is None) == ("overlap" in trained)
     assert ("overlap head of these weights is untrained" in caplog.text) == ("overlap" not in trained)
 

@@ -284,7 +284,7 @@ def calibrate(
     model: deeppointmap.Model, sources: Sequence[cli.Source], seed: int, on_wait: Callable[[], object]
 ) -> tuple[deeppointmap.Model, dict[str, Any]]:
     """Returns the model with regressions of confidence and overlap, and their numbers on held-out places."""
-    with tqdm(desc="calibrate confidence, then overlap", unit=" pairs", dynamic_ncols=True) as bar:
+    with tqdm(desc="calibrate confidence (then overlap, about 2 min)", unit=" pairs", dynamic_ncols=True) as bar:
         on_pair = lambda: (on_wait(), bar.update(1))  # noqa: E731
         measured = cli.measure_drives(model, [source() for source in sources], seed, on_pair=on_pair)
     calibrated, numbers = cli.calibrate(model, measured)

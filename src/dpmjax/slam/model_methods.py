@@ -59,7 +59,7 @@ class NetworkMatcher:
         # Other keyframes and the map confirm a motion, so no other place needs to be tried for it.
         verification = replace(model.config.verification, plane_radius_m=ELEMENT_RADIUS_M, num_lookalikes=0)
         self._model = replace(model, config=replace(model.config, verification=verification))
-        self._overlap_model = with_head(self._model) if by_head else self._model
+        self._overlap_model = without_regression(self._model) if by_head else self._model
         self.fingerprint = model_fingerprint(model)
 
     def encode(self, scan: ThinnedScan) -> CompactScan:
@@ -158,7 +158,7 @@ class NetworkMatcher:
         return Match(T[0], float(found.confidence), float(found.rmse), found.verification, information)
 
 
-def with_head(model: Model) -> Model:
+def without_regression(model: Model) -> Model:
     """Returns the model without its regression of overlap where its overlap head is trained, so that the head predicts.
 
     Args:
