@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import gc
-import importlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from dpmjax.cli import program
-from dpmjax.cli.command import EXIT_BAD_INPUT, STOPPING, run_command
-
-
-@dataclass(frozen=True)
-class Options:
-    """A command without options."""
-
+from dpmjax.cli.run import EXIT_BAD_INPUT, STOPPING
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -37,12 +28,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 import tyro
-from dpmjax.cli.command import StopFlag, run_command
-from dpmjax.cli.result_files import HistoryFile, read_history
-from dpmjax.cli.run_folder import RunOptions, open_run_folder, recording, write_metrics
+from dpmjax.cli.run import HISTORY, Numbers, Run, RunOptions, run_command
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunOptions):
+class ToyOptions(RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"steps"})
 
     data: tyro.conf.Positional[Path | None] = None
@@ -51,32 +40,28 @@ class Config(RunOptions):
     fail: bool = False
     no_loop: tyro.conf.FlagCreatePairsOff[bool] = False
 
-def main(config):
-    if config.data is not None and not config.data.exists():
-        raise ValueError(f"{config.data}: no such file\\n  name a file of scans")
-    folder = open_run_folder(config, "toy")
-    with recording(folder), StopFlag() as stop:
-        start = len(read_history(folder / "metrics.csv")) if folder.is_resumed else 0
-        step = start - 1
-        keep_until = start - 1 if folder.is_resumed else None
-        with HistoryFile(folder / "metrics.csv", ["step"], keep_until=keep_until) as history:
-            for step in range(start, config.steps):
-                history.append(step=step)
-                print(step, flush=True)
-                if config.fail:
-                    raise ValueError("diverged")
-                if config.steps > 100:
-                    time.sleep(0.01)
-                if stop.is_requested:
-                    break
-        if config.seed == 99:
-            while True:  # a step that does not end
-                time.sleep(0.01)
-        write_metrics(folder, {"steps": step + 1}, seed=config.seed)
+def main(options: ToyOptions, run: Run) -> Numbers:
+    if options.data is not None and not options.data.exists():
+        raise ValueError(f"{options.data}: no such file\\n  name a file of scans")
+    run.open()
+    start = len(run.continue_table(HISTORY))
+    for step in range(start, options.steps):
+        run.append_row(HISTORY, step=step)
+        print(step, flush=True)
+        if options.fail:
+            raise ValueError("diverged")
+        if options.steps > 100:
+            time.sleep(0.01)
+        if run.is_stopped:
+            break
+    if options.seed == 99:
+        while True:  # a step that does not end
+            time.sleep(0.01)
     assert "jax" not in sys.modules
+    return {"steps": options.steps, "verdict": "all steps are done"}
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(main, Config, name="toy", description=__doc__))
+    raise SystemExit(run_command(main, name="toy", description=__doc__))
 '''
 
 
@@ -117,12 +102,6 @@ def test_help_shows_the_examples(toy):
     assert code == 0
     assert "    python -m experiments.toy scans.txt -o out\n" in output
     assert "usage: python -m experiments.toy" in output
-
-
-def test_version_is_told(toy):
-    import dpmjax
-
-    assert finish(toy("--version"))[:2] == (0, f"dpmjax {dpmjax.__version__}\n")
 
 
 def test_finished_run_exits_with_zero(toy, tmp_path):
@@ -188,7 +167,7 @@ def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expec
     done = len((tmp_path / "out" / "metrics.csv").read_text().splitlines()) - 1
     code, output, _ = finish(toy("-o", "out", "--resume", "--steps", str(done + 2)))
     assert code == 0
-    assert output.split() == [str(done), str(done + 1)]
+    assert output.splitlines() == [str(done), str(done + 1), "all steps are done", "results in out"]
     rows = (tmp_path / "out" / "metrics.csv").read_text().split()
     assert rows == ["step", *map(str, range(done + 2))]
 
@@ -196,34 +175,6 @@ def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expec
 def test_second_signal_ends_at_once(toy):
     code, _, errors = stop_after_first_step(toy("--seed", "99"), signal.SIGINT, signal.SIGINT)
     assert (code, errors) == (130, f"{STOPPING}dpmjax: stopped by SIGINT\n")
-
-
-def test_a_signal_while_a_module_is_imported_waits_for_its_end(tmp_path, monkeypatch, capsys) -> None:
-    module = tmp_path / "compiled.py"
-    module.write_text("import signal, time\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(0.2)\ndone = True\n")
-    monkeypatch.syspath_prepend(tmp_path)
-
-    def main(config: Options) -> None:
-        importlib.import_module("compiled")
-        time.sleep(10)
-
-    assert run_command(main, Options, name="toy", description=None, args=[]) == 143
-    assert sys.modules.pop("compiled").done
-    assert capsys.readouterr().err == "dpmjax: stopped by SIGTERM\n"
-
-
-def test_a_signal_during_a_collection_of_garbage_is_not_lost(capsys) -> None:
-    def signal_once(phase: str, info: dict[str, int]) -> None:
-        gc.callbacks.remove(signal_once)
-        signal.raise_signal(signal.SIGINT)
-
-    def main(config: Options) -> None:
-        gc.callbacks.append(signal_once)
-        gc.collect()
-        time.sleep(10)
-
-    assert run_command(main, Options, name="toy", description=None, args=[]) == 130
-    assert capsys.readouterr().err == "dpmjax: stopped by SIGINT\n"
 
 
 def test_resumed_run_keeps_the_options_that_are_not_given(toy):

@@ -1,0 +1,594 @@
+"""One run of a command: options, folder, log, Ctrl-C, numbers, exit code.
+
+A command is a frozen dataclass of options and a function of them:
+
+    def main(options: ToyOptions, run: Run) -> Numbers:
+        scans = io.read_sequence(options.data)      # bad input: one line, exit code 2, no folder
+        run.open(scans.notes)                       # from here on, results are kept and Ctrl-C ends the next step
+        ...
+        return {"ate_m": 0.1, "verdict": "trusted: ..."}
+
+Everything else happens here: `metrics.json` gets the numbers, the console the verdict, the shell the exit code.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import itertools
+import json
+import logging
+import math
+import os
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass
+from datetime import datetime
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, get_type_hints
+
+import tyro
+from tqdm import tqdm
+from tyro.conf import FlagCreatePairsOff, arg
+
+from dpmjax.cli import program
+from dpmjax.cli.info import environment, select_device
+from dpmjax.compile_cache import enable_compile_cache
+from dpmjax.io.files import write_atomically
+from dpmjax.sequences import InputError, Note
+
+EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
+CONFIG, METRICS, HISTORY, LOG, CHECKPOINTS = "config.json", "metrics.json", "metrics.csv", "log.txt", "checkpoints"
+RESULTS = Path("results")
+# Options that do not change the result.
+FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "visualize"})
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
+LOGGERS = ("dpmjax", "experiments", "__main__")
+
+Numbers = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """Options of every command that writes results."""
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/<command>/<time>."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace OUT and everything in it, where it holds an earlier run."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(OutputOptions):
+    """Options of every command that can be interrupted and resumed.
+
+    Attributes:
+        may_change: options that a resumed run may change, besides those that do not affect the computation.
+    """
+
+    may_change: ClassVar[frozenset[str]] = frozenset()
+
+    seed: int = 0
+    """Seed of everything random."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """Options of every command that reads scans or images in a row."""
+
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Use the first N scans, after --jump; without it, all."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
+
+    @property
+    def selection(self) -> slice:
+        """Returns the rows of the scans to use."""
+        return slice(None, None if self.n_scans is None else self.n_scans * self.jump, self.jump)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Options of every command that uses trained weights."""
+
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file; a saved map needs the weights that made it."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal has stopped the run."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.exit_code = program.EXIT_BY_SIGNAL + number
+
+
+class Run:
+    """The folder of one run, and the wish to stop it.
+
+    Attributes:
+        path: the folder; it exists after `open`.
+        is_resumed: True where an earlier run is continued.
+    """
+
+    def __init__(self, name: str, options: Any) -> None:
+        """Finds the folder, and refuses it before any work.
+
+        Args:
+            name: name of the command, and of its folder in `results`.
+            options: `OutputOptions` or `RunOptions`, or those of a command without results.
+
+        Raises:
+            ValueError: OUT holds something, and neither --resume nor --force is given; there is nothing to resume; the
+                resumed run had other options; or --force would remove an input.
+        """
+        self._name, self._options, self._started = name, options, time.perf_counter()
+        self._handler: logging.Handler | None = None
+        self._lock: int | None = None
+        self._signals: list[int] = []
+        self._notes: list[str] = []
+        self.is_resumed = getattr(options, "resume", False)
+        output = getattr(options, "output", None)
+        self.path = Path(output or RESULTS / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+        if self.is_resumed:
+            self.path = find_run(name, output)
+            _check_same_options(self.path, options)
+        elif output is not None:
+            _check_replaceable(self.path, options)
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+    @property
+    def is_open(self) -> bool:
+        """Returns True after `open`."""
+        return self._handler is not None
+
+    @property
+    def is_stopped(self) -> bool:
+        """Returns True after the first signal: what is done is written, and the run ends."""
+        return bool(self._signals)
+
+    def check_stop(self) -> None:
+        """Ends the run after a signal, in the middle of work of which nothing can be kept."""
+        if self._signals:
+            raise Interrupted(self._signals[0])
+
+    def open(self, notes: Iterable[Note] = ()) -> None:
+        """Makes the folder, or empties it with --force, and writes `config.json`; call it after the input was read.
+
+        Args:
+            notes: doubts and remarks on the input, which the console and `metrics.json` show.
+
+        Raises:
+            ValueError: the folder cannot be written, or another process is writing in it.
+        """
+        output = self._options.output
+        try:
+            if output is None and not self.is_resumed:
+                self.path = _make_latest(self.path)
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = _lock(self.path)
+            if output is not None and not self.is_resumed:
+                for entry in self.path.iterdir():
+                    shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            write_json(self / CONFIG, self._options)
+            self._handler = logging.FileHandler(self / LOG, encoding="utf-8")
+        except OSError as error:
+            raise ValueError(_cannot_write(self.path, error.strerror or str(error))) from error
+        self._handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        for logger in map(logging.getLogger, LOGGERS):
+            logger.addHandler(self._handler)
+            logger.setLevel(logging.INFO)
+        for note in notes:
+            self._notes.append(note.text)
+            logging.getLogger("dpmjax").info("%s", note.text)
+            if not note.is_doubt:  # the reader has warned of a doubt
+                print(note.text, flush=True)
+
+    def close(self) -> None:
+        """Ends the log, and lets other processes into the folder."""
+        for logger in map(logging.getLogger, LOGGERS):
+            if self._handler is not None:
+                logger.removeHandler(self._handler)
+        if self._handler is not None:
+            self._handler.close()
+        if self._lock is not None:
+            os.close(self._lock)
+        self._handler = self._lock = None
+
+    def part(self, *names: str) -> Run:
+        """Makes a folder inside, such as that of one drive, or continues in it; a signal stops both."""
+        part = object.__new__(Run)
+        part.__dict__ |= self.__dict__
+        part.path, part.is_resumed = self.path.joinpath(*names), True
+        part.path.mkdir(parents=True, exist_ok=True)
+        return part
+
+    def say(self, text: str) -> None:
+        """Prints a text, and writes it to the log."""
+        print(text, flush=True)
+        logging.getLogger("dpmjax").info("%s", text)
+
+    def write_numbers(self, numbers: Mapping[str, Any]) -> None:
+        """Writes `metrics.json`: status and verdict, the numbers, then notes, seed, versions, device and machine."""
+        status = "interrupted" if self.is_stopped else numbers.get("status", "done")
+        seed = {"seed": self._options.seed} if hasattr(self._options, "seed") else {}
+        after = {"input_notes": self._notes, "wall_s": time.perf_counter() - self._started, **seed, **environment()}
+        write_json(self / METRICS, {**numbers, "status": status, **after})
+
+    def read_table(self, name: str) -> list[dict[str, str]]:
+        """Reads the rows of a table, without a last line that a crash has cut off; none where there is no table."""
+        path = self / name
+        text = path.read_text(encoding="utf-8", errors="surrogateescape") if path.exists() else ""
+        return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+
+    def continue_table(self, name: str, until: float = math.inf) -> list[dict[str, str]]:
+        """Keeps the rows whose first column is at most `until`; later ones will be computed again.
+
+        Args:
+            name: name of the file.
+            until: largest first column, a count of steps.
+
+        Returns:
+            The rows.
+        """
+        rows = [row for row in self.read_table(name) if until == math.inf or int(next(iter(row.values()))) <= until]
+        (self / name).unlink(missing_ok=True) if not rows else write_table(self / name, list(rows[0]), rows)
+        return rows
+
+    def append_row(self, name: str, **row: object) -> None:
+        """Adds a row to a table, whose columns are those of its first row; a column that is not given stays empty."""
+        path = self / name
+        is_new = not path.exists()
+        with path.open("a+", newline="", encoding="utf-8", errors="surrogateescape") as file:
+            file.seek(0)
+            columns = list(row) if is_new else next(csv.reader(file))
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            if is_new:
+                writer.writeheader()
+            writer.writerow(row)
+
+    def on_signal(self, number: int, _frame: object = None) -> None:
+        """Stops the run at its next step; without a folder, or at a second signal, at once."""
+        if self.is_stopped or not self.is_open:
+            raise Interrupted(number)
+        self._signals.append(number)
+        os.write(2, STOPPING.encode())  # without a buffer: a handler may interrupt a print
+
+
+def run_command(
+    main: Callable[[Any, Run], Numbers], *, name: str, description: str | None, args: Sequence[str] | None = None
+) -> int:
+    """Parses the command line, runs `main`, writes its numbers, and returns the exit code.
+
+    Code 0 is success. Code 2 is wrong usage or bad input, with one line on stderr. Code 1 is a failure after the folder
+    was opened, or numbers with the status "failed". Codes 130 and 143 are stops by Ctrl-C or SIGTERM, with results.
+
+    Args:
+        main: takes the options, a frozen dataclass by its annotation, and the run; returns the numbers of
+            `metrics.json`, among them `verdict`, one sentence, and `status` if it is not "done".
+        name: name of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
+        description: the module's docstring; `--help` begins with it.
+        args: the command line; None takes that of the process.
+
+    Returns:
+        The exit code.
+    """
+    console = logging.StreamHandler()
+    console.setLevel(logging.WARNING)
+    logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
+    run: Run | None = None
+    previous = {number: signal.signal(number, _end_at_once) for number in SIGNALS}
+    try:
+        enable_compile_cache()
+        options = _read_options(main, name, description, list(sys.argv[1:] if args is None else args))
+        run = Run(name, options)
+        select_device(getattr(options, "device", None))
+        for number in SIGNALS:
+            signal.signal(number, run.on_signal)
+        return _finish(run, main(options, run))
+    except SystemExit as done:  # after --help
+        return int(done.code or 0)
+    except Interrupted as stop:
+        return _say(f"stopped by {stop}", stop.exit_code)
+    except Exception as error:
+        return _explain(error, run)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        if run is not None:
+            run.close()
+
+
+def _finish(run: Run, numbers: Numbers) -> int:
+    """Writes the numbers, and says the verdict and where the results are."""
+    if run.is_open:
+        run.write_numbers(numbers)
+    has_failed = numbers.get("status") == "failed" and not run.is_stopped
+    if "verdict" in numbers and not has_failed:
+        run.say(numbers["verdict"])
+    if run.is_open:
+        print(f"results in {run.path}", flush=True)
+    run.check_stop()
+    return _say(f"error: {numbers['verdict']}; results are in {run.path}", EXIT_FAILED) if has_failed else EXIT_OK
+
+
+def _explain(error: Exception, run: Run | None) -> int:
+    """Says in one line what went wrong, after the traceback where the program is at fault."""
+    is_usual = isinstance(error, InputError | OSError)
+    if run is not None and run.is_open:
+        logging.getLogger("__main__").info("failed", exc_info=error)
+        if not is_usual:
+            traceback.print_exception(error)
+        text = str(error).removesuffix(".") if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        return _say(f"error: {text}; what was finished is in {run.path}", EXIT_FAILED)
+    if isinstance(error, PermissionError):
+        return _say(f"error: {error.filename}: {error.strerror}", EXIT_BAD_INPUT)
+    if isinstance(error, ValueError):
+        return _say(f"error: {error}", EXIT_BAD_INPUT)
+    traceback.print_exception(error)
+    return _say(f"error: {type(error).__name__}: {error}", EXIT_FAILED)
+
+
+def _end_at_once(number: int, _frame: object) -> NoReturn:
+    raise Interrupted(number)
+
+
+def _say(message: str, exit_code: int) -> int:
+    print("dpmjax:", " ".join(message.split()), file=sys.stderr, flush=True)
+    return exit_code
+
+
+def _read_options(main: Callable[..., Numbers], name: str, description: str | None, arguments: list[str]) -> Any:
+    """Returns the options of the command line, with those of the earlier run where it is resumed."""
+    options_type = get_type_hints(main)["options"]
+    prog = f"dpmjax {name}" if name in program.COMMANDS else f"python -m experiments.{name}"
+    options = parse_options(options_type, arguments, prog=prog, description=description)
+    if getattr(options, "resume", False):
+        earlier = load_options(find_run(name, options.output), options_type)
+        # Of a flag that is on, tyro takes --no-FLAG alone; who repeats the command says --FLAG again.
+        on = {f"--{field.name}" for field in dataclasses.fields(earlier) if getattr(earlier, field.name) is True}
+        again = [word for word in arguments if word.replace("-", "_").replace("__", "--", 1) not in on]
+        options = parse_options(options_type, again, prog=prog, default=earlier)
+    # The next run moves the link `latest`, and a resumed one must find the same file.
+    paths = {field.name: _without_latest(getattr(options, field.name)) for field in dataclasses.fields(options)}
+    return dataclasses.replace(options, **{name: value for name, value in paths.items() if name != "output"})
+
+
+def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -> Any:
+    """Makes the options of a command line, or prints the help.
+
+    Args:
+        options_type: frozen dataclass of the options.
+        arguments: the command line.
+        **details: further arguments of `tyro.cli`, such as `prog` and `default`.
+
+    Returns:
+        The options.
+
+    Raises:
+        ValueError: an option is unknown, is missing, or has a wrong value.
+        SystemExit: the help was printed.
+    """
+    width = os.environ.get("COLUMNS")
+    if not {"-h", "--help"} & set(arguments):
+        os.environ["COLUMNS"] = "10000"  # no line breaks within a message
+    try:
+        with redirect_stderr(StringIO()) as box:
+            return tyro.cli(options_type, args=arguments, **details)
+    except SystemExit as done:
+        if not done.code:
+            raise
+    finally:
+        os.environ.pop("COLUMNS", None) if width is None else os.environ.update(COLUMNS=width)
+    # tyro draws a box: a title, the message, a line, and help.
+    rows = [row.strip("│ ") for row in box.getvalue().splitlines() if row.startswith("│")]
+    message = " ".join(itertools.takewhile(lambda row: not row.startswith("──"), rows))
+    raise ValueError(f"{message.rstrip('.') or 'wrong options'}; --help describes the options")
+
+
+def _without_latest(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_without_latest, value))
+    is_link = isinstance(value, str | Path) and "latest" in Path(value).parts and Path(value).exists()
+    return type(value)(Path(value).resolve()) if is_link else value
+
+
+def load_options(path: Path, options_type: Any) -> Any:
+    """Reads the options of an earlier run; missing options, and those such as `output`, get their defaults.
+
+    Args:
+        path: folder of the run.
+        options_type: dataclass of the options.
+
+    Returns:
+        The options.
+
+    Raises:
+        ValueError: its `config.json` holds an option that `options_type` does not have, or is no JSON.
+    """
+    from dpmjax.weights.config_json import config_from_json
+
+    stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
+    try:
+        return config_from_json(stored, options_type)
+    except ValueError as error:
+        raise ValueError(f"{path / CONFIG} holds options of another command or version: {error}") from error
+
+
+def find_run(name: str, output: Path | None) -> Path:
+    """Finds the folder of an earlier run.
+
+    Args:
+        name: name of the command.
+        output: the folder, or None for the latest run of this command.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: there is none.
+    """
+    path = output or RESULTS / name / "latest"
+    if not (path / CONFIG).is_file():
+        raise ValueError(f"{path} holds no {CONFIG}: it is no run of {name}; name one (--resume -o OUT)")
+    return path if output else path.resolve()
+
+
+def _check_same_options(path: Path, options: Any) -> None:
+    if options.force:
+        raise ValueError("--resume continues a run and --force starts it over: give one of them")
+    stored, now = load_json(path / CONFIG), as_json(options)
+    for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - options.may_change):
+        if stored[name] != now[name]:
+            was, is_now = ("not given" if value is None else value for value in (stored[name], now[name]))
+            raise ValueError(
+                f"--{name.replace('_', '-')} was {was} in {path} and is {is_now} now: a resumed run keeps its options; "
+                "start a new run for others"
+            )
+
+
+def _check_replaceable(path: Path, options: Any) -> None:
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise ValueError(_cannot_write(path, "permission denied" if existing.is_dir() else f"{existing} is a file"))
+    if existing != path or not any(path.iterdir()):
+        return
+    if not (path / CONFIG).is_file() or "output" not in load_json(path / CONFIG):
+        raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")
+    if not options.force:
+        resume = "--resume continues it, " if hasattr(options, "resume") else ""
+        raise ValueError(f"{path} holds an earlier run: {resume}--force replaces it, -o names another")
+    values = [value for name, value in vars(options).items() if name != "output"]
+    for value in itertools.chain(*(value if isinstance(value, tuple) else (value,) for value in values)):
+        inside = isinstance(value, str | Path) and str(value) and Path(value).resolve().is_relative_to(path.resolve())
+        if inside and Path(value).exists():
+            raise ValueError(f"--force would remove {value}, an input: name another folder with -o")
+
+
+def _cannot_write(path: Path, reason: str) -> str:
+    return f"cannot write to {path}: {reason}; name another folder with -o"
+
+
+def _make_latest(path: Path) -> Path:
+    """Makes a new folder, and lets the link `latest` beside it point there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = itertools.chain([path.name], (f"{path.name}_{number}" for number in itertools.count(2)))
+    path = next(new for new in map(path.with_name, names) if not new.exists())
+    path.mkdir()
+    link = path.parent / f".latest_{path.name}"
+    link.symlink_to(path.name, target_is_directory=True)
+    link.replace(path.parent / "latest")
+    return path
+
+
+def _lock(path: Path) -> int | None:
+    """Keeps other processes out of a folder, where the system can lock folders."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise ValueError(f"{path}: another process is writing this run; let it end, or stop it") from error
+    except OSError:
+        pass  # a network file system without locks
+    return handle
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes dataclasses, paths and NumPy values as JSON, atomically."""
+    write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
+
+
+def load_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object; a file that holds something else is a ValueError."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def as_json(value: Any) -> Any:
+    """Returns the same value made of JSON's types; NaN and infinity become null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, Mapping):
+        return {str(name): as_json(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "__array__"):
+        return as_json(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes a CSV file atomically."""
+    text = StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())
+
+
+def check_least(options: Any, **least: float) -> None:
+    """Checks the ranges of options that are numbers, tuples of numbers, or None.
+
+    Args:
+        options: the options.
+        **least: the smallest allowed value of each option.
+
+    Raises:
+        ValueError: an option is smaller, or not finite.
+    """
+    for name, smallest in least.items():
+        values = getattr(options, name)
+        for value in values if isinstance(values, tuple) else (values,):
+            if value is not None and not smallest <= value < math.inf:
+                raise ValueError(f"--{name.replace('_', '-')}: expected at least {smallest}, got {value}")
+
+
+def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
+    """Raises a ValueError where a name is not allowed, or no name is given."""
+    unknown = [name for name in names if name not in allowed]
+    if unknown or not names:
+        raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")
+
+
+@contextmanager
+def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Shows a bar while the block runs; yields a callback with the number of finished items and of all.
+
+    Args:
+        description: shown before the bar.
+        unit: unit of the numbers, with a space before it.
+
+    Yields:
+        The callback.
+    """
+    with tqdm(desc=description, unit=unit, dynamic_ncols=True) as bar:
+
+        def on_progress(num_done: int, num_all: int) -> None:
+            bar.total = num_all
+            bar.update(num_done - bar.n)
+
+        yield on_progress
