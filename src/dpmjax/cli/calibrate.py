@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from dpmjax import deeppointmap as dpm
 from dpmjax import metrics
-from dpmjax.cli.resumable_table import Row
 from dpmjax.sequences import LidarSequence
 
+Row = dict[str, Any]
 # Smallest and largest distance of the pairs of each kind, metres.
 Bands = tuple[tuple[float, float], ...]
 # Probabilities of examples by fits without their place, and the labels of these examples.

@@ -15,18 +15,17 @@ is the share of pixels that other images confirm; flat walls alone confirm many 
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, metrics, registration_rgbd, simulation, viz
+from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
 from dpmjax.sequences import DepthSequence, FloatArray
 
-NAME = "depth"
 _NUM_SIMULATED = 8
 # Names of the sets of poses, in the order of the picture.
 METHODS = {"start": "search of first poses", "fit": "DeepMapping"}
@@ -35,7 +34,7 @@ _LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.ScanOptions, cli.RunOptions):
+class DepthOptions(ScanOptions, RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
@@ -48,55 +47,57 @@ class Config(cli.ScanOptions, cli.RunOptions):
         cli.check_least(self, n_scans=2, jump=1)
 
 
-def main(config: Config) -> None:
+def main(options: DepthOptions, run: Run) -> Numbers:
     """Registers depth images and writes the results."""
     import jax
 
-    started = time.perf_counter()
-    sequence = read_images(config)
+    sequence = read_images(options)
     images = registration_rgbd.as_depth_scans(sequence.points, sequence.mask)
-    folder = cli.open_run_folder(config, NAME)
-    with cli.recording(folder), cli.StopFlag() as stop:
-        print(f"{sequence.name}: {len(sequence)} images", flush=True)
-        recorder = cli.FitRecorder(folder, "m", stop=lambda _run_s: stop.is_requested)
-        settings = deepmapping.preset(config.preset, "depth", motion="planar" if sequence.is_planar else "full")
-        key, search = jax.random.key(config.seed), registration_rgbd.depth_search(settings.motion)
-        with cli.progress_bar("search of first poses", " images") as on_image:
-            start = registration_rgbd.initialize_depth(images, search, key=key, on_image=on_image)
-        found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
-        numbers = {
-            **depth_numbers(sequence, found),
-            **recorder.numbers,
-            "status": stop.status,
-        }
-        write_depth_results(folder, sequence, found.T_world_scan)
-        draw(folder, sequence, found)
-        numbers["wall_s"] = time.perf_counter() - started
-        cli.write_metrics(folder, numbers, seed=config.seed)
-        print(depth_report(numbers), f"results in {folder.path}", sep="\n")
+    run.open()
+    run.say(f"{sequence.name}: {len(sequence)} images")
+    recorder = cli.FitRecorder(run, "m")
+    settings = deepmapping.preset(options.preset, "depth", motion="planar" if sequence.is_planar else "full")
+    key, search = jax.random.key(options.seed), registration_rgbd.depth_search(settings.motion)
+    with cli.progress_bar("search of first poses", " images") as on_image:
+        start = registration_rgbd.initialize_depth(images, search, key=key, on_image=on_image)
+    found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
+    numbers = {**depth_numbers(sequence, found), **recorder.numbers}
+    cli.write_poses(run.path, found.T_world_scan)
+    points = np.einsum("nij,nhwj->nhwi", found.T_world_scan[:, :3, :3], sequence.points)
+    points += found.T_world_scan[:, None, None, :3, 3]
+    io.write_ply(run / "map.ply", points[sequence.mask].astype(np.float32))
+    run.write_numbers(numbers)  # also where a picture fails
+    draw(run, sequence, found)
+    return numbers
 
 
-def read_images(config: Config) -> DepthSequence:
+def read_images(options: DepthOptions) -> DepthSequence:
     """Returns the chosen images of DATA or of a simulated walk."""
-    if config.data is None:
-        sequence = simulation.simulate_depth_sequence(0, config.selection.stop or _NUM_SIMULATED, seed=config.seed)
+    if options.data is None:
+        sequence = simulation.simulate_depth_sequence(0, options.selection.stop or _NUM_SIMULATED, seed=options.seed)
     else:
-        sequence = io.read_pose_folder(config.data)
-    chosen = sequence.take(config.selection)
+        sequence = io.read_pose_folder(options.data)
+    chosen = sequence.take(options.selection)
     if len(chosen) < 2:
         raise ValueError(f"{sequence.name}: {len(chosen)} of {len(sequence)} images are chosen; choose two or more")
     return chosen
 
 
-def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> dict[str, Any]:
+def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
     before, after = (depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
+    consistency = 1 - (found.misfit if found.kept == "fit" else found.start_misfit)
+    verdict = f"kept: {METHODS[found.kept]}; the images agree to {consistency:.0%}"
+    if after:
+        verdict += f"; ATE {after['ate_m']:.3f} m, map points {after['point_distance_m']:.3f} m, largest error of a "
+        verdict += f"turn {after['largest_turn_error_deg']:.2f} degrees"
     return {
+        "verdict": verdict,
         "num_images": len(sequence),
         "kept": METHODS[found.kept],
-        "consistency": 1 - (found.misfit if found.kept == "fit" else found.start_misfit),
+        "consistency": consistency,
         "consistency_initial": 1 - found.start_misfit,
         **after,
         **cli.named_initial(before),
@@ -134,33 +135,15 @@ def depth_errors(sequence: DepthSequence, T_world_camera: FloatArray) -> dict[st
     }
 
 
-def write_depth_results(folder: cli.RunFolder, sequence: DepthSequence, T_world_camera: FloatArray) -> None:
-    """Writes the trajectory and map.ply."""
-    cli.write_poses(folder.path, T_world_camera)
-    points = np.einsum("nij,nhwj->nhwi", T_world_camera[:, :3, :3], sequence.points)
-    points += T_world_camera[:, None, None, :3, 3]
-    io.write_ply(folder / "map.ply", points[sequence.mask].astype(np.float32))
-
-
-def draw(folder: cli.RunFolder, sequence: DepthSequence, found: deepmapping.Registered) -> None:
+def draw(run: Run, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
     assert found.start is not None
-    poses = {"start": found.start, "fit": found.fitted.T_world_scan}
     panels = []
-    for name, T_world_camera in poses.items():
+    for name, T_world_camera in {"start": found.start, "fit": found.fitted.T_world_scan}.items():
         errors = depth_errors(sequence, T_world_camera)
         ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
         panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))
     if sequence.T_world_camera is not None:
         panels.append(("reference", sequence.T_world_camera))
-    viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), folder / "map.png", dpi=110)
-    cli.draw_loss(folder, "m")
-
-
-def depth_report(numbers: dict[str, Any]) -> str:
-    """Returns the last lines on the console."""
-    lines = [f"kept: {numbers['kept']}; the images agree to {numbers['consistency']:.0%}"]
-    if "ate_m" in numbers:
-        ate, points, turn = (numbers[name] for name in ("ate_m", "point_distance_m", "largest_turn_error_deg"))
-        lines.append(f"ATE {ate:.3f} m, map points {points:.3f} m, largest error of a turn {turn:.2f} degrees")
-    return "\n".join(lines)
+    viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), run / "map.png", dpi=110)
+    cli.draw_loss(run, "m")

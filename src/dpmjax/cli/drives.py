@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
-from dpmjax.cli.command import check_least
-from dpmjax.cli.run_folder import RESULTS, ModelOptions, RunOptions, ScanOptions
+from dpmjax.cli.run import RESULTS, ModelOptions, RunOptions, ScanOptions, check_least
 from dpmjax.sequences import InputError, LidarSequence, Note
 
 LOGGER = logging.getLogger("dpmjax.drives")
@@ -94,24 +93,6 @@ def open_path(path: Path, seed: int, **options: Any) -> LidarSequence:
     """Opens a folder of scans or a bag, or simulates a town of a seed along a file of poses."""
     is_route = path.suffix.lower() in (".txt", ".tum") and path.is_file()
     return route_drive(path, seed) if is_route else io.open_lidar_sequence(path, **options)
-
-
-def report_notes(notes: Iterable[Note]) -> dict[str, list[str]]:
-    """Logs the notes on the input, and prints those that are no doubts, because the console shows doubts already.
-
-    Args:
-        notes: notes of a drive.
-
-    Returns:
-        The entry of `metrics.json`.
-    """
-    texts = []
-    for note in notes:
-        LOGGER.info("%s", note.text)
-        texts.append(note.text)
-        if not note.is_doubt:
-            print(note.text, flush=True)
-    return {"input_notes": texts}
 
 
 def with_raised_beams(drive: LidarSequence) -> LidarSequence:

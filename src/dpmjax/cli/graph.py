@@ -11,27 +11,26 @@ trajectory_tum.txt (stamps are the numbers of the nodes), metrics.json and traje
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, io, pose_graph, viz
-from dpmjax.sequences import InputError, Note
+from dpmjax.cli.run import Numbers, OutputOptions, Run
+from dpmjax.sequences import Note
 
-NAME = "graph"
 # Edges below this weight are rejected.
 LET_GO = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.OutputOptions):
+class GraphOptions(OutputOptions):
     """Options of the run."""
 
-    graph: Annotated[Positional[Path], arg(metavar="GRAPH", help_behavior_hint="required")] = Path()
+    graph: Annotated[Positional[Path], arg(metavar="GRAPH")]
     """Pose graph, a file of g2o or TORO."""
     outlier_chi2: Annotated[float | None, arg(metavar="X")] = None
     """The most that a contradicted edge costs; without it, all edges count fully."""
@@ -45,50 +44,38 @@ class Config(cli.OutputOptions):
         cli.check_least(self, iterations=1)
         if self.outlier_chi2 is not None and not self.outlier_chi2 > 0.0:
             raise ValueError(f"--outlier-chi2: expected more than 0, got {self.outlier_chi2}")
-        if self.graph == Path():
-            raise ValueError("give a pose graph, a file of g2o or TORO")
 
 
-def main(config: Config) -> None:
+def main(options: GraphOptions, run: Run) -> Numbers:
     """Optimises a pose graph and writes the results."""
-    started = time.perf_counter()
-    graph = io.read_g2o(config.graph, nearest_psd=config.nearest_psd)
-    settings = pose_graph.PoseGraphConfig(outlier_chi2=config.outlier_chi2, max_iterations=config.iterations)
-    folder = cli.open_run_folder(config, NAME)
-    with cli.recording(folder):
-        found = pose_graph.optimize_pose_graph(graph, settings)
-        free = found.free_nodes
-        # A doubt: the solver has logged it, so that the console shows it already.
-        doubts = [Note(f"{config.graph}: {pose_graph.describe_free_nodes(free)}", is_doubt=True)] if free else []
-        notes = cli.report_notes(doubts)
-        metrics = {"graph": config.graph.name, **graph_numbers(found), **notes, "wall_s": time.perf_counter() - started}
-        poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
-        io.write_g2o(folder / "graph.g2o", found.graph)
-        io.write_tum(folder / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
-        cli.write_metrics(folder, metrics)
-        title = f"{config.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
-        tracks = [
-            viz.Track(f"before, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
-            viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
-        ]
-        viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), folder / "trajectory.png")
-        let_go = f", {metrics['num_edges_let_go']} of them let go" if metrics["num_edges_let_go"] else ""
-        print(f"{metrics['num_nodes']} nodes, {metrics['num_edges']} edges{let_go}")
-        print(f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations")
-        print(f"results in {folder.path}")
-        if not found.is_converged:
-            advice = "give more --iterations, or a kernel by --outlier-chi2"
-            raise InputError(config.graph, f"no minimum after {found.iterations} iterations", advice)
-
-
-def graph_numbers(found: pose_graph.OptimizedPoseGraph) -> dict[str, Any]:
-    """Returns the numbers of an optimisation."""
+    graph = io.read_g2o(options.graph, nearest_psd=options.nearest_psd)
+    settings = pose_graph.PoseGraphConfig(outlier_chi2=options.outlier_chi2, max_iterations=options.iterations)
+    run.open()
+    found = pose_graph.optimize_pose_graph(graph, settings)
+    if found.free_nodes:  # the solver has warned
+        run.note([Note(f"{options.graph}: {pose_graph.describe_free_nodes(found.free_nodes)}", is_doubt=True)])
+    poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
+    io.write_g2o(run / "graph.g2o", found.graph)
+    io.write_tum(run / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
+    title = f"{options.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
+    tracks = [
+        viz.Track(f"before, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
+        viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
+    ]
+    viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), run / "trajectory.png")
+    num_let_go = int((found.weights < LET_GO).sum())
+    verdict = f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations"
+    verdict += f", {num_let_go} edges let go" if num_let_go else ""
+    if not found.is_converged:
+        verdict = f"no minimum after {found.iterations} iterations: give more --iterations, or a kernel: --outlier-chi2"
     return {
+        "graph": options.graph.name,
         "status": "done" if found.is_converged else "failed",
+        "verdict": verdict,
         "num_nodes": len(found.graph.poses),
         "num_edges": len(found.graph.edges.source),
         "num_held": int(found.graph.held_nodes().sum()),
-        "num_edges_let_go": int((found.weights < LET_GO).sum()),
+        "num_edges_let_go": num_let_go,
         "chi2_initial": found.chi2_initial,
         "chi2": found.chi2,
         "iterations": found.iterations,

@@ -15,18 +15,19 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, geometry, io, slam, viz, weights
-from dpmjax.sequences import InputError, LidarSequence
+from dpmjax.cli.run import Numbers, Run
+from dpmjax.sequences import LidarSequence
 
-NAME = "localize"
+TABLE = "localizations.csv"
 POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
-COLUMNS = ["scan", "source", "status", "probability", "keyframe", "keyframe_scan", "part", "seconds", *POSE, "reason"]
+COLUMNS = ("scan", "source", "status", "probability", "keyframe", "keyframe_scan", "part", "seconds", *POSE, "reason")
 # Largest distance from a keyframe at which a scan is expected in the map.
 REACH_M = 15.0
 # Motions between keyframes differ by less than this share of their length from those of the right reference.
@@ -35,7 +36,7 @@ NUM_MAP_POINTS = 200_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.DriveOptions):
+class LocalizeOptions(cli.DriveOptions):
     """Options of the run."""
 
     map: Annotated[Positional[Path], arg(metavar="MAP", help_behavior_hint="required")] = Path()
@@ -70,51 +71,41 @@ class Case(NamedTuple):
     is_calibrated: bool
 
 
-def main(config: Config) -> None:
+def main(options: LocalizeOptions, run: Run) -> Numbers:
     """Localises the remaining scans, and writes table, trajectory, numbers and picture."""
-    model = weights.load_model(config.weights)
-    slam_map = cli.open_map(config.map, slam.make_methods(model, weights=config.weights))
-    drive = cli.open_drive(config.scans, config, config.sequence)
-    case = Case(slam_map, drive, reference_of(config, slam_map, drive), model.config.calibration is not None)
-    folder = cli.open_run_folder(config, NAME)
-    path = folder / "localizations.csv"
-    rows = cli.read_history(path) if path.exists() else []
+    model = weights.load_model(options.weights)
+    slam_map = cli.open_map(options.map, slam.make_methods(model, weights=options.weights))
+    drive = cli.open_drive(options.scans, options, options.sequence)
+    case = Case(slam_map, drive, reference_of(options, slam_map, drive), model.config.calibration is not None)
+    run.open(drive.notes)
+    rows = run.continue_table(TABLE)
     results = slam.localize_each(model, slam_map, (drive.read_points(i) for i in range(len(rows), len(drive))))
-    with (
-        cli.recording(folder),
-        cli.StopFlag() as stop,
-        cli.HistoryFile(path, COLUMNS, keep_until=len(drive)) as table,
-        tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar,
-    ):
-        notes = cli.report_notes(drive.notes)
+    with tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar:
         clock = time.perf_counter()
         try:
-            while len(rows) < len(drive) and not stop.is_requested:
+            while len(rows) < len(drive) and not run.is_stopped:
                 row = as_row(len(rows), case, next(results), time.perf_counter() - clock)
                 clock = time.perf_counter()
-                table.append(**row)
+                run.append_row(TABLE, **row)
                 rows.append(row)
                 bar.update(1)
                 bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        finally:  # also where a scan cannot be read
-            bar.close()  # so that the result stands below it
-            print(write_found(folder, config, case, rows, notes))
-        if _are_all_empty(rows) and not stop.is_requested:
-            found = f"{len(rows)} of {len(rows)} scans without enough points, none could be looked for"
-            raise InputError(drive.name, found, "check that the scans are 3-D and in metres")
-    print(f"results in {folder.path}")
+        except Exception:  # such as a scan that cannot be read
+            run.write_numbers({**write_found(run, options, case, rows), "status": "interrupted"})
+            raise
+    return write_found(run, options, case, rows)
 
 
-def reference_of(config: Config, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
+def reference_of(options: LocalizeOptions, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
     """Returns the reference poses of the keyframes; raises a `ValueError` where they cannot be used."""
-    if config.map_poses is None:
+    if options.map_poses is None:
         return None
     if drive.T_world_lidar is None:
-        raise ValueError(f"--map-poses: {config.scans} has no reference poses to compare with")
-    poses, numbers = io.read_poses(config.map_poses), [keyframe.scan for keyframe in slam_map.keyframes]
+        raise ValueError(f"--map-poses: {options.scans} has no reference poses to compare with")
+    poses, numbers = io.read_poses(options.map_poses), [keyframe.scan for keyframe in slam_map.keyframes]
     if max(numbers) >= len(poses):
-        raise ValueError(f"{config.map_poses}: {len(poses)} poses, the map has a keyframe of scan {max(numbers)}")
-    _check_map_poses(config.map_poses, poses[numbers], slam_map)
+        raise ValueError(f"{options.map_poses}: {len(poses)} poses, the map has a keyframe of scan {max(numbers)}")
+    _check_map_poses(options.map_poses, poses[numbers], slam_map)
     return poses[numbers]
 
 
@@ -155,45 +146,44 @@ def as_localization(row: dict[str, str]) -> slam.Localization:
     return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"], part=part)
 
 
-def write_found(
-    folder: cli.RunFolder, config: Config, case: Case, rows: list[dict[str, str]], notes: dict[str, list[str]]
-) -> str:
-    """Writes trajectory, metrics and picture; returns a summary."""
+def write_found(run: Run, options: LocalizeOptions, case: Case, rows: list[dict[str, str]]) -> Numbers:
+    """Writes trajectory and picture; returns the numbers."""
     results = [as_localization(row) for row in rows]
     numbers = [number for number, result in enumerate(results) if result.is_in_map]
     T = np.array([results[number].T_world_scan for number in numbers]).reshape(-1, 4, 4)
-    times = case.drive.times
-    stamps = numbers if times is None else times[numbers]
-    io.write_tum(folder / "trajectory_tum.txt", T, times=np.asarray(stamps, float), frame="T_map_scan")
+    stamps = numbers if case.drive.times is None else case.drive.times[numbers]
+    io.write_tum(run / "trajectory_tum.txt", T, times=np.asarray(stamps, float), frame="T_map_scan")
     errors, is_wrong = error_numbers(case, results)
-    metrics = {
-        "num_scans": len(rows),
-        "num_found": len(numbers),
-        "num_empty": sum(result.status == "empty" for result in results),
-        "num_keyframes": len(case.slam_map),
-        "is_calibrated": case.is_calibrated,
-        "map_bytes": config.map.stat().st_size,
-        **notes,
-        "status": _status(case, rows),
-        "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
-        **errors,
-    }
-    cli.write_metrics(folder, metrics, seed=config.seed)
     found = f"{len(numbers)} of {len(rows)} scans found"
-    title = f"{case.drive.name} in {config.map.name}: {found}"
+    title = f"{case.drive.name} in {options.map.name}: {found}"
     figure = viz.localization_figure(
         map_points(case.slam_map), case.slam_map.T_world_keyframe, T, is_wrong=is_wrong, title=title
     )
-    viz.save_figure(figure, folder / "map.png")
+    viz.save_figure(figure, run / "map.png")
     if errors:
         found += f"; {errors['num_inside']} are within {REACH_M:g} m of a keyframe; "
         found += f"{errors['num_right']} right, {errors['num_wrong']} wrong"
     if any(result.part for result in results):
         found += "; poses in parts of the map that no loop joins to the first have no common frame (column part)"
-    return found + ("" if case.is_calibrated else "; the probabilities are scores (these weights are not calibrated)")
+    found += "" if case.is_calibrated else "; the probabilities are scores (these weights are not calibrated)"
+    num_empty = sum(result.status == "empty" for result in results)
+    if is_failed := bool(rows) and num_empty == len(rows):
+        found = f"{len(rows)} of {len(rows)} scans without enough points: check that the scans are 3-D and in metres"
+    return {
+        "status": "failed" if is_failed else "done",
+        "verdict": found,
+        "num_scans": len(rows),
+        "num_found": len(numbers),
+        "num_empty": num_empty,
+        "num_keyframes": len(case.slam_map),
+        "is_calibrated": case.is_calibrated,
+        "map_bytes": options.map.stat().st_size,
+        "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
+        **errors,
+    }
 
 
-def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[str, Any], np.ndarray | None]:
+def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[Numbers, np.ndarray | None]:
     """Returns the numbers of right and wrong scans, and True for each found scan with a wrong pose.
 
     Without a reference there are no numbers, and None.
@@ -204,7 +194,7 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[dict[st
     errors = cli.localization_errors(results, case.slam_map, reference, drive.T_world_lidar)
     is_wrong = (~errors.is_right & drive.has_reference)[errors.is_found]
     num_inside, num_right = int((errors.keyframe_distance_m <= REACH_M).sum()), int(errors.is_right.sum())
-    numbers: dict[str, Any] = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
+    numbers: Numbers = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
     if num_right:
         numbers["median_error_m"] = float(np.median(errors.translation_m[errors.is_right]))
         numbers["median_error_deg"] = float(np.median(errors.rotation_deg[errors.is_right]))
@@ -216,14 +206,3 @@ def map_points(slam_map: slam.KeyframeMap) -> np.ndarray:
     poses = enumerate(slam_map.T_world_keyframe)
     points = np.concatenate([slam.keyframe_points(slam_map, row) @ T[:3, :3].T + T[:3, 3] for row, T in poses])
     return points[np.random.default_rng(0).permutation(len(points))[:NUM_MAP_POINTS]]
-
-
-def _status(case: Case, rows: list[dict[str, str]]) -> str:
-    """Returns the status of the run, whose rows are those of all scans unless it was stopped."""
-    if len(rows) < len(case.drive):
-        return "interrupted"
-    return "failed" if _are_all_empty(rows) else "done"
-
-
-def _are_all_empty(rows: list[dict[str, str]]) -> bool:
-    return bool(rows) and all(row["status"] == "empty" for row in rows)

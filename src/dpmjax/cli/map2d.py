@@ -18,12 +18,11 @@ recording, scans half a metre or 20 degrees apart are registered, and all others
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -31,18 +30,18 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, registration2d, simulation
 from dpmjax.cli import map2d_results as results
+from dpmjax.cli.run import CHECKPOINTS, Numbers, Run, RunOptions, ScanOptions, find_run, load_options
 from dpmjax.sequences import FloatArray, ScanSequence
 
 # Computes numbers, by name, of the poses of all scans.
-Measure = Callable[[FloatArray], dict[str, float]]
+Measure = Callable[[FloatArray], Numbers]
 
-NAME = "map2d"
 # Scans of a recording in metres that lie this far apart are registered.
 _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.ScanOptions, cli.RunOptions):
+class Map2dOptions(ScanOptions, RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
@@ -88,41 +87,29 @@ class Config(cli.ScanOptions, cli.RunOptions):
             raise ValueError("--world and --range-noise-px choose simulated scans; leave them out beside DATA")
 
 
-def main(config: Config) -> dict[str, Any]:
-    """Registers planar scans and writes the results; returns the content of `metrics.json`."""
-    started = time.perf_counter()
-    sequence = read_scans(config)
-    start = starting_poses(config, sequence)
-    measure = measures_of(config, sequence)
-    folder = cli.open_run_folder(config, NAME)
-    with cli.recording(folder), cli.StopFlag() as stop:
-        print(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
-        notes = cli.report_notes(sequence.notes)
-        seconds = math.inf if config.seconds is None else config.seconds
-        recorder = cli.FitRecorder(folder, sequence.unit, stop=lambda run_s: stop.is_requested or run_s >= seconds)
-        result = register_sequence(sequence, start, config, recorder, stop)
-        metrics = {
-            **map_numbers(sequence, result, config, measure),
-            **notes,
-            **recorder.numbers,
-            "status": "uncertain" if stop.status == "done" and not result.assessment.is_trusted else stop.status,
-        }
-        # Numbers first, so that they are written even if a picture fails.
-        cli.write_poses(folder.path, result.poses, times=sequence.times, unit=sequence.unit)
-        cli.write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started}, seed=config.seed)
-        registered = sequence.take(result.recording.chosen)
-        limits = results.draw_map(folder, registered, result, metrics)
-        if recorder.has_map:
-            results.draw_occupancy(folder, registered, result, limits)
-        cli.draw_loss(folder, sequence.unit)
-        metrics["wall_s"] = time.perf_counter() - started
-        cli.write_metrics(folder, metrics, seed=config.seed)
-        cli.tell(f"{results.report(sequence.unit, metrics)}\nresults in {folder.path}")
-    return metrics
+def main(options: Map2dOptions, run: Run) -> Numbers:
+    """Registers planar scans and writes the results."""
+    sequence = read_scans(options)
+    start = starting_poses(options, sequence)
+    measure = measures_of(options, sequence)
+    run.open(sequence.notes)
+    run.say(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
+    recorder = cli.FitRecorder(run, sequence.unit, max_s=math.inf if options.seconds is None else options.seconds)
+    result = register_sequence(sequence, start, options, recorder, run)
+    numbers = {**map_numbers(sequence, result, options, measure), **recorder.numbers}
+    cli.write_poses(run.path, result.poses, times=sequence.times, unit=sequence.unit)
+    run.write_numbers(numbers)  # also where a picture fails
+    registered = sequence.take(result.recording.chosen)
+    limits = results.draw_map(run, registered, result, numbers)
+    if recorder.has_map:
+        results.draw_occupancy(run, registered, result, limits)
+    cli.draw_loss(run, sequence.unit)
+    run.say(results.report(sequence.unit, numbers))
+    return numbers
 
 
 def register_sequence(
-    sequence: ScanSequence, start: str | FloatArray, config: Config, recorder: cli.FitRecorder, stop: cli.StopFlag
+    sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: Run
 ) -> registration2d.RegisteredScans:
     """Registers the scans, with the recorder as engine of the fit, and prints each stage and a bar of all."""
     import jax
@@ -137,35 +124,37 @@ def register_sequence(
         if len(rows) < len(sequence):
             bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
-        unit = fit_settings(config, sequence).unit or geometry.typical_range(fitted.points, fitted.mask)
+        unit = fit_settings(options, sequence).unit or geometry.typical_range(fitted.points, fitted.mask)
         return partial(recorder, measure=results.ate_of(fitted, unit))
 
     def advance(share: float) -> None:
         bar.update(share - bar.n)
 
-    hooks = registration2d.RegistrationHooks(show, lambda: stop.is_requested, engine, advance)
+    hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine, advance)
     with bar:
         return registration2d.register_scans(
             results.scan_set_of(sequence),
-            registration_settings(config, sequence),
-            key=jax.random.key(config.seed),
+            registration_settings(options, sequence),
+            key=jax.random.key(options.seed),
             start=start,
-            odometry=sequence.odometry_poses if config.ordered else None,
+            odometry=sequence.odometry_poses if options.ordered else None,
             hooks=hooks,
         )
 
 
 def map_numbers(
-    sequence: ScanSequence, result: registration2d.RegisteredScans, config: Config, measure: Measure
-) -> dict[str, Any]:
+    sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions, measure: Measure
+) -> Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
     registered = sequence.take(result.recording.chosen)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
 
     def title(name: str) -> str:
-        return name.replace(registration2d.GIVEN_POSES, f"poses of {Path(config.init).name}")
+        return name.replace(registration2d.GIVEN_POSES, f"poses of {Path(options.init).name}")
 
     return {
+        "status": "done" if result.assessment.is_trusted else "uncertain",
+        "verdict": results.verdict(result.assessment._asdict()),
         "num_scans": len(sequence),
         "num_registered": len(registered),
         **results.before_and_after(registered, start, kept),
@@ -181,11 +170,11 @@ def map_numbers(
     }
 
 
-def measures_of(config: Config, sequence: ScanSequence) -> Measure:
+def measures_of(options: Map2dOptions, sequence: ScanSequence) -> Measure:
     """Reads further references of the scans.
 
     Args:
-        config: options of the run.
+        options: options of the run.
         sequence: all scans.
 
     Returns:
@@ -194,8 +183,8 @@ def measures_of(config: Config, sequence: ScanSequence) -> Measure:
     Raises:
         ValueError: a file does not belong to the scans.
     """
-    relations = None if config.relations is None else io.read_relations(config.relations)
-    corrected = None if config.corrected is None else io.read_sequence(config.corrected)
+    relations = None if options.relations is None else io.read_relations(options.relations)
+    corrected = None if options.corrected is None else io.read_sequence(options.corrected)
     if relations is None and corrected is None:
         return lambda _poses: {}
     times = sequence.times
@@ -211,23 +200,23 @@ def measures_of(config: Config, sequence: ScanSequence) -> Measure:
     return measure
 
 
-def read_scans(config: Config) -> ScanSequence:
+def read_scans(options: Map2dOptions) -> ScanSequence:
     """Returns the chosen scans of DATA or of the built-in world."""
-    chosen = config.selection
-    if config.data is not None:
-        sequence = io.read_sequence(config.data, selection=chosen, topic=config.topic)
+    chosen = options.selection
+    if options.data is not None:
+        sequence = io.read_sequence(options.data, selection=chosen, topic=options.topic)
         if not registration2d.find_originals(results.scan_set_of(sequence)).any():
-            raise ValueError(f"{config.data}: all scans are equal beam by beam; give scans of a robot that moves")
+            raise ValueError(f"{options.data}: all scans are equal beam by beam; give scans of a robot that moves")
         return sequence
     sequence = simulation.simulate_sequence(
-        config.world, chosen.stop or 256, range_noise_px=config.range_noise_px, seed=config.seed, with_odometry=True
+        options.world, chosen.stop or 256, range_noise_px=options.range_noise_px, seed=options.seed, with_odometry=True
     )
     return sequence.take(chosen)
 
 
-def starting_poses(config: Config, sequence: ScanSequence) -> Any:
+def starting_poses(options: Map2dOptions, sequence: ScanSequence) -> str | FloatArray:
     """Returns the name of the initial poses, or the poses of the file that `--init` names, for all scans."""
-    init = config.init
+    init = options.init
     if init == "odometry" and sequence.odometry_poses is None:
         raise ValueError(
             f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
@@ -241,23 +230,23 @@ def starting_poses(config: Config, sequence: ScanSequence) -> Any:
     return io.read_planar_poses(init, len(sequence), sequence.unit)
 
 
-def registration_settings(config: Config, sequence: ScanSequence) -> registration2d.RegistrationConfig:
+def registration_settings(options: Map2dOptions, sequence: ScanSequence) -> registration2d.RegistrationConfig:
     """Returns the settings of the registration; scans in metres are chosen by their motion."""
     return registration2d.RegistrationConfig(
-        is_ordered=config.ordered,
-        refine=config.refine,
-        fit=fit_settings(config, sequence),
+        is_ordered=options.ordered,
+        refine=options.refine,
+        fit=fit_settings(options, sequence),
         min_distance=_MIN_DISTANCE_M if sequence.unit == "m" else None,
         min_turn=_MIN_TURN_RAD,
     )
 
 
-def fit_settings(config: Config, sequence: ScanSequence) -> deepmapping.DeepMappingConfig:
+def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.DeepMappingConfig:
     """Returns the preset, with the given number of steps; the unit of the paper is that of its worlds in pixels."""
-    settings = deepmapping.preset(config.preset, is_organised=sequence.is_organised)
+    settings = deepmapping.preset(options.preset, is_organised=sequence.is_organised)
     if sequence.unit == "m":
         settings = replace(settings, unit=None)
-    return settings if config.steps is None else deepmapping.with_steps(settings, config.steps)
+    return settings if options.steps is None else deepmapping.with_steps(settings, options.steps)
 
 
 class Map2dRun(NamedTuple):
@@ -291,27 +280,27 @@ def read_map2d_run(path: Path) -> Map2dRun:
 
     from dpmjax.checkpoints import Checkpoints
 
-    config, trajectory = cli.load_config(cli.find_run(NAME, path), Config), path / "trajectory.npy"
+    options, trajectory = load_options(find_run("map2d", path), Map2dOptions), path / "trajectory.npy"
     if not trajectory.is_file():
         raise ValueError(f"{path} holds no trajectory.npy: let the run end, or resume it")
-    if not config.ordered:
+    if not options.ordered:
         raise ValueError(
             f"{path} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
         )
-    sequence = read_scans(config)
+    sequence = read_scans(options)
     if sequence.unit == "m":
         raise ValueError(f"{path} is a run on {sequence.name}, in metres: give a run on a built-in world (--world)")
-    settings = fit_settings(config, sequence)
+    settings = fit_settings(options, sequence)
     data, unit = deepmapping.mapping_data(
         results.scan_set_of(sequence),
-        None if config.init == "zero" else np.load(trajectory),
+        None if options.init == "zero" else np.load(trajectory),
         unit=settings.unit,
     )
     problem = deepmapping.mapping_problem(settings, data)
     like = deepmapping.init(problem, data, key=jax.random.key(0))
-    state = Checkpoints((path / cli.CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
+    state = Checkpoints((path / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
     if state is None:
         raise ValueError(f"{path} holds no checkpoint that can be read")
     poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
     fitted = deepmapping.Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings, int(state.step))
-    return Map2dRun(sequence, fitted, config.world if config.data is None else None)
+    return Map2dRun(sequence, fitted, options.world if options.data is None else None)

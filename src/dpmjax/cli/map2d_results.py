@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dpmjax import cli, deepmapping, geometry, metrics, registration2d, viz
+from dpmjax import deepmapping, geometry, metrics, registration2d, viz
+from dpmjax.cli.run import Run
 from dpmjax.sequences import FloatArray, Relations, ScanSequence
 
 if TYPE_CHECKING:
@@ -64,10 +65,16 @@ def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArra
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
     return {
         **after,
-        **cli.named_initial(before),
+        **named_initial(before),
         f"success_threshold_{unit}": threshold,
         "success": after[f"ate_{unit}"] < threshold,
     }
+
+
+def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
+    """Returns errors under their names for the initial poses, such as ate_initial_m for ate_m; counts are left out."""
+    errors = {name: value for name, value in numbers.items() if not name.startswith("num_")}
+    return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
 
 
 def relation_numbers(times: FloatArray, poses: FloatArray, relations: Relations) -> dict[str, float]:
@@ -115,20 +122,20 @@ def corrected_numbers(times: FloatArray, poses: FloatArray, corrected: ScanSeque
     }
 
 
-def _trust_lines(assessment: Mapping[str, Any]) -> list[str]:
-    """Returns the lines on trust: the assessment, the fault of the odometry, and the uncertain scans."""
+def verdict(assessment: Mapping[str, Any]) -> str:
+    """Returns whether the map can be trusted, why, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     # Near zero the difference of two shares has either sign.
     more = f"{max(contradiction, 0.0):.1%} more beams than between the best pairs"
-    lines = [f"{trust}: the weakest connection scores {weakest:.2f} of 1; {more} end in the free space of another scan"]
+    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {more} end in the free space of another scan"
     if assessment["fault"] is not None:
-        lines.append(assessment["fault"])
+        text += f"; {assessment['fault']}"
     if count := len(assessment["uncertain_scans"]):
         spans = spans_of(assessment["uncertain_scans"])
         shown = ", ".join(spans[:_NUM_SPANS]) + (" ..." if len(spans) > _NUM_SPANS else "")
-        lines.append(f"uncertain where {count} scans are, which slide along a corridor or fit no other: {shown}")
-    return lines
+        text += f"; uncertain where {count} scans are, which slide along a corridor or fit no other: {shown}"
+    return text
 
 
 def spans_of(rows: Sequence[int]) -> list[str]:
@@ -138,8 +145,8 @@ def spans_of(rows: Sequence[int]) -> list[str]:
 
 
 def report(unit: str, numbers: Mapping[str, Any]) -> str:
-    """Returns the last lines on the console: errors and scores of each candidate, assessment of the kept one."""
-    candidates, assessment = numbers["candidates"], numbers["assessment"]
+    """Returns errors and scores of each candidate, which one was kept, and errors against further references."""
+    candidates = numbers["candidates"]
     width = max(map(len, candidates))
     has_ate = all(f"ate_{unit}" in found for found in candidates.values())
     head = f"  {'ATE, ' + unit:>10}" if has_ate else ""
@@ -148,10 +155,7 @@ def report(unit: str, numbers: Mapping[str, Any]) -> str:
         mark, ate = "*" if name == numbers["kept"] else " ", f"  {found[f'ate_{unit}']:10.3g}" if has_ate else ""
         lines.append(f"{mark} {name:{width}}{ate}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
     why = "chosen without the reference" if has_ate else "no reference was given"
-    lines += [
-        f"kept: {numbers['kept']} ({why}; docs/guides/scans_2d.md explains both scores)",
-        *_trust_lines(assessment),
-    ]
+    lines.append(f"kept: {numbers['kept']} ({why}; docs/guides/scans_2d.md explains both scores)")
     if "num_relations" in numbers:
         kinds = (f"{numbers[f'relations_initial_{kind}']:.3g} -> {numbers[f'relations_{kind}']:.3g}" for kind in UNITS)
         lines.append(f"mean error of {numbers['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")
@@ -173,7 +177,7 @@ def scan_set_of(sequence: ScanSequence) -> ScanSet:
 
 
 def draw_map(
-    folder: cli.RunFolder, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
+    run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
 ) -> viz.Limits:
     """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
     scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
@@ -189,12 +193,12 @@ def draw_map(
     if reference is not None:
         panels.append(viz.Panel("Reference", scans, reference, is_reference=True))
     figure = viz.registered_scans_figure(panels, unit)
-    viz.save_figure(figure, folder / "map.png")
+    viz.save_figure(figure, run / "map.png")
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 
 
 def draw_occupancy(
-    folder: cli.RunFolder, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
+    run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
 ) -> None:
     """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
     picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
@@ -202,4 +206,4 @@ def draw_occupancy(
     anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
     T_view_fit = np.asarray(metrics.align_rigid(trajectory, anchor[:, :2]))
     figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
-    viz.save_figure(figure, folder / "occupancy.png")
+    viz.save_figure(figure, run / "occupancy.png")

@@ -15,66 +15,65 @@ map_2.npz and so on.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
 from dpmjax.cli import slam_numbers
+from dpmjax.cli.run import ModelOptions, Numbers, OutputOptions, Run
 from dpmjax.sequences import counted
-
-NAME = "merge"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.ModelOptions, cli.OutputOptions):
+class MergeOptions(ModelOptions, OutputOptions):
     """Options of the run."""
 
     maps: Annotated[Positional[tuple[Path, ...]], arg(metavar="MAP MAP ...", help_behavior_hint="required")] = ()
     """Two or more maps, files of dpmjax.save_map."""
 
+    def __post_init__(self) -> None:
+        """Checks the maps."""
+        if len(self.maps) < 2:
+            raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(self.maps)}")
+        for number, path in enumerate(self.maps):
+            if path.resolve() in [before.resolve() for before in self.maps[:number]]:
+                raise ValueError(f"{path} is given twice; give each map once")
 
-def main(config: Config) -> None:
+
+def main(options: MergeOptions, run: Run) -> Numbers:
     """Merges maps and writes the results."""
-    started = time.perf_counter()
-    if len(config.maps) < 2:
-        raise ValueError(f"give two or more maps, files of dpmjax.save_map; got {len(config.maps)}")
-    for number, path in enumerate(config.maps):
-        if path.resolve() in [before.resolve() for before in config.maps[:number]]:
-            raise ValueError(f"{path} is given twice; give each map once")
-    methods = slam.make_methods(weights.load_model(config.weights), weights=config.weights)
-    maps = [cli.open_map(path, methods) for path in config.maps]
-    folder = cli.open_run_folder(config, NAME)
-    with cli.recording(folder):
-        with cli.progress_bar("loops between maps", " keyframes") as on_keyframe:
-            merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
-        write_maps(folder, maps, merged)
-        metrics = {"weights": config.weights, **merge_numbers(config.maps, maps, merged)}
-        cli.write_metrics(folder, metrics | {"wall_s": time.perf_counter() - started})
-        parts = len(merged.maps)
-        title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
-        panels = [panel_of(config.maps, merged, part) for part in range(parts)]
-        viz.save_figure(viz.agents_figure(title, panels), folder / "map.png")
-        print(merge_text(metrics), f"results in {folder.path}", sep="\n")
+    methods = slam.make_methods(weights.load_model(options.weights), weights=options.weights)
+    maps = [cli.open_map(path, methods) for path in options.maps]
+    run.open()
+    with cli.progress_bar("loops between maps", " keyframes") as on_keyframe:
+        merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
+    write_maps(run, maps, merged)
+    numbers = {"weights": options.weights, **merge_numbers(options.maps, maps, merged)}
+    run.write_numbers(numbers)  # also where a picture fails
+    parts = len(merged.maps)
+    title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
+    panels = [panel_of(options.maps, merged, part) for part in range(parts)]
+    viz.save_figure(viz.agents_figure(title, panels), run / "map.png")
+    return numbers
 
 
-def write_maps(folder: cli.RunFolder, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
+def write_maps(run: Run, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
     for part, slam_map in enumerate(merged.maps, start=1):
-        saved_maps.save_map(folder / map_name(part, len(merged.maps)), slam_map)
-    io.write_g2o(folder / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
+        saved_maps.save_map(run / map_name(part, len(merged.maps)), slam_map)
+    io.write_g2o(run / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
     ends = [
         {"map": number, "scan": keyframe.scan}
         for number, each in enumerate(maps, start=1)
         for keyframe in each.keyframes
     ]
     columns = ("map", "scan", "other_map", "other_scan", *cli.LOOP_CELLS)
-    cli.write_table(folder / "loops.csv", columns, cli.loop_rows(merged.loops, ends))
+    cli.write_table(run / "loops.csv", columns, cli.loop_rows(merged.loops, ends))
 
 
 def map_name(part: int, num_parts: int) -> str:
@@ -87,9 +86,9 @@ def short_name(path: Path) -> str:
     return str(Path(*path.parts[-2:]))
 
 
-def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> dict[str, Any]:
+def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> Numbers:
     """Returns the content of `metrics.json`: connected maps, and the numbers of loops and keyframes."""
-    parts: list[dict[str, Any]] = [
+    parts: list[Numbers] = [
         {
             "file": map_name(part, len(merged.maps)),
             "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
@@ -99,7 +98,7 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
         for part, slam_map in enumerate(merged.maps, start=1)
     ]
     is_measured = all(part["num_measured_parts"] < 2 for part in parts)
-    return {
+    numbers = {
         "status": "done" if is_measured else "uncertain",
         "num_maps": len(maps),
         "num_parts": len(parts),
@@ -113,6 +112,7 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
         ],
         "loops_between": [{"maps": pair, "num_loops": number} for pair, number in cli.count_meetings(merged.joined)],
     }
+    return {"verdict": merge_text(numbers), **numbers}
 
 
 def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.AgentPanel:
@@ -135,15 +135,16 @@ def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack
     return cli.map_track(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 
-def merge_text(metrics: dict[str, Any]) -> str:
-    """Returns the last lines on the console."""
+def merge_text(metrics: Numbers) -> str:
+    """Returns the verdict: what has become of each map."""
     names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
-    lines = []
+    texts = [
+        f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"
+    ]
     for part in metrics["parts"]:
         members = ", ".join(names[number] for number in part["maps"])
         text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
         if (num_parts := part["num_measured_parts"]) > 1:
             text += f", in {num_parts} parts whose relative poses are guesses"
-        lines.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
-    loops, candidates = counted(metrics["num_loops"], "loop"), counted(metrics["num_candidates"], "candidate")
-    return "\n".join([*lines, f"{loops} between maps, of {candidates}"])
+        texts.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
+    return "; ".join(texts)

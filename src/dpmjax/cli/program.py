@@ -75,11 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given and given[0] in COMMANDS:
         try:  # the imports take a second or two
             module = importlib.import_module(f"dpmjax.cli.{given[0]}")
-            run = importlib.import_module("dpmjax.cli.command").run_command
+            run = importlib.import_module("dpmjax.cli.run").run_command
         except KeyboardInterrupt:
             print("dpmjax: stopped by SIGINT", file=sys.stderr)
             return EXIT_INTERRUPTED
-        return int(run(module.main, module.Config, name=given[0], description=module.__doc__, args=given[1:]))
+        return int(run(module.main, name=given[0], description=module.__doc__, args=given[1:]))
     if given and given[0] == "--version":
         print(f"dpmjax {importlib.metadata.version('dpmjax')}")
         return EXIT_OK

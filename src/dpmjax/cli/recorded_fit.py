@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from dpmjax import cli
+from dpmjax import viz
+from dpmjax.cli.run import CHECKPOINTS, HISTORY, Numbers, Run
 
 if TYPE_CHECKING:
     import jax
 
     from dpmjax.deepmapping import Fit, Problem, Progress
 
-# Columns of the table; the last one is the error, named with its unit.
-_COLUMNS = ("step", "phase", "run_s", "loss", "occupancy", "chamfer")
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 _SAVE_EVERY_S = 20.0
 
@@ -37,15 +36,15 @@ class FitRecorder:
         has_map: True where M-Net has been trained.
     """
 
-    def __init__(self, folder: cli.RunFolder, length: str, *, stop: Callable[[float], bool]) -> None:
+    def __init__(self, run: Run, length: str, *, max_s: float = math.inf) -> None:
         """Makes an engine for one fit.
 
         Args:
-            folder: folder of the run; gets `metrics.csv` and checkpoints.
+            run: gets `metrics.csv` and checkpoints.
             length: unit of the ATE.
-            stop: called before each call of the step with the run time so far, seconds; the fit ends where it is True.
+            max_s: seconds of stepping after which the fit ends.
         """
-        self._folder, self._length, self._stop = folder, length, stop
+        self._run, self._length, self._max_s = run, length, max_s
         self.steps, self.run_s, self.compile_s, self.has_map = 0, 0.0, 0.0, False
 
     def __call__(
@@ -60,61 +59,62 @@ class FitRecorder:
         from dpmjax.checkpoints import Checkpoints
         from dpmjax.deepmapping import init, resume
 
-        folder, state = self._folder, init(problem, data, key=key)
-        checkpoints = Checkpoints(Path(folder.path) / cli.CHECKPOINTS)
+        state = init(problem, data, key=key)
+        checkpoints = Checkpoints(Path(self._run / CHECKPOINTS))
         state = checkpoints.restore_latest(state, fallback=state)
-        columns = (*_COLUMNS, f"ate_{self._length}")
+        earlier = self._run.continue_table(HISTORY, until=int(state.step))
+        earlier_s = self.run_s = max((float(row["run_s"]) for row in earlier), default=0.0)
         bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
         saved_at = time.perf_counter()
 
         def record(progress: Progress) -> None:
             nonlocal saved_at
             self.run_s = earlier_s + progress.run_s
-            self._write(progress, measure(np.asarray(progress.report.poses, np.float64)), history, bar)
+            ate = measure(np.asarray(progress.report.poses, np.float64))
+            self._append(progress, ate)
+            self._show(progress, ate, bar)
             if time.perf_counter() - saved_at > _SAVE_EVERY_S:
                 checkpoints.save(int(progress.state.step), progress.state)
                 saved_at = time.perf_counter()
 
-        with bar, cli.HistoryFile(folder / cli.HISTORY, columns, keep_until=int(state.step)) as history:
-            earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
-            self.run_s = earlier_s
-            done = resume(problem, state, data, on_report=record, stop=lambda: self._stop(self.run_s))
+        with bar:
+            done = resume(problem, state, data, on_report=record, stop=self._is_over)
         checkpoints.save(int(done.state.step), done.state)
         self.steps, self.compile_s = int(done.state.step), done.compile_s
         self.has_map = self.steps > 0 and problem.phases[int(done.state.phase)].occupancy_weight > 0.0
         return done
 
     @property
-    def numbers(self) -> dict[str, float]:
+    def numbers(self) -> Numbers:
         """Returns seconds and steps under the names of `metrics.json`."""
         return {"fit_s": self.run_s, "compile_s": self.compile_s, "steps": self.steps}
 
-    def _write(self, progress: Progress, ate: float, history: cli.HistoryFile, bar: tqdm) -> None:
-        """Adds one call of the step to the table and to the progress bar."""
-        report, phase, step = progress.report, progress.phase.name, int(progress.state.step)
-        losses = {name: float(np.mean(term)) for name, term in report.terms._asdict().items()}
-        row = {"step": step, "phase": phase, "run_s": round(self.run_s, 4), f"ate_{self._length}": ate}
-        history.append(**row, loss=report.loss, **losses)
+    def _is_over(self) -> bool:
+        return self._run.is_stopped or self.run_s >= self._max_s
+
+    def _append(self, progress: Progress, ate: float) -> None:
+        """Adds one call of the step to the table."""
+        report = progress.report
+        row = {"step": int(progress.state.step), "phase": progress.phase.name, "run_s": round(self.run_s, 4)}
+        row |= {"loss": report.loss, **{name: float(np.mean(term)) for name, term in report.terms._asdict().items()}}
+        self._run.append_row(HISTORY, **row, **{f"ate_{self._length}": ate})
+
+    def _show(self, progress: Progress, ate: float, bar: tqdm) -> None:
+        """Moves the bar to the share that is done; the remaining time is that of the last calls."""
+        seconds, share = progress.run_s, progress.share
+        self._begun = getattr(self, "_begun", (seconds, share))
+        pace_s = (seconds - self._begun[0]) / max(share - self._begun[1], 1e-9)
+        left = f", {pace_s * (1 - share):.0f} s left" if share > self._begun[1] else ""
         ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
-        show_progress(bar, f"{phase}, loss {report.loss:.4f}{ate_text}", progress.share, self.run_s)
+        bar.set_postfix_str(f"{progress.phase.name}, loss {progress.report.loss:.4f}{ate_text}{left}", refresh=False)
+        bar.update(share - bar.n)
 
 
-def show_progress(bar: tqdm, text: str, done: float, run_s: float) -> None:
-    """Updates the bar to the share that is done, with the text and the remaining seconds."""
-    done = min(1.0, done)
-    left = run_s * (1.0 - done) / max(done, 1e-9)
-    bar.set_postfix_str(f"{text}, {left:.0f} s left", refresh=False)
-    bar.update(done - bar.n)
-
-
-def draw_loss(folder: cli.RunFolder, unit: str) -> None:
+def draw_loss(run: Run, unit: str) -> None:
     """Draws loss.png: loss and error of the fit over its run time."""
-    from dpmjax import viz
-
-    rows = cli.read_history(folder / cli.HISTORY)
-    if rows:
+    if rows := run.read_table(HISTORY):
         seconds, loss, ate = (
             np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
         )
         figure = viz.history_figure(seconds, loss, [row["phase"] for row in rows], ate, unit)
-        viz.save_figure(figure, folder / "loss.png")
+        viz.save_figure(figure, run / "loss.png")

@@ -11,28 +11,26 @@ metrics.json, aligned.ply (A in the frame of B, and B, in two colours) and regis
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deeppointmap, io, viz, weights
-from dpmjax.sequences import InputError
+from dpmjax.cli.run import ModelOptions, Numbers, OutputOptions, Run
 
 if TYPE_CHECKING:
     from dpmjax.types import Registration
 
-NAME = "register"
 # Least calibrated probability of a certain motion.
 SURE = 0.9
 SOURCE_COLOR, TARGET_COLOR = (58, 134, 192), (240, 168, 64)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.ModelOptions, cli.OutputOptions):
+class RegisterOptions(ModelOptions, OutputOptions):
     """Options of the run."""
 
     source: Annotated[Positional[Path], arg(metavar="A")]
@@ -49,60 +47,53 @@ class Config(cli.ModelOptions, cli.OutputOptions):
         cli.check_least(self, columns=3)
 
 
-def main(config: Config) -> None:
+def main(options: RegisterOptions, run: Run) -> Numbers:
     """Registers two scans and writes the results."""
-    started = time.perf_counter()
-    paths = (config.source, config.target)
-    source, target = (io.read_lidar_file(path, bin_columns=config.columns) for path in paths)
+    paths = (options.source, options.target)
+    source, target = (io.read_lidar_file(path, bin_columns=options.columns) for path in paths)
     scans = zip(paths, (source, target), strict=True)
-    notes = [note for path, points in scans for note in io.scan_notes(path, points, bin_columns=config.columns)]
-    model = weights.load_model(config.weights)
-    folder = cli.open_run_folder(config, NAME)
-    with cli.recording(folder):
-        noted = cli.report_notes(notes)
-        print("registration ...", flush=True)
-        clock = time.perf_counter()
-        found = deeppointmap.register(model, source, target, refine=config.refine)
-        T = np.asarray(found.T_target_source, np.float64)
-        metrics = {
-            "source": config.source.name,
-            "target": config.target.name,
-            "weights": config.weights,
-            **noted,
-            **motion_numbers(T),
-            **confidence_numbers(found, model.config.calibration is not None),
-            "register_s": time.perf_counter() - clock,
-        }
-        write_motion(folder, T, source, target)
-        metrics["wall_s"] = time.perf_counter() - started
-        cli.write_metrics(folder, metrics)
-        motions = {"before registration": np.eye(4), f"registered, confidence {metrics['confidence']:.2f}": T}
-        files = names_of(config.source, config.target)
-        pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
-        figure = viz.registered_pairs_figure([pair])
-        viz.save_figure(figure, folder / "registration.png")
-        print(motion_text(T, metrics), f"results in {folder.path}", sep="\n")
-        if metrics["status"] == "failed":
-            outcome = "no motion was found, the identity was written"
-            advice = "give scans with walls and other things at 20 places or more, 1 to 60 m from the lidar"
-            raise InputError(f"{config.source}, {config.target}", outcome, advice)
+    notes = [note for path, points in scans for note in io.scan_notes(path, points, bin_columns=options.columns)]
+    model = weights.load_model(options.weights)
+    run.open(notes)
+    print("registration ...", flush=True)
+    found = deeppointmap.register(model, source, target, refine=options.refine)
+    T = np.asarray(found.T_target_source, np.float64)
+    write_motion(run, T, source, target)
+    motions = {"before registration": np.eye(4), f"registered, confidence {float(found.confidence):.2f}": T}
+    # Files of the same name are told apart by their folders.
+    num_parts = 1 if options.source.name != options.target.name else 2
+    files = (str(Path(*options.source.parts[-num_parts:])), str(Path(*options.target.parts[-num_parts:])))
+    pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
+    viz.save_figure(viz.registered_pairs_figure([pair]), run / "registration.png")
+    print(f"T_target_source, which maps points of {files[0]} to the frame of {files[1]}:")
+    print("\n".join("  " + " ".join(f"{value:12.6f}" for value in row) for row in T))
+    return {
+        "source": files[0],
+        "target": files[1],
+        "weights": options.weights,
+        **motion_numbers(T),
+        **verdict_numbers(found, model.config.calibration is not None),
+    }
 
 
-def names_of(source: Path, target: Path) -> tuple[str, str]:
-    """Returns the names of both files, with their folders where the files have the same name."""
-    num_parts = 1 if source.name != target.name else 2
-    return str(Path(*source.parts[-num_parts:])), str(Path(*target.parts[-num_parts:]))
-
-
-def confidence_numbers(found: Registration, is_calibrated: bool) -> dict[str, Any]:
-    """Returns the status of a registration, its confidence, and the evidence for it."""
+def verdict_numbers(found: Registration, is_calibrated: bool) -> Numbers:
+    """Returns status and verdict of a registration, its confidence, and the evidence for it."""
     names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
     shares = {name: float(getattr(found.verification, name)) for name in names}
     confidence, num_inliers = float(found.confidence), int(found.num_inliers)
-    has_motion = num_inliers > 0 or bool(shares.get("matched_share"))
     status = "uncertain" if is_calibrated and confidence < SURE else "done"
+    if not is_calibrated:
+        verdict = f"score of the matches {confidence:.2f} (these weights are not calibrated)"
+    else:
+        verdict = f"right within 2 m and 5 degrees with probability {confidence:.2f}"
+        verdict += "" if confidence >= SURE else ": NOT SURE, look at registration.png"
+    if num_inliers == 0 and not shares.get("matched_share"):
+        status = "failed"
+        verdict = "no motion was found, the identity was written: give scans with walls and other things at 20 places"
+        verdict += " or more, 1 to 60 m from the lidar"
     return {
-        "status": status if has_motion else "failed",
+        "status": status,
+        "verdict": verdict,
         "confidence": confidence,
         "num_inliers": num_inliers,
         **shares,
@@ -110,7 +101,7 @@ def confidence_numbers(found: Registration, is_calibrated: bool) -> dict[str, An
     }
 
 
-def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
+def motion_numbers(T_target_source: np.ndarray) -> Numbers:
     """Returns the motion as a matrix, a distance and an angle."""
     from scipy.spatial.transform import Rotation
 
@@ -122,25 +113,10 @@ def motion_numbers(T_target_source: np.ndarray) -> dict[str, Any]:
     }
 
 
-def write_motion(folder: cli.RunFolder, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
+def write_motion(run: Run, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
     """Writes T_target_source.txt and aligned.ply."""
     rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
-    io.write_atomically(folder / "T_target_source.txt", "\n".join(rows) + "\n")
+    io.write_atomically(run / "T_target_source.txt", "\n".join(rows) + "\n")
     moved = source @ T_target_source[:3, :3].T + T_target_source[:3, 3]
     colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
-    io.write_ply(folder / "aligned.ply", np.concatenate([moved, target]).astype(np.float32), colors=colors)
-
-
-def motion_text(T_target_source: np.ndarray, metrics: dict[str, Any]) -> str:
-    """Returns the last lines on the console."""
-    rows = "\n".join("  " + " ".join(f"{value:12.6f}" for value in row) for row in T_target_source)
-    if metrics["is_calibrated"]:
-        sure = "" if metrics["confidence"] >= SURE else ": NOT SURE, look at registration.png"
-        confidence = f"probability that it is right within 2 m and 5 degrees: {metrics['confidence']:.2f}{sure}"
-    else:
-        confidence = f"score of the matches (these weights are not calibrated): {metrics['confidence']:.2f}"
-    return (
-        f"T_target_source, which maps points of {metrics['source']} to the frame of {metrics['target']}:\n{rows}\n"
-        f"{metrics['translation_m']:.3f} m, {metrics['rotation_deg']:.2f} degrees\n"
-        f"{confidence}"
-    )
+    io.write_ply(run / "aligned.ply", np.concatenate([moved, target]).astype(np.float32), colors=colors)

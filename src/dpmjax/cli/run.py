@@ -33,21 +33,24 @@ from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NoReturn, get_type_hints
 
+import numpy as np
 import tyro
 from tqdm import tqdm
 from tyro.conf import FlagCreatePairsOff, arg
 
+from dpmjax import io
 from dpmjax.cli import program
-from dpmjax.cli.info import environment, select_device
+from dpmjax.cli.machine import environment, select_device
 from dpmjax.compile_cache import enable_compile_cache
-from dpmjax.io.files import write_atomically
 from dpmjax.sequences import InputError, Note
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
 CONFIG, METRICS, HISTORY, LOG, CHECKPOINTS = "config.json", "metrics.json", "metrics.csv", "log.txt", "checkpoints"
 RESULTS = Path("results")
 # Options that do not change the result.
-FREE_OPTIONS = frozenset({"output", "resume", "force", "device", "visualize"})
+FREE_OPTIONS = frozenset(
+    {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
+)
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
 LOGGERS = ("dpmjax", "experiments", "__main__")
@@ -169,7 +172,7 @@ class Run:
         """Makes the folder, or empties it with --force, and writes `config.json`; call it after the input was read.
 
         Args:
-            notes: doubts and remarks on the input, which the console and `metrics.json` show.
+            notes: doubts and decisions on the input.
 
         Raises:
             ValueError: the folder cannot be written, or another process is writing in it.
@@ -191,6 +194,10 @@ class Run:
         for logger in map(logging.getLogger, LOGGERS):
             logger.addHandler(self._handler)
             logger.setLevel(logging.INFO)
+        self.note(notes)
+
+    def note(self, notes: Iterable[Note]) -> None:
+        """Logs doubts and decisions on the input, and keeps them for `metrics.json`."""
         for note in notes:
             self._notes.append(note.text)
             logging.getLogger("dpmjax").info("%s", note.text)
@@ -295,7 +302,8 @@ def run_command(
         enable_compile_cache()
         options = _read_options(main, name, description, list(sys.argv[1:] if args is None else args))
         run = Run(name, options)
-        select_device(getattr(options, "device", None))
+        if getattr(options, "coordinator", None) is None:  # several processes find each other first
+            select_device(getattr(options, "device", None))
         for number in SIGNALS:
             signal.signal(number, run.on_signal)
         return _finish(run, main(options, run))
@@ -512,7 +520,7 @@ def _lock(path: Path) -> int | None:
 
 def write_json(path: Path, value: Any) -> None:
     """Writes dataclasses, paths and NumPy values as JSON, atomically."""
-    write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
+    io.write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
 
 
 def load_json(path: Path) -> dict[str, Any]:
@@ -547,7 +555,21 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, 
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_atomically(path, text.getvalue())
+    io.write_atomically(path, text.getvalue())
+
+
+def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum: Any) -> None:
+    """Writes poses in the plane or in space as NAME.npy, NAME_tum.txt and NAME_kitti.txt.
+
+    Args:
+        folder: folder of the files.
+        poses: poses of all scans.
+        name: beginning of the names of the files.
+        **tum: options of `io.write_tum`, such as the times.
+    """
+    io.write_poses_npy(folder / f"{name}.npy", poses)
+    io.write_tum(folder / f"{name}_tum.txt", poses, **tum)
+    io.write_kitti(folder / f"{name}_kitti.txt", poses)
 
 
 def check_least(options: Any, **least: float) -> None:

@@ -16,29 +16,26 @@ and writes all files too.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, io, slam, viz, weights
 from dpmjax.cli import slam_files as files
-from dpmjax.cli import slam_numbers as numbers
-from dpmjax.sequences import InputError, LidarSequence, counted, require
-
-NAME = "slam"
+from dpmjax.cli import slam_numbers as results
+from dpmjax.cli.run import Numbers, Run, find_run
+from dpmjax.sequences import LidarSequence, counted, require
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.DriveOptions):
+class SlamOptions(cli.DriveOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
@@ -56,8 +53,6 @@ class Config(cli.DriveOptions):
     exact offsets; 2.5 suits dpm_small."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
-    refine: FlagCreatePairsOff[bool] = False
-    """Refine the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
@@ -73,48 +68,46 @@ class Config(cli.DriveOptions):
             raise ValueError("--max-rmse: give it with --preset paper")
 
 
-def main(config: Config) -> None:
+def main(options: SlamOptions, run: Run) -> Numbers:
     """Maps a drive and writes the results."""
     from dpmjax.cli.slam_run import find_beginning, run_scans
 
-    if config.visualize:
+    if options.visualize:
         cli.require_importable("rerun", "-v")
-    started = time.perf_counter()
-    methods = slam_methods(config)
+    methods = slam_methods(options)
     # A map of other weights is refused here, before the scans are opened.
-    start = slam.init_slam(None if config.map is None else files.open_map(config.map, methods))
-    sequence = cli.open_drive(config.data, config, config.sequence)
-    reader = cli.ScanReader(sequence, is_deskewed=config.deskew, jump=config.jump)
-    beginning = find_beginning(cli.find_run(NAME, config.output) if config.resume else None, methods, start)
+    start = slam.init_slam(None if options.map is None else files.open_map(options.map, methods))
+    sequence = cli.open_drive(options.data, options, options.sequence)
+    reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
+    beginning = find_beginning(find_run("slam", options.output) if options.resume else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{counted(num_done, 'scan')} done, {len(sequence)} wanted"
     require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
-    folder = cli.open_run_folder(config, NAME)
-    with cli.recording(folder), cli.StopFlag() as stop:
-        done = f", {len(beginning.reports)} done before" if beginning.reports else ""
-        cli.tell(f"{sequence.name}: {counted(len(sequence), 'scan')}{done}")
-        notes = cli.report_notes(sequence.notes)
-        viewer = viz.LiveViewer(sequence.name, folder / "slam.rrd") if config.visualize else None
-        with nullcontext() if viewer is None else closing(viewer):
-            run = run_scans(folder, reader, methods, beginning, lambda: stop.is_requested, viewer)
-        result = slam.finish_slam(run.state, run.reports, methods.config)
-        drive = MappedDrive(sequence.take(slice(0, len(result.reports))), start, result)
-        metrics = write_results(folder, config, drive, run)
-        if config.refine and run.failure is None and not stop.is_requested:
-            metrics |= refine_trajectory(folder, config, drive, lambda: stop.is_requested)
-        is_interrupted = stop.is_requested or run.failure is not None
-        metrics |= {
-            **notes,
-            "status": numbers.run_status(metrics, is_interrupted),
-            "wall_s": time.perf_counter() - started,
-        }
-        cli.write_metrics(folder, metrics, seed=config.seed)
-        cli.tell(f"{numbers.summary(metrics)}\nresults in {folder.path}")
-        if run.failure is not None:
-            raise run.failure
-        failed = numbers.why_failed(metrics["scan_statuses"])
-        if failed is not None and not stop.is_requested:
-            raise InputError(sequence.name, failed, "check that the scans are 3-D, in metres, and follow each other")
+    run.open(sequence.notes)
+    run.say(f"{sequence.name}: {counted(len(sequence), 'scan')}" + (f", {num_done} done before" if num_done else ""))
+    viewer = viz.LiveViewer(sequence.name, run / "slam.rrd") if options.visualize else None
+    with nullcontext() if viewer is None else closing(viewer):
+        mapped = run_scans(run, reader, methods, beginning, viewer)
+    result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
+    drive = MappedDrive(sequence.take(slice(0, len(result.reports))), start, result)
+    num_new = len(mapped.scan_s)
+    numbers = {
+        "weights": options.weights,
+        **results.run_numbers(result, drive.sequence),
+        "scans_per_s": num_new / mapped.run_s if num_new else None,
+        "run_s": mapped.run_s,
+        "compile_s": mapped.compile_s,
+    }
+    if result.reports:
+        numbers |= write_results(run, drive, numbers)
+    if mapped.failure is not None:
+        run.write_numbers({**numbers, "status": "interrupted"})
+        raise mapped.failure
+    if errors := results.error_text(numbers):
+        run.say(errors)
+    if num_new:
+        run.say(f"{numbers['scans_per_s']:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
+    return numbers
 
 
 class MappedDrive(NamedTuple):
@@ -137,49 +130,29 @@ class MappedDrive(NamedTuple):
         return self.sequence.read_points(self.result.map.keyframes[row].scan - self.start.front_end.num_scans)
 
 
-def slam_methods(config: Config) -> slam.SlamMethods:
+def slam_methods(options: SlamOptions) -> slam.SlamMethods:
     """Returns the methods of the model."""
-    settings = slam.slam_preset(config.preset)
-    if config.odometry is not None:
-        settings = replace(settings, odometry=replace(settings.odometry, proposer=config.odometry))
-    if config.max_rmse is not None:
-        settings = replace(settings, descriptors=replace(settings.descriptors, max_rmse_m=config.max_rmse))
-    if config.no_loop:
+    settings = slam.slam_preset(options.preset)
+    if options.odometry is not None:
+        settings = replace(settings, odometry=replace(settings.odometry, proposer=options.odometry))
+    if options.max_rmse is not None:
+        settings = replace(settings, descriptors=replace(settings.descriptors, max_rmse_m=options.max_rmse))
+    if options.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
-    return slam.make_methods(weights.load_model(config.weights), settings, weights=config.weights)
+    return slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
 
 
-def write_results(folder: cli.RunFolder, config: Config, drive: MappedDrive, run: numbers.SlamRun) -> dict[str, Any]:
-    """Writes all files but metrics.json, and returns its numbers; pictures come last."""
+def write_results(run: Run, drive: MappedDrive, numbers: Numbers) -> Numbers:
+    """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
     sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
-    metrics = {"weights": config.weights, **numbers.run_numbers(run, result, sequence)}
-    if not result.reports:
-        return metrics
-    files.write_trajectory(folder.path, result.T_world_scan, sequence.times)
-    files.write_trajectory(folder.path, result.T_odometry_scan, sequence.times, "odometry")
-    files.write_graph(folder.path, result)
-    files.write_loops(folder / "loops.csv", result.loops, result.keyframes)
-    files.write_scans(folder / "scans.csv", result.reports, result.keyframes, sequence.sources)
-    if len(slam_map):
-        metrics |= files.write_map_file(folder / "map.npz", slam_map)
-    # Numbers first, so that they are written even if a picture fails.
-    cli.write_metrics(folder, metrics | {"status": "interrupted"}, seed=config.seed)
+    files.write_trajectory(run.path, result.T_world_scan, sequence.times)
+    files.write_trajectory(run.path, result.T_odometry_scan, sequence.times, "odometry")
+    files.write_graph(run.path, result)
+    files.write_loops(run / "loops.csv", result.loops, result.keyframes)
+    files.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
+    sizes = files.write_map_file(run / "map.npz", slam_map) if len(slam_map) else {}
+    run.write_numbers({**numbers, **sizes})  # also where a picture fails
     cloud = files.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
-    io.write_ply(folder / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
-    files.draw_pictures(folder.path, sequence, result, cloud, len(drive.start.slam_map))
-    return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
-
-
-def refine_trajectory(
-    folder: cli.RunFolder, config: Config, drive: MappedDrive, is_stopped: Callable[[], bool]
-) -> dict[str, Any]:
-    """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
-    import jax
-
-    result, key = drive.result, jax.random.key(config.seed)
-    with cli.progress_bar("refine", " windows of keyframes") as on_window:
-        refined = slam.refine_keyframes(result.map, drive.read_keyframe, key=key, on_window=on_window, stop=is_stopped)
-    T = slam.place_scans(refined.slam_map.T_world_keyframe, result.reports)
-    files.write_trajectory(folder.path, T, drive.sequence.times, "refined")
-    windows = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
-    return {**windows, **numbers.trajectory_errors(T, drive.sequence.T_world_lidar, "_refined")}
+    io.write_ply(run / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
+    files.draw_pictures(run.path, sequence, result, cloud, len(drive.start.slam_map))
+    return {**sizes, "map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}

@@ -1,15 +1,16 @@
-"""Numbers of SLAM and of localization for metrics.json: errors, counts, seconds; and the record of a run."""
+"""Numbers of SLAM and of localization for metrics.json: errors, counts, status and verdict."""
 
 from __future__ import annotations
 
 import collections
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from dpmjax import geometry, metrics, slam
+from dpmjax.cli.run import Numbers
 from dpmjax.sequences import LidarSequence, counted
 
 MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
@@ -17,34 +18,6 @@ MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
 
 INVERTED_SHARE = 0.2
 """Share of the error of the reference, below which the error of its inverse makes the reference doubtful."""
-
-
-class SlamRun(NamedTuple):
-    """A run until its end or its stop.
-
-    Attributes:
-        state: after the last scan.
-        reports: reports of all scans.
-        stages_s: seconds of each stage in this process, without compilation. "waiting" is for the next scan; a stage
-            "ahead" runs in the thread that reads and thins it, at the same time as the others.
-        compile_s: seconds of compilation.
-        run_s: seconds of all scans of this process, without compilation.
-        scan_s: seconds of each scan of this process, without compilation and writing.
-        failure: error that ended the run early; None without an error.
-    """
-
-    state: slam.SlamState
-    reports: tuple[slam.ScanReport, ...]
-    stages_s: dict[str, float]
-    compile_s: float
-    run_s: float
-    scan_s: tuple[float, ...]
-    failure: Exception | None
-
-    @property
-    def num_done(self) -> int:
-        """Returns the number of scans of this process."""
-        return len(self.scan_s)
 
 
 class LocalizationErrors(NamedTuple):
@@ -105,7 +78,7 @@ UNSURE = {
 """Texts for scans that were not aligned with the scans before them, by status."""
 
 
-def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> dict[str, Any]:
+def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> Numbers:
     """Returns ATE, RPE and KITTI's errors of a trajectory, at scans with a reference pose; none without two of them."""
     if reference is None:
         return {}
@@ -154,12 +127,11 @@ def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | Non
     return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))
 
 
-def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) -> dict[str, Any]:
-    """Returns the numbers of a run for `metrics.json`; the sequence has the scans that were placed."""
+def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
+    """Returns the numbers of a map for `metrics.json`; the sequence has the scans that were placed."""
     T, reference = result.T_world_scan, sequence.T_world_lidar
-    statuses = collections.Counter(report.status for report in result.reports)
     loops = collections.Counter(loop.status for loop in result.loops)
-    return {
+    numbers = {
         "sequence": sequence.name,
         "num_scans": len(T),
         "path_m": float(metrics.path_lengths(T).max(initial=0.0)),
@@ -170,15 +142,11 @@ def run_numbers(run: SlamRun, result: slam.SlamResult, sequence: LidarSequence) 
         "num_loops": loops["accepted"],
         **trajectory_errors(T, reference),
         **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
-        "scan_statuses": dict(statuses),
+        "scan_statuses": dict(collections.Counter(report.status for report in result.reports)),
         "num_unknown_along": sum(report.is_unknown_along for report in result.reports),
         "loop_statuses": dict(loops),
-        "scans_per_s": run.num_done / run.run_s if run.num_done else None,
-        "run_s": run.run_s,
-        "compile_s": run.compile_s,
-        "stages_s": run.stages_s,
-        "stages_ms_per_scan": {name: 1000 * s / max(run.num_done, 1) for name, s in run.stages_s.items()},
     }
+    return {"status": status_of(numbers), "verdict": verdict_of(numbers), **numbers}
 
 
 def why_failed(statuses: Mapping[str, int]) -> str | None:
@@ -199,27 +167,23 @@ def why_failed(statuses: Mapping[str, int]) -> str | None:
     return None
 
 
-def run_status(numbers: Mapping[str, Any], is_interrupted: bool) -> str:
-    """Returns the status of a finished run.
+def status_of(numbers: Numbers) -> str:
+    """Returns the status of a run that came to its end.
 
     Args:
         numbers: of the run.
-        is_interrupted: True for a run that stopped before its end.
 
     Returns:
         done; uncertain: less than half of the scans were aligned in all directions, or no loop joins all parts of the
-        map; failed: none aligned; interrupted: before its end.
+        map; failed: none aligned.
     """
     statuses = numbers["scan_statuses"]
-    if is_interrupted:
-        return "interrupted"
     if why_failed(statuses) is not None:
         return "failed"
     if numbers["num_parts"] > 1:
         return "uncertain"
     num_placed = sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
-    num_sure = num_placed - numbers["num_unknown_along"]
-    return "done" if 2 * num_sure >= sum(statuses.values()) else "uncertain"
+    return "done" if 2 * (num_placed - numbers["num_unknown_along"]) >= sum(statuses.values()) else "uncertain"
 
 
 def count_parts(slam_map: slam.KeyframeMap) -> int:
@@ -227,38 +191,38 @@ def count_parts(slam_map: slam.KeyframeMap) -> int:
     return len(set(slam.measured_parts(slam_map).tolist()))
 
 
-def summary(numbers: Mapping[str, Any]) -> str:
-    """Returns the last lines on the console."""
+def verdict_of(numbers: Numbers) -> str:
+    """Returns what was mapped, and what is uncertain or wrong about it."""
+    if (reason := why_failed(numbers["scan_statuses"])) is not None:
+        return f"{reason}: check that the scans are 3-D, in metres, and follow each other"
     counts = (("scan", "num_scans"), ("keyframe", "num_new_keyframes"), ("loop closure", "num_loops"))
     scans, keyframes, loops = (counted(numbers[name], noun) for noun, name in counts)
     if numbers["num_keyframes"] > numbers["num_new_keyframes"]:
         keyframes += f" ({numbers['num_keyframes']} in the map)"
-    lines = [", ".join([scans, f"{numbers['path_m']:.1f} m driven", keyframes, loops])]
-    lines += [
-        f"{counted(numbers['scan_statuses'][status], 'scan')} {text}"
+    texts = [", ".join([scans, f"{numbers['path_m']:.1f} m driven", keyframes, loops])]
+    texts += [
+        f"{counted(numbers['scan_statuses'][status], 'scan')} {text} (scans.csv has the reasons)"
         for status, text in UNSURE.items()
         if status in numbers["scan_statuses"]
     ]
     if numbers["num_unknown_along"]:
         unknown = counted(numbers["num_unknown_along"], "scan")
-        lines.append(f"{unknown} where nothing faces the axis of a corridor: the last speed goes on there, uncertain")
-    if len(lines) > 1:
-        lines[-1] += " (scans.csv has the reason for each)"
+        texts.append(f"{unknown} where nothing faces the axis of a corridor: the last speed goes on there, uncertain")
     if numbers["num_parts"] > 1:
-        lines.append(f"the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess")
+        texts.append(f"the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess")
     if numbers["reference_doubt"] is not None:
-        lines.append(f"warning: {numbers['reference_doubt']}")
-    if "ate_m" in numbers:
-        lines.append("errors against the reference poses (ATE of the whole drive, RPE from scan to scan):")
-    for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):
+        texts.append(f"warning: {numbers['reference_doubt']}")
+    return "; ".join(texts)
+
+
+def error_text(numbers: Numbers) -> str:
+    """Returns the errors against the reference poses; empty without a reference."""
+    lines = []
+    for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM")):
         if f"ate{suffix}_m" in numbers:
-            line = f"  {name:14}  ATE {numbers[f'ate{suffix}_m']:.3f} m, RPE {numbers[f'rpe{suffix}_m']:.3f} m"
+            ate_m, rpe_m = numbers[f"ate{suffix}_m"], numbers[f"rpe{suffix}_m"]
+            line = f"{name:14}  ATE {ate_m:.3f} m, RPE from scan to scan {rpe_m:.3f} m"
             t_rel, r_rel = numbers.get(f"t_rel{suffix}_percent"), numbers.get(f"r_rel{suffix}_deg_per_100m")
             is_long = t_rel is not None and math.isfinite(t_rel)
             lines.append(line + (f", {t_rel:.2f} %, {r_rel:.2f} degrees/100 m" if is_long else ""))
-    speed = numbers["scans_per_s"]
-    if speed is not None:
-        slowest = sorted(numbers["stages_ms_per_scan"].items(), key=lambda entry: -entry[1])[:4]
-        stages = ", ".join(f"{name} {ms:.0f}" for name, ms in slowest)
-        lines.append(f"{speed:.1f} scans/s (ms a scan: {stages}); compilation took {numbers['compile_s']:.0f} s more")
     return "\n".join(lines)

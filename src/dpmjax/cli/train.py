@@ -22,13 +22,11 @@ confidence and overlap are calibrated, so that SLAM can use the model.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -36,30 +34,18 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import cli, deeppointmap, io, simulation, weights
 from dpmjax.cli import train_files
+from dpmjax.cli.run import Numbers, Run, RunOptions
 from dpmjax.sequences import LidarSequence
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records, Selection
 
-NAME = "train"
 # Share of the learning rate at which trained weights are tuned: at the full rate they forget pairs far apart.
 TUNING_SHARE = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProcessOptions(cli.RunOptions):
-    """Options of a run of several processes."""
-
-    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
-    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
-    num_processes: Annotated[int | None, arg(metavar="N")] = None
-    """How many processes there are."""
-    process_id: Annotated[int | None, arg(metavar="I")] = None
-    """Which of them this one is, from 0; process 0 alone writes and prints."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Config(ProcessOptions):
+class TrainOptions(RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "calibrate"})
@@ -115,6 +101,12 @@ class Config(ProcessOptions):
     """Folders of scans with poses whose pairs choose the model, instead of held-out places of --data."""
     recall_every: Annotated[int, arg(metavar="N")] = 100
     """Measure recall every N steps, and at the end."""
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
+    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
+    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    """How many processes there are."""
+    process_id: Annotated[int | None, arg(metavar="I")] = None
+    """Which of them this one is, from 0; process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -137,56 +129,48 @@ class Config(ProcessOptions):
             raise ValueError("--stages overlap trains the head of a model: give it by --weights")
 
 
-def main(config: Config) -> None:
+def main(options: TrainOptions, run: Run) -> Numbers:
     """Trains, evaluates, and writes the files; one of several processes writes."""
     from dpmjax.deeppointmap.training.processes import is_first, join_processes, merged, together
 
-    started = time.perf_counter()
-    join_processes(config.coordinator, config.num_processes, config.process_id)
-    if config.coordinator is not None:  # not before the processes have found each other
-        cli.select_device(config.device)
+    join_processes(options.coordinator, options.num_processes, options.process_id)
+    if options.coordinator is not None:  # not before the processes have found each other
+        cli.select_device(options.device)
     from dpmjax.cli.train_preparation import prepare_sources
     from dpmjax.cli.train_run import Records, run_training, training_part
 
     with together():
-        first = None if config.weights is None else weights.load_model(config.weights)
-        settings = training_settings(config, first)
-        sources = training_sources(config, settings)
-        folder = cli.open_run_folder(config, NAME) if is_first() else None
-    with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
-        with together():
-            # Of several processes, none may end alone.
-            on_wait = stop.end_if_requested if config.coordinator is None else lambda: None
-            parts = [partial(training_part, source) for source in sources]
-            drives = prepare_sources(parts, settings, config.cache, seed=config.seed, on_wait=on_wait)
-            store = deeppointmap.ScanStore(drives)
-            settings = for_devices(settings, len(store.table))
-            records = None
-            if folder is not None:
-                settings = without_impossible_stage(settings, store)
-                print(f"{config.preset}: {describe_plan(settings, len(store.table))}")
-                selection = select_pairs(config, settings, sources, on_wait)
-                is_last = config.preset == "paper"
-                records = Records(folder, settings, selection, seed=config.seed, weights=first, takes_last=is_last)
-        hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
-        total_s = 0.0 if config.finish else 3600 * (config.hours or math.inf)
-        trained = run_training(records, store, settings, hooks, seed=config.seed, total_s=total_s)
-        if trained.stopped_by:
-            stop.request(trained.stopped_by)
-        bad = merged(store.bad)
-        if folder is None or records is None:
-            return
-        ended = evaluate_and_calibrate(config, trained, records, chosen_sources(config, sources), stop)
-        metrics = {
-            **training_numbers(trained, records),
-            **ended.numbers,
-            "num_scans": len(store.table),
-            "bad_scans": bad,
-            "wall_s": time.perf_counter() - started,
-            "status": stop.status,
-            "seed": config.seed,
-        }
-        train_files.write_results(records, trained, ended, metrics, origin=origin_of(config))
+        first = None if options.weights is None else weights.load_model(options.weights)
+        settings = training_settings(options, first)
+        sources = training_sources(options, settings)
+        if is_first():
+            run.open()
+    with together():
+        # Of several processes, none may end alone.
+        on_wait = run.check_stop if options.coordinator is None else lambda: None
+        parts = [partial(training_part, source) for source in sources]
+        drives = prepare_sources(parts, settings, options.cache, seed=options.seed, on_wait=on_wait)
+        store = deeppointmap.ScanStore(drives)
+        settings = for_devices(settings, len(store.table))
+        records = None
+        if run.is_open:
+            settings = without_impossible_stage(settings, store)
+            run.say(f"{options.preset}: {describe_plan(settings, len(store.table))}")
+            selection = select_pairs(options, settings, sources, on_wait)
+            is_last = options.preset == "paper"
+            records = Records(run, settings, selection, seed=options.seed, weights=first, takes_last=is_last)
+    hooks = deeppointmap.TrainingHooks(evaluate_every=options.recall_every, stop=lambda: run.is_stopped)
+    total_s = 0.0 if options.finish else 3600 * (options.hours or math.inf)
+    trained = run_training(records, store, settings, hooks, seed=options.seed, total_s=total_s)
+    bad = merged(store.bad)
+    if records is None:
+        return {}
+    numbers = {**training_numbers(trained, records), "num_scans": len(store.table), "bad_scans": bad}
+    ended = evaluate_and_calibrate(options, trained, records, numbers, chosen_sources(options, sources))
+    numbers |= ended.numbers
+    numbers = {"verdict": train_files.verdict(numbers), **numbers}
+    train_files.write_results(records, trained, ended, numbers, origin=origin_of(options))
+    return numbers
 
 
 def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
@@ -196,20 +180,20 @@ def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
     return f"{num_scans} scans; at most {of_stages}"
 
 
-def origin_of(config: Config) -> str:
+def origin_of(options: TrainOptions) -> str:
     """Returns the beginning of the description of a model."""
-    return f"{config.preset}, trained on {', '.join(config.data)}"
+    return f"{options.preset}, trained on {', '.join(options.data)}"
 
 
-def training_sources(config: Config, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
+def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
     """Returns the drives of --data; a drive of --validate or --data that has no pairs of scans raises a ValueError."""
     sampling = settings.sampling
-    town = partial(simulation.simulate_drive, length_m=config.town_length_m, mixture=simulation.TRAINING_MIXTURE)
-    towns: list[cli.Source] = [partial(town, config.seed + number) for number in range(config.num_towns)]
+    town = partial(simulation.simulate_drive, length_m=options.town_length_m, mixture=simulation.TRAINING_MIXTURE)
+    towns: list[cli.Source] = [partial(town, options.seed + number) for number in range(options.num_towns)]
     if settings.num_variants == 0:  # scans that are read at each use are simulated once
-        towns = [partial(kept_drive, source, config.cache) for source in towns]
-    sources = cli.find_sources(config.data, towns, sampling)
-    for path in config.validate:
+        towns = [partial(kept_drive, source, options.cache) for source in towns]
+    sources = cli.find_sources(options.data, towns, sampling)
+    for path in options.validate:
         if (reason := deeppointmap.why_useless(io.open_lidar_sequence(path), sampling)) is not None:
             raise ValueError(f"--validate {path}: {reason}")
     return sources
@@ -227,7 +211,7 @@ def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppo
     return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
-def chosen_sources(config: Config, sources: Sequence[cli.Source]) -> list[cli.Source]:
+def chosen_sources(options: TrainOptions, sources: Sequence[cli.Source]) -> list[cli.Source]:
     """Returns the drives by which models are chosen and calibrated: those of the user, or else the towns."""
     own = [source for source in sources if not is_town(source)]
     return own or list(sources)
@@ -239,21 +223,24 @@ def is_town(source: cli.Source) -> bool:
 
 
 def select_pairs(
-    config: Config, settings: deeppointmap.TrainingConfig, sources: Sequence[cli.Source], on_wait: Callable[[], object]
+    options: TrainOptions,
+    settings: deeppointmap.TrainingConfig,
+    sources: Sequence[cli.Source],
+    on_wait: Callable[[], object],
 ) -> Selection:
     """Returns the pairs that choose the model: of --validate, else of held-out places of the drives or of the towns."""
     from dpmjax.cli.train_run import Selection, draw_selection, held_out_part
 
-    if "registration" not in config.stages:
+    if "registration" not in options.stages:
         return Selection(None, "given weights")
-    if config.validate:
-        drives: list[cli.Source] = [partial(io.open_lidar_sequence, path) for path in config.validate]
+    if options.validate:
+        drives: list[cli.Source] = [partial(io.open_lidar_sequence, path) for path in options.validate]
         name = "drives of --validate"
     else:
-        chosen = chosen_sources(config, sources)
+        chosen = chosen_sources(options, sources)
         drives = [partial(held_out_part, source) for source in chosen]
         name = f"held-out places of the {'towns' if is_town(chosen[0]) else 'drives'}"
-    return draw_selection(settings, config.held_out_pairs, drives, name, on_wait=on_wait)
+    return draw_selection(settings, options.held_out_pairs, drives, name, on_wait=on_wait)
 
 
 def without_impossible_stage(
@@ -282,7 +269,7 @@ def without_impossible_stage(
 
 def calibrate(
     model: deeppointmap.Model, sources: Sequence[cli.Source], seed: int, on_wait: Callable[[], object]
-) -> tuple[deeppointmap.Model, dict[str, Any]]:
+) -> tuple[deeppointmap.Model, Numbers]:
     """Returns the model with regressions of confidence and overlap, and their numbers on held-out places."""
     with tqdm(desc="calibrate confidence (then overlap, about 2 min)", unit=" pairs", dynamic_ncols=True) as bar:
         on_pair = lambda: (on_wait(), bar.update(1))  # noqa: E731
@@ -295,54 +282,57 @@ def calibrate(
     return calibrated, numbers
 
 
-def training_settings(config: Config, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
+def training_settings(options: TrainOptions, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
     """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
     import jax
 
-    settings = deeppointmap.training_preset(config.preset)
+    settings = deeppointmap.training_preset(options.preset)
     if first is not None:
         model = replace(first.config, calibration=None, overlap=None, trained=())
         settings = replace(settings, model=model, learning_rate=TUNING_SHARE * settings.learning_rate)
         if "overlap" not in first.config.trained:  # this head begins, whatever is tuned
             rate_share = settings.overlap.rate_share / TUNING_SHARE
             settings = replace(settings, overlap=replace(settings.overlap, rate_share=rate_share))
-    settings = replace(settings, stages=config.stages)
-    if config.frame is not None:
-        encoder = replace(settings.model.encoder, frame=config.frame)
+    settings = replace(settings, stages=options.stages)
+    if options.frame is not None:
+        encoder = replace(settings.model.encoder, frame=options.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
-    settings = replace(settings, refines_labels=config.refine_labels)
-    if config.variants is not None:
-        settings = replace(settings, num_variants=config.variants)
+    settings = replace(settings, refines_labels=options.refine_labels)
+    if options.variants is not None:
+        settings = replace(settings, num_variants=options.variants)
     stages = settings.curriculum
-    if config.groups:
-        num_steps = max(1, settings.num_steps // len(config.groups))
-        stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in config.groups)
-    num_scans = config.scans or settings.sampling.num_scans
+    if options.groups:
+        num_steps = max(1, settings.num_steps // len(options.groups))
+        stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in options.groups)
+    num_scans = options.scans or settings.sampling.num_scans
     settings = replace(settings, curriculum=stages, sampling=replace(settings.sampling, num_scans=num_scans))
     if jax.default_backend() != "cpu":
         settings = replace(settings, scans_at_once=num_scans)
-    for part in config.without:
+    for part in options.without:
         settings = deeppointmap.without(settings, part)
-    if config.epochs is not None:
-        return replace(settings, num_epochs=config.epochs)
-    return settings if config.steps is None else settings.with_steps(config.steps)
+    if options.epochs is not None:
+        return replace(settings, num_epochs=options.epochs)
+    return settings if options.steps is None else settings.with_steps(options.steps)
 
 
 def evaluate_and_calibrate(
-    config: Config, trained: deeppointmap.Trained, records: Records, sources: Sequence[cli.Source], stop: cli.StopFlag
+    options: TrainOptions,
+    trained: deeppointmap.Trained,
+    records: Records,
+    numbers: Numbers,
+    sources: Sequence[cli.Source],
 ) -> train_files.Ended:
     """Evaluates and calibrates, unless a signal came: both take minutes, which a stopped run does not have."""
-    evaluation, numbers = (None, {}) if stop.is_requested else evaluate(trained, records)
-    model, calibration = trained.model, dict[str, Any]()
-    if config.calibrate and not stop.is_requested:
+    run, model, calibration = records.run, trained.model, Numbers()
+    evaluation, measured = (None, {}) if run.is_stopped else evaluate(trained, records)
+    if options.calibrate and not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
-        so_far = {**training_numbers(trained, records), **numbers, "num_scans": "all", "seed": config.seed}
-        train_files.write_model(records.folder / train_files.MODEL, model, so_far, origin=origin_of(config))
-        model, calibration = calibrate(model, sources, config.seed, stop.end_if_requested)
-    return train_files.Ended(model, evaluation, {**numbers, "calibration": calibration})
+        train_files.write_model(run / train_files.MODEL, model, {**numbers, **measured}, origin=origin_of(options))
+        model, calibration = calibrate(model, sources, options.seed, run.check_stop)
+    return train_files.Ended(model, evaluation, {**measured, "calibration": calibration})
 
 
-def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[str, Any]:
+def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers:
     """Returns steps, selection score and seconds for `metrics.json`."""
     return {
         "steps": int(trained.progress.state.step),
@@ -357,7 +347,7 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> dict[st
     }
 
 
-def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, dict[str, Any]]:
+def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, Numbers]:
     """Returns recall and errors of the trained and of the untrained network, of the latter for pairs of scans alone."""
     from dpmjax.cli.train_run import KIND_NAMES
 
@@ -365,7 +355,7 @@ def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppoint
     if pairs is None or of_scans is None:
         return None, {}
     models = {"": (trained.model, pairs), "_untrained": (records.untrained, of_scans)}
-    metrics: dict[str, Any] = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
+    metrics: Numbers = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
     evaluations = {}
     for suffix, (model, some) in tqdm(models.items(), desc="evaluate", unit=" networks", dynamic_ncols=True):
         evaluation = evaluations[suffix] = deeppointmap.evaluate_registration(model, some)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dpmjax import cli, deeppointmap, viz, weights
+from dpmjax import deeppointmap, viz, weights
+from dpmjax.cli.run import HISTORY, METRICS, Numbers, Run
 
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records
 
 MODEL, LAST, BEST = "model.safetensors", "last.safetensors", "best.safetensors"
-# Largest number of listed damaged scans; further ones are only counted.
-MAX_LISTED = 10
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "overlap_loss")
 
 
@@ -30,35 +29,34 @@ class Ended(NamedTuple):
 
     model: deeppointmap.Model
     evaluation: deeppointmap.Evaluation | None
-    numbers: dict[str, Any]
+    numbers: Numbers
 
 
 def write_results(
-    records: Records, trained: deeppointmap.Trained, ended: Ended, metrics: dict[str, Any], *, origin: str
+    records: Records, trained: deeppointmap.Trained, ended: Ended, metrics: Numbers, *, origin: str
 ) -> None:
     """Writes all files of a run; numbers first, so that they are written even if a picture fails."""
-    folder, pairs = records.folder, records.selection.pairs
-    cli.write_metrics(folder, metrics)
-    write_model(folder / MODEL, ended.model, metrics, origin=origin)
-    write_other_model(folder, trained, records, metrics, origin=origin)
-    draw_curves(folder)
+    run, pairs = records.run, records.selection.pairs
+    run.write_numbers(metrics)
+    write_model(run / MODEL, ended.model, metrics, origin=origin)
+    write_other_model(run, trained, records, metrics, origin=origin)
+    draw_curves(run)
     if ended.evaluation is not None and pairs is not None:
-        draw_matches(folder, ended.evaluation, pairs)
-    print_summary(folder, metrics)
+        draw_matches(run, ended.evaluation, pairs)
 
 
 def write_other_model(
-    folder: cli.RunFolder, trained: deeppointmap.Trained, records: Records, metrics: dict[str, Any], *, origin: str
+    run: Run, trained: deeppointmap.Trained, records: Records, metrics: Numbers, *, origin: str
 ) -> None:
     """Writes the last model of the first stage beside the best, or the best beside the last."""
     from dpmjax.cli.train_run import best_model, last_model
 
     if metrics["best_step"] is not None and "registration" in metrics["trained"]:
         name, other = (BEST, best_model) if records.takes_last else (LAST, last_model)
-        write_model(folder / name, other(trained), metrics, origin=f"{name} of {origin}")
+        write_model(run / name, other(trained), metrics, origin=f"{name} of {origin}")
 
 
-def write_model(path: Path, model: deeppointmap.Model, metrics: dict[str, Any], *, origin: str) -> None:
+def write_model(path: Path, model: deeppointmap.Model, metrics: Numbers, *, origin: str) -> None:
     """Writes a model with a description of its training, which begins with the preset and the data."""
     best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
     card = f"{origin} ({metrics['num_scans']} scans), {metrics['steps']} steps{best}, seed {metrics['seed']}. "
@@ -75,18 +73,16 @@ def write_model(path: Path, model: deeppointmap.Model, metrics: dict[str, Any], 
     unfinished.replace(path)
 
 
-def draw_curves(folder: cli.RunFolder) -> None:
+def draw_curves(run: Run) -> None:
     """Draws loss.png: losses and recalls over the steps."""
-    rows = cli.read_history(folder / cli.HISTORY)
+    rows = run.read_table(HISTORY)
     if rows:
         curves = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SHOWN_CURVES}
         curves = {name.replace("_", " "): curve for name, curve in curves.items() if np.isfinite(curve).any()}
-        viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), folder / "loss.png")
+        viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), run / "loss.png")
 
 
-def draw_matches(
-    folder: cli.RunFolder, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs
-) -> None:
+def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:
     """Draws matches.png: of the pairs left out of the training, the one of the median error."""
     errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
     number = int(np.argsort(errors)[len(errors) // 2])
@@ -100,23 +96,20 @@ def draw_matches(
     title += "right matches are less than 3 m apart under the true motion"
     motions = {"source moved by the estimated motion": np.asarray(matches.T_target_source[number], np.float64)}
     pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
-    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), folder / "matches.png")
+    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), run / "matches.png")
 
 
-def print_summary(folder: cli.RunFolder, metrics: dict[str, Any]) -> None:
-    """Prints the recall, the scans that were left out, and the folder."""
-    at = "" if metrics["best_step"] is None else f" (best, after step {metrics['best_step']})"
-    if "recall" in metrics:
-        print(f"recall on held-out places {metrics['recall_untrained']:.2f} -> {metrics['recall']:.2f}{at}")
-    else:
-        print(f"ended after step {metrics['steps']}{at}; not evaluated")
-    for name in ("overlap", "head"):
-        if np.isfinite(auc := metrics["calibration"].get(f"auc_{name}", math.nan)):
-            by = "regression" if name == "overlap" else name
-            print(f"overlap by the {by}: AUC {auc:.3f} on held-out places")
-    bad = metrics["bad_scans"]
+def verdict(numbers: Numbers) -> str:
+    """Returns the recall, the overlap, and the scans that were left out."""
+    at = "" if numbers["best_step"] is None else f" (best, after step {numbers['best_step']})"
+    text = f"ended after step {numbers['steps']}{at}; not evaluated"
+    if "recall" in numbers:
+        text = f"recall on held-out places {numbers['recall_untrained']:.2f} -> {numbers['recall']:.2f}{at}"
+    for name, by in (("overlap", "regression"), ("head", "head")):
+        if np.isfinite(auc := numbers["calibration"].get(f"auc_{name}", math.nan)):
+            text += f"; overlap by the {by}: AUC {auc:.3f} on held-out places"
+    bad = numbers["bad_scans"]
     if bad:
-        print(f"{len(bad)} scans left out, all of them in {folder / cli.METRICS}:")
-        for source, reason in list(bad.items())[:MAX_LISTED]:
-            print(f"  {source}: {reason}")
-    print(f"results in {folder.path}")
+        source, reason = next(iter(bad.items()))
+        text += f"; {len(bad)} scans left out, such as {source}: {reason} ({METRICS} has all)"
+    return text

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
+from dpmjax.cli.run import CHECKPOINTS, HISTORY, Run
 from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.sequences import LidarSequence
 
@@ -26,7 +27,7 @@ KINDS = (dpm.PairKind(2.0, 10.0), dpm.PairKind(10.0, 20.0), dpm.PairKind(2.0, 10
 
 KIND_NAMES = dict(zip(KINDS, ("recall", "recall_far", "recall_maps", "recall_maps_far"), strict=True))
 OVERLAP_STAGE = "overlap"
-OVERLAP_CHECKPOINTS = "checkpoints_overlap"
+BEST_CHECKPOINTS, OVERLAP_CHECKPOINTS = "checkpoints_best", "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
 SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
@@ -107,7 +108,7 @@ class Records:
     """The table, the progress bar, the checkpoints and the evaluation of a run; one process has them.
 
     Attributes:
-        folder: folder of the run.
+        run: the run; its folder gets the files.
         selection: pairs that choose the model.
         untrained: the model before the first step.
         start: progress to start from: the latest checkpoint of a resumed run.
@@ -118,7 +119,7 @@ class Records:
 
     def __init__(
         self,
-        folder: cli.RunFolder,
+        run: Run,
         settings: dpm.TrainingConfig,
         selection: Selection,
         *,
@@ -126,9 +127,9 @@ class Records:
         weights: dpm.Model | None = None,
         takes_last: bool = False,
     ) -> None:
-        self.folder, self.selection, self._settings = folder, selection, settings
-        self._overlap_checkpoints = Checkpoints(folder / OVERLAP_CHECKPOINTS)
-        self._checkpoints, self._best = Checkpoints(folder / cli.CHECKPOINTS), Checkpoints(folder / cli.BEST)
+        self.run, self.selection, self._settings = run, selection, settings
+        self._overlap_checkpoints = Checkpoints(run / OVERLAP_CHECKPOINTS)
+        self._checkpoints, self._best = Checkpoints(run / CHECKPOINTS), Checkpoints(run / BEST_CHECKPOINTS)
         begun = dpm.begin_training(settings, seed=seed, start=weights)
         self.takes_last = takes_last
         trained = () if weights is None else weights.config.trained
@@ -141,8 +142,8 @@ class Records:
         first = int(self.start.state.step)
         if self.overlap_start is not None:
             first += int(self.overlap_start.step)
-        self._history = cli.HistoryFile(folder / cli.HISTORY, COLUMNS, keep_until=first)
-        self.earlier_s = max((float(row["run_s"]) for row in cli.read_history(folder / cli.HISTORY)), default=0.0)
+        earlier = run.continue_table(HISTORY, until=first)
+        self.earlier_s = max((float(row["run_s"]) for row in earlier), default=0.0)
         total = int(self.start.state.end) if "registration" in settings.stages else 0
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
@@ -171,7 +172,7 @@ class Records:
         measured = {name: f"{value:.7g}" for name, value in values.items()}
         self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
         self._pace_s = record.speed.run_s / record.speed.num_steps if record.speed.num_steps else math.nan
-        self._history.append(step=record.step, stage=_stage_name(record.stage), run_s=round(self.run_s, 3), **measured)
+        self._append(record.step, _stage_name(record.stage), measured)
         self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
         self._bar.total = int(progress.state.end)
         self._bar.update(1)
@@ -179,6 +180,10 @@ class Records:
         if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
             self.save(progress)
             self._last_saved = time.perf_counter()
+
+    def _append(self, step: int, stage: str, measured: dict[str, str]) -> None:
+        row = {"step": step, "stage": stage, "run_s": round(self.run_s, 3), **measured}
+        self.run.append_row(HISTORY, **dict.fromkeys(COLUMNS, "") | row)
 
     def steps_left(self, step: int, *, total_s: float) -> int:
         """Returns the number of steps in the seconds that remain of `total_s`; 0 where the plan stays as it is.
@@ -205,8 +210,7 @@ class Records:
                 values = {"overlap_loss": record.loss, "overlap_accuracy": record.accuracy}
                 values |= {"learning_rate": record.learning_rate}
                 measured = {name: f"{value:.7g}" for name, value in values.items()}
-                run_s = round(self.run_s, 3)
-                self._history.append(step=before + record.step, stage=OVERLAP_STAGE, run_s=run_s, **measured)
+                self._append(before + record.step, OVERLAP_STAGE, measured)
                 bar.set_postfix_str(f"loss {record.loss:.3f}, right {record.accuracy:.2f}", refresh=False)
                 bar.update(1)
                 if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
@@ -248,7 +252,6 @@ class Records:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._history.__exit__(*error)
         self._bar.close()
 
 
