@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli import localize, map2d, program, slam
+from dpmjax.cli import localize, map2d, program
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from tests.cli.test_slam import run, table
 from tests.cli.test_slam_fuzz import leave_networks_out
