@@ -22,7 +22,7 @@ import tyro
 from benchmarks import COLUMNS, Row, format_table, in_new_process, run_benchmark
 
 # Modules, each with a function `run`.
-BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "slam", "toy")
+BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "toy")
 
 
 @dataclass(frozen=True)

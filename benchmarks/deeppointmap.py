@@ -8,11 +8,9 @@ the CPU always, on a GPU too where JAX has one.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,167 +25,18 @@ from dpmjax.io import LidarSequence, open_lidar_sequence
 from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
 
+Scans = dict[str, np.ndarray]
+Parts = dict[str, Callable[[], object]]
+
 KITTI = ("kitti_00", "kitti_07", "kitti_raw_0013")
 # Parts that run on the host, and the sum of parts that are compiled by then.
 NOT_COMPILED = ("preprocess", "pyramid", "preprocess + encode")
-
 # 2048 descriptors at the size of the paper.
 SCANS_IN_MAP = 8
 
-
-def make_scans(folder: Path, quick: bool) -> list[Row]:
-    """Writes scans for the later stages and returns their sizes: a simulated one, one of KITTI if found."""
-    sensor = HDL64E.with_azimuths(256) if quick else HDL64E
-    scans = {"town": simulate_scene(Scene(0, TownConfig(), DriveConfig(), sensor)).read_scan(10)}
-    recorded = [path for name in KITTI if not quick and (path := DATA / "lidar_3d" / name).is_dir()]
-    if recorded:
-        scans["KITTI"] = open_lidar_sequence(recorded[0]).read_scan(0)
-    for name, points in scans.items():
-        np.save(folder / f"{name}.npy", points)
-    return [Row(f"{name} scan", "size", len(points), "points") for name, points in scans.items()]
-
-
-def read_scans(folder: Path) -> dict[str, np.ndarray]:
-    """Returns the scans that `make_scans` wrote, by name."""
-    return {file.stem: np.load(file) for file in sorted(folder.glob("*.npy"), reverse=True)}
-
-
-def time_encoding(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Returns times of `dpmjax.encode` and of its parts: two on the host, one on the device."""
-    model = _model(preset)
-    rows = []
-    for name, points in read_scans(folder).items():
-        cloud = preprocess_scan_on_host(points, None, model.config.preprocess)
-        pyramid = dpm.pyramid_of_cloud(cloud, model.config)
-        parts: dict[str, Callable[[], object]] = {
-            "preprocess": partial(preprocess_scan_on_host, points, None, model.config.preprocess),
-            "pyramid": partial(dpm.pyramid_of_cloud, cloud, model.config),
-            "network": partial(dpmjax.encode_pyramid, model, pyramid),
-            "preprocess + encode": partial(dpmjax.encode, model, points),
-        }
-        rows += _timed(f"{preset}, {name} scan", parts, quick)
-    return rows
-
-
-def time_jax_builders(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Returns times of preprocessing and pyramid by the JAX kernels."""
-    model = _model(preset)
-    points = jnp.asarray(read_scans(folder)["town"])
-    config = model.config
-    cloud = preprocess_scan(points, None, config.preprocess)
-    scaled = cloud.points / config.scale_m
-    parts: dict[str, Callable[[], object]] = {
-        "preprocess in JAX": partial(preprocess_scan, points, None, config.preprocess),
-        "pyramid in JAX": partial(build_pyramid, scaled, cloud.mask, config.pyramid),
-        "network": partial(dpmjax.encode_pyramid, model, build_pyramid(scaled, cloud.mask, config.pyramid)),
-    }
-    return _timed(f"{preset}, town scan", parts, quick, repeats=5)
-
-
-def time_matching(folder: Path, quick: bool, *, preset: str, num_target: int) -> list[Row]:
-    """Returns times of the decoder alone, and of the whole registration of two descriptor clouds."""
-    model = _model(preset)
-    source, target = _cloud(model, model.config.num_descriptors, seed=0), _cloud(model, num_target, seed=1)
-    parts: dict[str, Callable[[], object]] = {
-        "correlate": partial(dpmjax.correlate, model, source, target),
-        "registration (correlate, match, align)": partial(dpmjax.register, model, source, target),
-    }
-    return _timed(f"{preset}, {model.config.num_descriptors} x {num_target}", parts, quick)
-
-
-def time_overlap(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Returns times of the overlap prediction."""
-    model = _model(preset)
-    clouds = [_cloud(model, model.config.num_descriptors, seed=seed) for seed in range(2)]
-    return _timed(f"{preset}, one pair", {"overlap": partial(dpmjax.overlap, model, *clouds)}, quick)
-
-
-def time_training(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Returns times of a training step on pairs of scans, as the curriculum begins, and the scans a second."""
-    settings = dpm.training_preset(preset)
-    num_scans = 4 if quick else settings.sampling.num_scans
-    sampling = replace(settings.sampling, num_scans=num_scans)
-    settings = replace(settings, curriculum=(dpm.CurriculumStage(2, 1),), sampling=sampling, num_variants=1)
-    points = read_scans(folder)["town"]
-    T_world_lidar = np.tile(np.eye(4), (num_scans, 1, 1))
-    T_world_lidar[:, 0, 3] = np.linspace(0, 10, num_scans)
-    drive = LidarSequence("town", ("town",) * num_scans, lambda _: points, T_world_lidar)
-    with dpm.SampleMaker(dpm.ScanStore([dpm.prepare_drive(drive, settings)]), settings, seed=0) as maker:
-        batch = maker(0)
-    step = dpm.make_step(settings)
-    state = dpm.init_training(jax.random.key(0), settings)
-    timing = measure(step, state, batch, repeats=3 if quick else 12)
-    case = f"{preset}, K = 2, {num_scans} scans: training step"
-    return [*timing.rows(case), Row(case, "speed", num_scans / timing.median_s, "scans/s")]
-
-
-def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Returns no rows; runs encoding, registration of scans and maps, and overlap, to measure the memory."""
-    model = _model(preset)
-    scan = next(iter(read_scans(folder).values()))
-    cloud = dpmjax.encode(model, scan)
-    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * SCANS_IN_MAP), cloud)
-    poses = jnp.tile(jnp.eye(4), (SCANS_IN_MAP, 1, 1)).at[:, 0, 3].set(jnp.arange(SCANS_IN_MAP))
-    targets = (scan, dpm.merge_clouds(stacked, poses))
-    motions = [dpmjax.register(model, cloud, target) for target in targets]
-    jax.block_until_ready((motions, dpmjax.overlap(model, cloud, cloud)))
-    return []
-
-
-def time_products(folder: Path, quick: bool) -> list[Row]:
-    """Returns the speed of the decoder's largest matrix product, which shows if the machine is busy."""
-    product = jax.jit(jnp.matmul)
-    a, b = jnp.ones((2304, 256)), jnp.ones((256, 768))
-    timing = measure(product, a, b, repeats=5 if quick else 30)
-    return [Row("float32 product 2304x256x768", "speed", 2e-9 * 2304 * 256 * 768 / timing.median_s, "GFLOP/s")]
-
-
-def _model(preset: str) -> dpmjax.Model:
-    # Speed does not depend on the values of the weights.
-    return dpmjax.init_model(jax.random.key(0), dpmjax.model_preset(preset))
-
-
-def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.DescriptorCloud:
-    rng = np.random.default_rng(seed)
-    positions = rng.uniform(-40.0, 40.0, (num_descriptors, 3)).astype(np.float32)
-    features = rng.normal(size=(num_descriptors, model.config.decoder.input_channels)).astype(np.float32)
-    return dpmjax.DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
-
-
-def _timed(case: str, parts: dict[str, Callable[[], object]], quick: bool, repeats: int = 12) -> list[Row]:
-    rows: list[Row] = []
-    for name, function in parts.items():
-        timing = measure(function, repeats=3 if quick else repeats)
-        rows += timing.rows(f"{case}: {name}", is_compiled=name not in NOT_COMPILED)
-    return rows
-
-
-STAGES: dict[str, Callable[[Path, bool], list[Row]]] = {
-    "scans": make_scans,
-    "products": time_products,
-    **{f"encode {preset}": partial(time_encoding, preset=preset) for preset in ("tiny", "small", "paper")},
-    "JAX builders paper": partial(time_jax_builders, preset="paper"),
-    "match tiny": partial(time_matching, preset="tiny", num_target=256),
-    "match scan": partial(time_matching, preset="paper", num_target=256),
-    "match map": partial(time_matching, preset="paper", num_target=256 * SCANS_IN_MAP),
-    "overlap": partial(time_overlap, preset="paper"),
-    **{f"train {preset}": partial(time_training, preset=preset) for preset in ("tiny", "small")},
-    "everything tiny": partial(run_everything, preset="tiny"),
-    "everything paper": partial(run_everything, preset="paper"),
-}
-QUICK = ("products", "encode tiny", "match tiny", "everything tiny")
-FULL = tuple(stage for stage in STAGES if stage not in ("scans", "match tiny", "everything tiny"))
-
-
-def stage_rows(stage: str, folder: Path, quick: bool) -> list[Row]:
-    """Returns the rows of one stage, with the peak memory of this process."""
-    return [*STAGES[stage](folder, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]
-
-
 # The authors' program was measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI scan of
-# 122,500 points).
+# 122,500 points). By case; held against the median, or against the peak memory of the one process that does all of it.
 THEIRS, GOAL = "authors' program", "goal"
-# By case. Held against the median, or against the peak memory of the one process that does all of it.
 FIGURES: dict[str, dict[str, float]] = {
     "paper, KITTI scan: preprocess": {THEIRS: 98.0},
     "paper, KITTI scan: pyramid": {THEIRS: 990.0},
@@ -208,28 +57,135 @@ def run(quick: bool) -> list[Row]:
     """Returns rows of all stages on the CPU; then on the GPU, where JAX has one, under names that say so."""
     # Several processes share the GPU.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    with tempfile.TemporaryDirectory() as name:
-        folder, stages = Path(name), QUICK if quick else FULL
-        rows = [row for row in run_stage("scans", folder, quick) if row.metric == "size"]
-        for stage in stages:
-            rows += with_figures(run_stage(stage, folder, quick, platform="cpu"))
-        if jax.default_backend() == "gpu":
-            for stage in stages:
-                rows += [row._replace(case=f"GPU, {row.case}") for row in run_stage(stage, folder, quick)]
+    sensor = HDL64E.with_azimuths(256) if quick else HDL64E
+    scans: Scans = {"town": simulate_scene(Scene(0, TownConfig(), DriveConfig(), sensor)).read_scan(10)}
+    recorded = [path for name in KITTI if not quick and (path := DATA / "lidar_3d" / name).is_dir()]
+    if recorded:
+        scans["KITTI"] = open_lidar_sequence(recorded[0]).read_scan(0)
+    rows = [Row(f"{name} scan", "size", len(points), "points") for name, points in scans.items()]
+    devices = {"": "cpu"} | ({"GPU, ": "cuda"} if jax.default_backend() == "gpu" else {})
+    for prefix, platform in devices.items():
+        for stage in QUICK if quick else FULL:
+            found = in_new_process(stage_rows, stage, scans, quick, JAX_PLATFORMS=platform)
+            rows += [row._replace(case=prefix + row.case) for row in (found if prefix else with_figures(found))]
     return rows
 
 
-def run_stage(stage: str, folder: Path, quick: bool, *, platform: str | None = None) -> list[Row]:
-    """Returns rows of one stage, run in a fresh process on a platform, or on the device that JAX chooses."""
-    return in_new_process(stage_rows, stage, folder, quick, **({} if platform is None else {"JAX_PLATFORMS": platform}))
+def stage_rows(stage: str, scans: Scans, quick: bool) -> list[Row]:
+    """Returns the rows of one stage, with the peak memory of this process."""
+    return [*STAGES[stage](scans, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]
 
 
 def with_figures(rows: list[Row]) -> list[Row]:
     """Returns the rows, each followed by the authors' figure and by the goal, where they exist."""
     result = []
     for row in rows:
-        result.append(row)
-        if row.metric in ("median", "peak memory"):
-            figures = FIGURES.get(row.case, {}).items()
-            result += [row._replace(metric=f"{row.metric}, {name}", value=value) for name, value in figures]
+        figures = FIGURES.get(row.case, {}) if row.metric in ("median", "peak memory") else {}
+        result += [row, *(row._replace(metric=f"{row.metric}, {name}", value=v) for name, v in figures.items())]
     return result
+
+
+def time_encoding(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
+    """Returns times of `dpmjax.encode` and of its parts: two on the host, one on the device."""
+    model, rows = _model(preset), []
+    for name, points in scans.items():
+        cloud = preprocess_scan_on_host(points, None, model.config.preprocess)
+        parts: Parts = {
+            "preprocess": partial(preprocess_scan_on_host, points, None, model.config.preprocess),
+            "pyramid": partial(dpm.pyramid_of_cloud, cloud, model.config),
+            "network": partial(dpmjax.encode_pyramid, model, dpm.pyramid_of_cloud(cloud, model.config)),
+            "preprocess + encode": partial(dpmjax.encode, model, points),
+        }
+        rows += _timed(f"{preset}, {name} scan", parts, quick)
+    return rows
+
+
+def time_jax_builders(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
+    """Returns times of preprocessing and pyramid by the JAX kernels."""
+    config, points = _model(preset).config, jnp.asarray(scans["town"])
+    cloud = preprocess_scan(points, None, config.preprocess)
+    parts: Parts = {
+        "preprocess in JAX": partial(preprocess_scan, points, None, config.preprocess),
+        "pyramid in JAX": partial(build_pyramid, cloud.points / config.scale_m, cloud.mask, config.pyramid),
+    }
+    return _timed(f"{preset}, town scan", parts, quick, repeats=5)
+
+
+def time_matching(scans: Scans, quick: bool, *, preset: str, num_target: int) -> list[Row]:
+    """Returns times of the decoder alone, and of the whole registration of two descriptor clouds."""
+    model = _model(preset)
+    source, target = _cloud(model, model.config.num_descriptors, seed=0), _cloud(model, num_target, seed=1)
+    parts: Parts = {
+        "correlate": partial(dpmjax.correlate, model, source, target),
+        "registration (correlate, match, align)": partial(dpmjax.register, model, source, target),
+    }
+    return _timed(f"{preset}, {model.config.num_descriptors} x {num_target}", parts, quick)
+
+
+def time_overlap(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
+    """Returns times of the overlap prediction."""
+    model = _model(preset)
+    clouds = [_cloud(model, model.config.num_descriptors, seed=seed) for seed in range(2)]
+    return _timed(f"{preset}, one pair", {"overlap": partial(dpmjax.overlap, model, *clouds)}, quick)
+
+
+def time_training(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
+    """Returns times of a training step on pairs of scans, as the curriculum begins, and the scans a second."""
+    settings = dpm.training_preset(preset)
+    num_scans = 4 if quick else settings.sampling.num_scans
+    sampling = replace(settings.sampling, num_scans=num_scans)
+    settings = replace(settings, curriculum=(dpm.CurriculumStage(2, 1),), sampling=sampling, num_variants=1)
+    T_world_lidar = np.tile(np.eye(4), (num_scans, 1, 1))
+    T_world_lidar[:, 0, 3] = np.linspace(0, 10, num_scans)
+    drive = LidarSequence("town", ("town",) * num_scans, lambda _: scans["town"], T_world_lidar)
+    with dpm.SampleMaker(dpm.ScanStore([dpm.prepare_drive(drive, settings)]), settings, seed=0) as maker:
+        batch = maker(0)
+    state = dpm.init_training(jax.random.key(0), settings)
+    timing = measure(dpm.make_step(settings), state, batch, repeats=3 if quick else 12)
+    case = f"{preset}, K = 2, {num_scans} scans: training step"
+    return [*timing.rows(case), Row(case, "speed", num_scans / timing.median_s, "scans/s")]
+
+
+def run_everything(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
+    """Returns no rows; runs encoding, registration of scans and maps, and overlap, to measure the memory."""
+    model, scan = _model(preset), scans["town"]
+    cloud = dpmjax.encode(model, scan)
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * SCANS_IN_MAP), cloud)
+    poses = jnp.tile(jnp.eye(4), (SCANS_IN_MAP, 1, 1)).at[:, 0, 3].set(jnp.arange(SCANS_IN_MAP))
+    motions = [dpmjax.register(model, cloud, target) for target in (scan, dpm.merge_clouds(stacked, poses))]
+    jax.block_until_ready((motions, dpmjax.overlap(model, cloud, cloud)))
+    return []
+
+
+def _model(preset: str) -> dpmjax.Model:
+    # Speed does not depend on the values of the weights.
+    return dpmjax.init_model(jax.random.key(0), dpmjax.model_preset(preset))
+
+
+def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.DescriptorCloud:
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform(-40.0, 40.0, (num_descriptors, 3)).astype(np.float32)
+    features = rng.normal(size=(num_descriptors, model.config.decoder.input_channels)).astype(np.float32)
+    return dpmjax.DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
+
+
+def _timed(case: str, parts: Parts, quick: bool, repeats: int = 12) -> list[Row]:
+    rows: list[Row] = []
+    for name, function in parts.items():
+        timing = measure(function, repeats=3 if quick else repeats)
+        rows += timing.rows(f"{case}: {name}", is_compiled=name not in NOT_COMPILED)
+    return rows
+
+
+QUICK = ("encode tiny", "match tiny", "everything tiny")
+STAGES: dict[str, Callable[[Scans, bool], list[Row]]] = {
+    **{f"encode {preset}": partial(time_encoding, preset=preset) for preset in ("tiny", "small", "paper")},
+    "JAX builders paper": partial(time_jax_builders, preset="paper"),
+    "match tiny": partial(time_matching, preset="tiny", num_target=256),
+    "match scan": partial(time_matching, preset="paper", num_target=256),
+    "match map": partial(time_matching, preset="paper", num_target=256 * SCANS_IN_MAP),
+    "overlap": partial(time_overlap, preset="paper"),
+    **{f"train {preset}": partial(time_training, preset=preset) for preset in ("tiny", "small")},
+    **{f"everything {preset}": partial(run_everything, preset=preset) for preset in ("tiny", "paper")},
+}
+FULL = tuple(stage for stage in STAGES if stage not in ("match tiny", "everything tiny"))
