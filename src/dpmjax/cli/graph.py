@@ -68,10 +68,10 @@ def main(config: Config) -> None:
         cli.write_metrics(folder, metrics)
         title = f"{config.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
         tracks = [
-            viz.Track(f"before, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
-            viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
+            viz.Track(positions(graph.poses), viz.ODOMETRY, f"before, chi2 {found.chi2_initial:.4g}"),
+            viz.Track(positions(poses), viz.PATH, f"optimised, chi2 {found.chi2:.4g}"),
         ]
-        viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), folder / "trajectory.png")
+        viz.save_figure(viz.trajectory_figure(title, tracks), folder / "trajectory.png")
         let_go = f", {metrics['num_edges_let_go']} of them let go" if metrics["num_edges_let_go"] else ""
         print(f"{metrics['num_nodes']} nodes, {metrics['num_edges']} edges{let_go}")
         print(f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations")
