@@ -1,4 +1,4 @@
-"""DeepPointMap from a raw scan to descriptors, motions and overlap, beside the authors' program and the goal.
+"""DeepPointMap from a raw scan to descriptors, motions and overlap, beside the authors' program.
 
 Each stage runs in a process of its own, so that its peak memory is its own. The input is a scan of the simulated town
 (HDL-64E, about 100,000 points), and one of KITTI where `$DPMJAX_DATA/lidar_3d` (default `../shared/data`) has it. On
@@ -20,9 +20,8 @@ import dpmjax
 from benchmarks import DATA, Row, in_new_process, measure
 from dpmjax import deeppointmap as dpm
 from dpmjax.cli import peak_rss_gb
-from dpmjax.geometry import build_pyramid
 from dpmjax.io import LidarSequence, open_lidar_sequence
-from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
+from dpmjax.scans import preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
 
 Scans = dict[str, np.ndarray]
@@ -35,21 +34,16 @@ NOT_COMPILED = ("preprocess", "pyramid", "preprocess + encode")
 SCANS_IN_MAP = 8
 
 # The authors' program was measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI scan of
-# 122,500 points). By case; held against the median, or against the peak memory of the one process that does all of it.
-THEIRS, GOAL = "authors' program", "goal"
-FIGURES: dict[str, dict[str, float]] = {
-    "paper, KITTI scan: preprocess": {THEIRS: 98.0},
-    "paper, KITTI scan: pyramid": {THEIRS: 990.0},
-    "paper, KITTI scan: network": {THEIRS: 250.0},
-    "paper, KITTI scan: preprocess + encode": {THEIRS: 1318.0, GOAL: 60.0},
-    "paper, town scan: preprocess + encode": {GOAL: 60.0},
-    "small, KITTI scan: preprocess + encode": {GOAL: 30.0},
-    "small, town scan: preprocess + encode": {GOAL: 30.0},
-    "paper, 256 x 256: registration (correlate, match, align)": {THEIRS: 75.0, GOAL: 40.0},
-    "paper, 256 x 2048: registration (correlate, match, align)": {THEIRS: 540.0, GOAL: 300.0},
-    "paper, one pair: overlap": {THEIRS: 82.0, GOAL: 40.0},
-    "small, K = 2, 16 scans: training step": {GOAL: 450.0},
-    "process of everything paper": {THEIRS: 1.0, GOAL: 1.0},
+# 122,500 points): milliseconds by case, and GB of the one process that does all of it.
+THEIRS = {
+    "paper, KITTI scan: preprocess": 98.0,
+    "paper, KITTI scan: pyramid": 990.0,
+    "paper, KITTI scan: network": 250.0,
+    "paper, KITTI scan: preprocess + encode": 1318.0,
+    "paper, 256 x 256: registration (correlate, match, align)": 75.0,
+    "paper, 256 x 2048: registration (correlate, match, align)": 540.0,
+    "paper, one pair: overlap": 82.0,
+    "process of everything paper": 1.0,
 }
 
 
@@ -67,7 +61,7 @@ def run(quick: bool) -> list[Row]:
     for prefix, platform in devices.items():
         for stage in QUICK if quick else FULL:
             found = in_new_process(stage_rows, stage, scans, quick, JAX_PLATFORMS=platform)
-            rows += [row._replace(case=prefix + row.case) for row in (found if prefix else with_figures(found))]
+            rows += [row._replace(case=prefix + row.case) for row in (found if prefix else with_theirs(found))]
     return rows
 
 
@@ -76,12 +70,13 @@ def stage_rows(stage: str, scans: Scans, quick: bool) -> list[Row]:
     return [*STAGES[stage](scans, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]
 
 
-def with_figures(rows: list[Row]) -> list[Row]:
-    """Returns the rows, each followed by the authors' figure and by the goal, where they exist."""
+def with_theirs(rows: list[Row]) -> list[Row]:
+    """Returns the rows, each followed by the number of the authors' program, where there is one."""
     result = []
     for row in rows:
-        figures = FIGURES.get(row.case, {}) if row.metric in ("median", "peak memory") else {}
-        result += [row, *(row._replace(metric=f"{row.metric}, {name}", value=v) for name, v in figures.items())]
+        result.append(row)
+        if row.case in THEIRS and row.metric in ("median", "peak memory"):
+            result.append(row._replace(metric=f"{row.metric}, authors' program", value=THEIRS[row.case]))
     return result
 
 
@@ -98,17 +93,6 @@ def time_encoding(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
         }
         rows += _timed(f"{preset}, {name} scan", parts, quick)
     return rows
-
-
-def time_jax_builders(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
-    """Returns times of preprocessing and pyramid by the JAX kernels."""
-    config, points = _model(preset).config, jnp.asarray(scans["town"])
-    cloud = preprocess_scan(points, None, config.preprocess)
-    parts: Parts = {
-        "preprocess in JAX": partial(preprocess_scan, points, None, config.preprocess),
-        "pyramid in JAX": partial(build_pyramid, cloud.points / config.scale_m, cloud.mask, config.pyramid),
-    }
-    return _timed(f"{preset}, town scan", parts, quick, repeats=5)
 
 
 def time_matching(scans: Scans, quick: bool, *, preset: str, num_target: int) -> list[Row]:
@@ -169,10 +153,10 @@ def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.De
     return dpmjax.DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
 
 
-def _timed(case: str, parts: Parts, quick: bool, repeats: int = 12) -> list[Row]:
+def _timed(case: str, parts: Parts, quick: bool) -> list[Row]:
     rows: list[Row] = []
     for name, function in parts.items():
-        timing = measure(function, repeats=3 if quick else repeats)
+        timing = measure(function, repeats=3 if quick else 12)
         rows += timing.rows(f"{case}: {name}", is_compiled=name not in NOT_COMPILED)
     return rows
 
@@ -180,7 +164,6 @@ def _timed(case: str, parts: Parts, quick: bool, repeats: int = 12) -> list[Row]
 QUICK = ("encode tiny", "match tiny", "everything tiny")
 STAGES: dict[str, Callable[[Scans, bool], list[Row]]] = {
     **{f"encode {preset}": partial(time_encoding, preset=preset) for preset in ("tiny", "small", "paper")},
-    "JAX builders paper": partial(time_jax_builders, preset="paper"),
     "match tiny": partial(time_matching, preset="tiny", num_target=256),
     "match scan": partial(time_matching, preset="paper", num_target=256),
     "match map": partial(time_matching, preset="paper", num_target=256 * SCANS_IN_MAP),
