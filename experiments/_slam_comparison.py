@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from functools import partial
 from pathlib import Path
@@ -220,39 +219,25 @@ def _place_cells(row: cli.Row) -> list[object]:
 
 
 def draw(folder: cli.RunFolder, *, sequences: list[LidarSequence], rows: list[cli.Row]) -> None:
-    """Draws trajectories.png, a panel a drive with all methods, and map_sizes.png, bytes against metres (figure 4)."""
-    tracks, sizes = {}, {}
+    """Draws trajectories.png, a panel a drive with all methods."""
+    panels = []
     for sequence in sequences:
         of_drive = {row["method"]: row for row in rows if row["sequence"] == sequence.name and "path_m" in row}
         if of_drive:
             drive = evaluation.open_folder(cli.TableRun(folder, lambda: False), sequence)
-            tracks[sequence.name], sizes[sequence.name] = _panel(drive, of_drive), _growth(drive, of_drive)
-    if tracks:
-        viz.save_figure(viz.trajectories_figure(tracks, COLORS), folder / "trajectories.png")
-    sizes = {name: curves for name, curves in sizes.items() if curves}
-    if sizes:
-        viz.save_figure(viz.growth_figure(sizes), folder / "map_sizes.png")
+            panels.append(_panel(drive, of_drive))
+    if panels:
+        viz.save_figure(viz.figure(panels), folder / "trajectories.png")
 
 
-def _panel(drive: Drive, rows: dict[str, cli.Row]) -> viz.TrackPanel:
+def _panel(drive: Drive, rows: dict[str, cli.Row]) -> viz.Panel:
     """Returns all trajectories in the frame of the reference; without one, in that of the first scan."""
     reference = None if drive.reference is None else drive.reference[:, :3, 3]
-    shown = {}
+    shown = []
     for method in [name for name in COLORS if name in rows]:
         positions = drive.trajectory(method)[:, :3, 3]
         if reference is not None:
             T = metrics.align_rigid(positions, reference)
             positions = positions @ T[:3, :3].T + T[:3, 3]
-        shown[method] = positions
-    return viz.TrackPanel(shown, reference)
-
-
-def _growth(drive: Drive, rows: dict[str, cli.Row]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Returns metres driven, and bytes, of each form of a map."""
-    curves = {}
-    for (name, title), row in itertools.product(SIZES.items(), rows.values()):
-        if row.get(name):
-            poses = drive.trajectory(row["method"]) if drive.reference is None else drive.reference
-            driven = metrics.path_lengths(poses)[np.array(row["map_scans"]) - 1]
-            curves[title] = (driven, np.array(row[name], float))
-    return curves
+        shown.append(viz.Track(positions, COLORS[method], method))
+    return viz.Panel(drive.sequence.name, shown, reference)

@@ -9,22 +9,20 @@ trained together. The variants of the networks are lnet (CNN or PointNet) and mn
 of their size are depth (4 to 7 layers of 64) and width (32 to 128 with 4 layers). Those of the loss are chamfer (with
 and without) and free (number of free samples a ray). All further settings are fixed. The basis is a small CNN and an
 MLP of 6 layers of 64: a run takes half a minute on a CPU. By default each variant has ten trajectories with three seeds
-of the networks each: 570 runs, five hours on two cores. Each run is written to rows/ when it is done; ablations.png has
-the box plots. The table has 95 % intervals: of the median by a bootstrap over the trajectories, of the success Wilson's
-of all runs.
+of the networks each: 570 runs, five hours on two cores. Each run is written to rows/ when it is done. The table has 95
+% intervals: of the median by a bootstrap over the trajectories, of the success Wilson's of all runs.
 """
 
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax import cli, metrics, nets, simulation, viz
+from dpmjax import cli, metrics, nets, simulation
 from dpmjax import deepmapping as dm
 from dpmjax.registration_rgbd import as_depth_scans
 from experiments.deepmapping_rgbd import errors_of
@@ -120,12 +118,10 @@ def run_one(settings: dm.DeepMappingConfig, seed: int, network_seed: int) -> cli
 
 
 def report(rows: list[cli.Row]) -> cli.Summary:
-    """Returns a line for each variant, with intervals of 95 %, and ablations.png."""
-    panels: dict[str, dict[str, list[float]]] = defaultdict(dict)
+    """Returns a line for each variant, with intervals of 95 %."""
     table = []
     for (ablation, variant), some in cli.group_rows(rows, "ablation", "variant").items():
         ate = np.array([row["ate_mm"] for row in some])
-        panels[f"{ablation}: ATE, mm"][variant] = ate.tolist()
         share = metrics.wilson_interval(int((ate < _SUCCESS_MM).sum()), len(ate))
         table.append(
             {
@@ -141,9 +137,6 @@ def report(rows: list[cli.Row]) -> cli.Summary:
             }
         )
 
-    def draw(folder: cli.RunFolder) -> None:
-        viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "ablations.png")
-
     columns = ("ablation", "variant", "runs", "median ATE, mm (95 %)", "success (95 %)", "median s")
     lines = [
         [
@@ -154,7 +147,7 @@ def report(rows: list[cli.Row]) -> cli.Summary:
         ]
         for row in table
     ]
-    return cli.Summary({"variants": table}, cli.markdown(columns, lines), draw)
+    return cli.Summary({"variants": table}, cli.markdown(columns, lines))
 
 
 def interval_of_median(values: np.ndarray, trajectories: list[int]) -> list[float]:

@@ -21,7 +21,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax import cli, simulation, viz
+from dpmjax import cli, simulation
 from experiments import _deepmapping_methods as shared
 from experiments._deepmapping_methods import Task
 
@@ -131,21 +131,12 @@ def _column(row: cli.Row, candidate: str) -> str:
 
 
 def report(config: Config, rows: list[cli.Row], not_run: dict[str, str]) -> cli.Summary:
-    """Returns the successes, the table and a picture for each world and order."""
+    """Returns the successes and the table."""
     lines = summary(rows)
-
-    def draw(folder: cli.RunFolder) -> None:
-        for (world, order), mine in cli.group_rows(rows, "world", "order").items():
-            figure = viz.success_grids_figure(
-                success_grids(mine, config),
-                {"scans used": [f"1/{stride}" for stride in sorted(config.strides)]},
-                {"range noise, px": [f"{noise:g}" for noise in config.noises_px]},
-            )
-            viz.save_figure(figure, folder / f"{world}_{order}.png")
 
     numbers = {"success_threshold_px": shared.SUCCESS_PX, "summary": lines, "not_run": not_run}
     numbers |= shared.success_of_trusted(rows) | shared.best_kept(rows)
-    return cli.Summary(numbers, "\n\n".join(["\n".join(lines), table(rows)]), draw)
+    return cli.Summary(numbers, "\n\n".join(["\n".join(lines), table(rows)]))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ RUN is a folder of `dpmjax map2d` on a built-in world. L-Net is trained on the p
 poses of each scan, and M-Net chooses. Headings are random and unknown. Beside it stands L-Net alone, as in the paper:
 the scans have the heading of the nearest scan of the fit, and the output of L-Net is the pose. That L-Net is the one of
 the fit where a single one moved all scans from zero poses, as with --preset paper; else it is trained on the poses of
-the fit. Written beside the results of RUN: relocalization.png, relocalization.json, and relocalization.npz with the
+the fit. Written beside the results of RUN: relocalization.json, and relocalization.npz with the
 numbers of each scan.
 """
 
@@ -22,7 +22,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import ScanSet, cli, metrics, simulation, viz
+from dpmjax import ScanSet, cli, metrics, simulation
 from dpmjax import deepmapping as dm
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
@@ -93,7 +93,6 @@ def main(config: Config) -> None:
     }
     cli.write_json(config.run / "relocalization.json", report)
     np.savez(config.run / "relocalization.npz", truth=truth, errors_alone=alone.errors, **queries._asdict())
-    draw(config, sequence, grid.shape, truth, {"L-Net alone, known heading": alone, "L-Net and M-Net": queries})
     print(lines_of(report), f"results in {config.run}", sep="\n")
 
 
@@ -113,24 +112,6 @@ class Queries(NamedTuple):
     is_known: np.ndarray
     is_mapped: np.ndarray
     nats: np.ndarray
-
-
-def draw(
-    config: Config, sequence: ScanSequence, shape: tuple[int, ...], truth: np.ndarray, methods: dict[str, Queries]
-) -> None:
-    """Draws relocalization.png: maps of the errors of each method, and of the last one for the scans that are known."""
-    panels, everywhere = [], np.ones(len(truth), bool)
-    last, queries = list(methods.items())[-1]
-    shown = {name: (found.errors, everywhere) for name, found in methods.items()}
-    for name, (errors, rows) in (shown | {f"{last}, known scans": (queries.errors, queries.is_known)}).items():
-        image = np.full(shape, np.nan)[:: config.stride_px, :: config.stride_px]
-        image[tuple((truth[rows, 1::-1] // config.stride_px).astype(int).T)] = errors[rows]
-        share = float((errors[rows] < _RIGHT_PX).mean()) if rows.any() else 0.0
-        panels.append(viz.ErrorMap(name, f"{share:.0%} of {rows.sum()} below {_RIGHT_PX:.0f} px", image))
-    side = config.stride_px * np.array(panels[0].error.shape)
-    extent = (0.0, side[1], 0.0, side[0])
-    figure = viz.error_maps_figure(panels, extent, sequence.reference_poses[:, :2], "px", worst=200.0)
-    viz.save_figure(figure, config.run / "relocalization.png")
 
 
 def free_poses(grid: np.ndarray, config: Config) -> np.ndarray:

@@ -14,7 +14,7 @@ missing pixels. Walks on which no motion at all has an ATE below 450 mm are left
 Each trajectory is written to rows/ as soon as all methods have done it. The file metrics.json has the share of walks
 with an ATE below 450 mm, and of right walks. The paper's threshold is 450 mm; no motion at all meets it on most of its
 walks. Right is an ATE below a tenth of the spread of the cameras, turns between neighbours within 2 degrees, and points
-within 100 mm. The file errors.png has the box plots, map_K.png some trajectories from above.
+within 100 mm. The files map_K.png have some trajectories from above.
 """
 
 from __future__ import annotations
@@ -219,21 +219,13 @@ def summarise(rows: list[cli.Row], methods: tuple[str, ...]) -> cli.Row:
 
 
 def report(rows: list[cli.Row], methods: tuple[str, ...]) -> cli.Summary:
-    """Returns the shares and medians of each method, and errors.png."""
+    """Returns the shares and medians of each method."""
     numbers = summarise(rows, methods)
     right = f"below {_RIGHT_SHARE:.0%} of the spread, turns {_RIGHT_DEG:g} degrees, points {_RIGHT_MM:g} mm"
     text = f"{len(rows)} trajectories; success: ATE below 450 mm (the paper's); right: ATE {right}"
     columns = list(numbers["methods"][methods[0]])
     lines = [[name, *(row[column] for column in columns)] for name, row in numbers["methods"].items()]
-    panels = {
-        title: {name: [row[name][key] for row in rows] for name in methods}
-        for title, key in (("ATE, mm", "ate_mm"), ("point distance, mm", "point_distance_mm"))
-    }
-
-    def draw(folder: cli.RunFolder) -> None:
-        viz.save_figure(viz.error_boxes_figure(panels, threshold=_SUCCESS_MM), folder / "errors.png")
-
-    return cli.Summary(numbers, f"{text}\n\n{cli.markdown(('method', *columns), lines)}", draw)
+    return cli.Summary(numbers, f"{text}\n\n{cli.markdown(('method', *columns), lines)}")
 
 
 if __name__ == "__main__":

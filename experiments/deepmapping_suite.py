@@ -6,7 +6,7 @@
 Three built-in worlds, 50 trajectories of 128 poses and 25 of 256, made by seed. With --range-noise-px the rows also
 carry the least error that one scan allows where the world is known (the Cramer-Rao bound). A method that compares
 several candidates, as a search and DeepMapping from it, has a row for each of them below its own. Results: table.md,
-metrics.json (with all rows), boxes.png.
+metrics.json (with all rows).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from tyro.conf import arg
 
-from dpmjax import cli, metrics, simulation, viz
+from dpmjax import cli, metrics, simulation
 from experiments import _deepmapping_methods as shared
 from experiments._deepmapping_methods import Task
 
@@ -125,23 +125,15 @@ def table(rows: list[cli.Row]) -> str:
 
 
 def report(rows: list[cli.Row], not_run: dict[str, str]) -> cli.Summary:
-    """Returns the numbers of the methods, the table and boxes.png."""
+    """Returns the numbers of the methods, and the table."""
     groups = {method: mine for (method,), mine in cli.group_rows(rows, "method").items()}
     methods = {method: {"title": shared.METHODS[method].title, **summarise(mine)} for method, mine in groups.items()}
     text, bounds = table(rows), [row["bound_px"] for row in rows if "bound_px" in row]
     if bounds:
         least = f"{np.median(bounds):.3g} px"
         text += f"\n\nNo unbiased estimate has a median ATE below {least}, not even where the world is known."
-    panels = {
-        label: {method: [row[key] for row in mine] for method, mine in groups.items()}
-        for label, key in (("ATE, px", "ate_px"), ("point distance, px", "point_distance_px"))
-    }
-
-    def draw(folder: cli.RunFolder) -> None:
-        viz.save_figure(viz.error_boxes_figure(panels, threshold=shared.SUCCESS_PX), folder / "boxes.png")
-
     numbers = {"success_threshold_px": shared.SUCCESS_PX, "methods": methods, "not_run": not_run}
-    return cli.Summary(numbers, text, draw)
+    return cli.Summary(numbers, text)
 
 
 if __name__ == "__main__":

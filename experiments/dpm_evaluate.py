@@ -21,8 +21,8 @@ With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM an
 `peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
 file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated. The
 file table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps, localisations and seconds a scan. The seconds
-are of all scans, and of the first and the last tenth, which show whether they grow. trajectories.png and map_sizes.png
-show the trajectories and the bytes of maps; drives/ holds the trajectories of every method and the files of our run.
+are of all scans, and of the first and the last tenth, which show whether they grow. trajectories.png
+shows the trajectories; drives/ holds the trajectories of every method and the files of our run.
 `_slam_evaluation.py` says how loops are counted.
 """
 

@@ -88,7 +88,7 @@ def map_agents(run: cli.TableRun, config: Config, methods: slam.SlamMethods, seq
     status = "interrupted" if run.is_stopped() else "done"
     # Numbers first: a picture that fails must not cost them.
     cli.write_metrics(folder, {"status": status, **numbers}, seed=config.seed)
-    viz.save_figure(viz.agents_figure(f"{len(mapped)} agents", agent_panels(result, mapped)), folder / "agents.png")
+    viz.save_figure(viz.figure(agent_panels(result, mapped), title=f"{len(mapped)} agents"), folder / "agents.png")
     return numbers
 
 
@@ -227,26 +227,27 @@ def _positions(
     return np.concatenate([result.T_world_scan[number][:, :3, 3] for number in members]), np.concatenate(known)
 
 
-def agent_panels(result: AgentsResult, sequences: list[LidarSequence]) -> list[viz.AgentPanel]:
+def agent_panels(result: AgentsResult, sequences: list[LidarSequence]) -> list[viz.Panel]:
     """Gathers the data of the picture: clouds, tracks and loops of each component."""
     panels, T_shown_keyframe = [], keyframe_poses(result, result.T_world_scan)
     for members in members_of(result):
         pairs = _positions(result, sequences, members)
+        references: list[np.ndarray] = []
         T_shown_reference = None if pairs is None else metrics.align_rigid(*reversed(pairs))
-        tracks = []
+        layers: list[viz.Layer] = []
         for number in members:
             scans, sequence, T = result.agents[number].keyframes, sequences[number], result.T_world_scan[number]
             cloud = cli.gather_map(T[scans], lambda row, read=sequence.read_points, scans=scans: read(int(scans[row])))
-            track = cli.map_track(f"agent {number + 1}, {len(T)} scans", number, T, cloud)
+            layers += cli.map_layers(f"agent {number + 1}, {len(T)} scans", number, T, cloud)
             if T_shown_reference is not None:
                 R, t = T_shown_reference[:3, :3], T_shown_reference[:3, 3]
-                track = track._replace(reference=sequence.T_world_lidar[:, :3, 3] @ R.T + t)
-            tracks.append(track)
+                references += [sequence.T_world_lidar[:, :3, 3] @ R.T + t, np.full((1, 3), np.nan)]
         ends = cli.accepted_ends(result.joined.loops)
         ends = ends[np.isin(result.joined.map_of_keyframe[ends[:, 0]], members)]
         drives = ", ".join(dict.fromkeys(sequences[number].name for number in members))
         title = drives + (", in one frame" if len(members) > 1 else ", in a frame of its own")
-        panels.append(viz.AgentPanel(title, tracks, T_shown_keyframe[ends, :3, 3]))
+        layers.append(viz.Edges(T_shown_keyframe[ends, :3, 3], viz.INK, "loops between them"))
+        panels.append(viz.Panel(title, layers, np.concatenate(references) if references else None))
     return panels
 
 

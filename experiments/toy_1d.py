@@ -3,7 +3,7 @@
     python -m experiments.toy_1d
     python -m experiments.toy_1d --seeds 100 -o out
 
-Writes toy.png (figure 14), endings.png (the ends of all seeds) and metrics.json. The metrics are the share of seeds
+Writes toy.png (figure 14) and metrics.json. The metrics are the share of seeds
 that reach the global minimum, in the network form and in the direct form, from the same starts. The direct form is
 solved by plain descent and by three solvers of jaxopt. The metrics cover several initialisations and learning rates.
 """
@@ -76,8 +76,6 @@ def main(config: Config) -> None:
         x = np.linspace(-VIEW, VIEW, 2401)
         loss = np.asarray(dm.toy_loss(x))
         viz.save_figure(viz.toy_figure((x, loss), **figure), folder / "toy.png")
-        ends_figure = viz.endings_figure(x, loss, ends, metrics["share_at_global_minimum"])
-        viz.save_figure(ends_figure, folder / "endings.png")
         print(report(metrics), f"results in {folder.path}", sep="\n")
 
 

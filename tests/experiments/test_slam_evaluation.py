@@ -120,7 +120,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(
     ]
     assert sorted(proposers) == ["network", "prediction"]
     assert sum(rows[NETWORK]["scan_statuses"].values()) == rows[NETWORK]["num_scans"] == NUM_SCANS
-    for name in ("table.md", "trajectories.png", "map_sizes.png"):
+    for name in ("table.md", "trajectories.png"):
         assert (out / name).stat().st_size > 0
     assert f"| toy 1 | {NUM_SCANS}, 10 m | {PEER} | 0.000 |" in (out / "table.md").read_text()
     monkeypatch.setattr("dpmjax.cli.map_drive", None)
