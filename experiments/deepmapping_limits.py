@@ -85,20 +85,6 @@ def _prepare(config: Config, cell: cli.Row) -> tuple[Task, cli.Row]:
     return shared.make_task(scans, is_ordered=cell["order"] == "ordered", steps=config.steps, seed=config.seed), {}
 
 
-def success_grids(rows: list[cli.Row], config: Config) -> dict[str, np.ndarray]:
-    """Returns (strides, noises) success rates of every method and candidate, smallest stride first; NaN: not run."""
-    cells: dict[str, dict[tuple[int, float], list[bool]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        found = {name: numbers["ate_px"] < shared.SUCCESS_PX for name, numbers in row["candidates"].items()}
-        for name, is_right in (found if len(found) == 1 else found | {"kept": row["success"]}).items():
-            cells[_column(row, name)][row["stride"], row["noise_px"]].append(is_right)
-    strides, empty = sorted(config.strides), [np.nan]
-    return {
-        column: np.array([[np.mean(found.get((i, j), empty)) for j in config.noises_px] for i in strides])
-        for column, found in cells.items()
-    }
-
-
 def summary(rows: list[cli.Row]) -> list[str]:
     """Returns a line for each world, order and method: mean success of all cells run, and at every 8th scan."""
     lines = []

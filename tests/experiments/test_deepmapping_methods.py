@@ -157,29 +157,6 @@ def test_limits_are_resumed_without_doing_a_row_twice(tmp_path, monkeypatch, cap
     assert simulated == [(0, 200), (1, 201)]
     assert second["note"] is None
     assert "rooms, ordered, icp-plane: 100% of 2" in capsys.readouterr().out
-    assert (tmp_path / "out" / "rooms_ordered.png").exists()
-
-
-def test_success_grid_leaves_open_what_was_not_run() -> None:
-    config = deepmapping_limits.Config(strides=(8, 4), noises_px=(0.0, 1.0))
-    cell = {"stride": 8, "noise_px": 1.0}
-    rows = [cell | a_row("m", 3.0), cell | a_row("m", 300.0)]
-    grids = deepmapping_limits.success_grids(rows, config)
-    assert list(grids) == ["m"]
-    np.testing.assert_array_equal(grids["m"], [[np.nan, np.nan], [np.nan, 0.5]])
-
-
-def test_success_grids_show_every_candidate_and_what_was_kept() -> None:
-    config = deepmapping_limits.Config(strides=(8,), noises_px=(0.0,))
-    cell = {"stride": 8, "noise_px": 0.0}
-    rows = [
-        cell | a_row("all", 2.0, "fit", search=300.0, fit=2.0),
-        cell | a_row("all", 3.0, "fit", search=300.0, fit=3.0),
-        cell | a_row("all", 1.0, "search", search=1.0, fit=90.0),
-        cell | a_row("icp-plane", 90.0),
-    ]
-    found = {name: round(grid.item(), 2) for name, grid in deepmapping_limits.success_grids(rows, config).items()}
-    assert found == {"all: search": 0.33, "all: fit": 0.67, "all: kept": 1.0, "icp-plane": 0.0}
 
 
 def test_limits_tell_every_candidate_and_how_often_the_best_was_kept() -> None:
