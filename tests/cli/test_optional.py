@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from dpmjax.cli import program, slam
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK, run_command
-from dpmjax.cli.info import EXTRAS, require_importable, why_not_importable
+from dpmjax.cli.machine import EXTRAS, require_importable, why_not_importable
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
 from tests.optional import import_or_skip
 
@@ -89,7 +89,7 @@ def test_tests_of_a_broken_package_are_skipped_with_the_reason(packages: Path) -
     [
         (deepmapping_rgbd, ["--methods", "multiway"], "open3d", "--methods multiway"),
         (deepmapping_suite, ["--methods", "icp-plane", "multiway"], "open3d", "--methods multiway"),
-        (deepmapping_suite, ["--methods", "particle-swarm"], "evosax", "--methods particle-swarm"),
+        (deepmapping_suite, ["--methods", "swarm-poses"], "evosax", "--methods swarm-poses"),
         (slam, ["-v"], "rerun", "-v"),
         (toy_1d, [], "jaxopt", "the solvers of the direct form"),
     ],
@@ -99,7 +99,7 @@ def test_a_command_names_a_broken_package_before_any_work(
 ) -> None:
     (packages / f"{package}.py").write_text(FAILURES["a missing library"])
     options = [*arguments, "-o", str(tmp_path / "out")]
-    code = run_command(module.main, module.Config, name="command", description=None, args=options)
+    code = run_command(module.main, name="command", description=None, args=options)
     assert code == EXIT_BAD_INPUT
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines == [f"dpmjax: error: {named}: {package} is installed, but its import fails: {LIBUSB}"]
