@@ -47,9 +47,7 @@ def format_table(named_rows: Iterable[tuple[str, Row]]) -> str:
     """Lays rows out under `COLUMNS`, numbers aligned to the right."""
     cells = [COLUMNS, *((name, row.case, row.metric, f"{row.value:.4g}", row.unit) for name, row in named_rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(COLUMNS))]
-    form = "  ".join(
-        f"{{:{'>' if name == 'value' else '<'}{width}}}" for name, width in zip(COLUMNS, widths, strict=True)
-    )
+    form = "  ".join(f"{{:{side}{width}}}" for side, width in zip("<<<><", widths, strict=True))
     head, *lines = (form.format(*line).rstrip() for line in cells)
     return "\n".join([head, "-" * len(head), *lines])
 

@@ -54,13 +54,7 @@ def cases(quick: bool) -> list[Case]:
     info_nce = partial(dpmjax.info_nce, temperature=TEMPERATURE)
     return [
         Case(f"weighted_svd {num_pairs}x3", dpmjax.weighted_svd, "SciPy", weighted_svd, (source, target, weights)),
-        Case(
-            f"k_nearest k=8 {num_points}x{num_points}",
-            lambda queries, points: dpmjax.k_nearest(queries, points, 8).squared_distances,
-            "SciPy tree",  # built anew for each call, as a moving scan needs it
-            lambda queries, points: KDTree(points).query(queries, 8)[0] ** 2,
-            (queries, points),
-        ),
+        Case(f"k_nearest k=8 {num_points}x{num_points}", k_nearest, "SciPy tree", tree_nearest, (queries, points)),
         Case("chamfer 256x256", dpmjax.chamfer_distance, "SciPy tree", chamfer_distance, (scan_a, scan_b)),
         Case(f"info_nce {num_descriptors}x128", info_nce, "NumPy", numpy_info_nce, (descriptors, keys, positives)),
     ]
@@ -70,6 +64,16 @@ def difference(case: Case) -> float:
     """Returns the largest entry of the difference to the peer on the same numbers in float64."""
     exact = (array.astype(np.float64) if array.dtype == np.float32 else array for array in case.arguments)
     return float(np.max(np.abs(np.asarray(case.ours(*case.arguments)) - np.asarray(case.peer(*exact)))))
+
+
+def k_nearest(queries: np.ndarray, points: np.ndarray) -> object:
+    """Returns the squared distances of the eight nearest points."""
+    return dpmjax.k_nearest(queries, points, 8).squared_distances
+
+
+def tree_nearest(queries: np.ndarray, points: np.ndarray) -> object:
+    """Returns the same by a tree, built anew for each call, as a moving scan needs it."""
+    return KDTree(points).query(queries, 8)[0] ** 2
 
 
 def weighted_svd(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> object:

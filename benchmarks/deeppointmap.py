@@ -1,4 +1,4 @@
-"""DeepPointMap from a raw scan to descriptors, motions and overlap, beside the authors' program and the goal.
+"""DeepPointMap from a raw scan to descriptors, motions and overlap, beside the authors' program.
 
 Each stage runs in a process of its own, so that its peak memory is its own. The input is a scan of the simulated town
 (HDL-64E, about 100,000 points), and one of KITTI where `$DPMJAX_DATA/lidar_3d` (default `../shared/data`) has it. On
@@ -8,11 +8,9 @@ the CPU always, on a GPU too where JAX has one.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -22,124 +20,125 @@ import dpmjax
 from benchmarks import DATA, Row, in_new_process, measure
 from dpmjax import deeppointmap as dpm
 from dpmjax.cli import peak_rss_gb
-from dpmjax.geometry import build_pyramid
 from dpmjax.io import LidarSequence, open_lidar_sequence
-from dpmjax.scans import preprocess_scan, preprocess_scan_on_host
+from dpmjax.scans import preprocess_scan_on_host
 from dpmjax.simulation import HDL64E, DriveConfig, Scene, TownConfig, simulate_scene
+
+Scans = dict[str, np.ndarray]
+Parts = dict[str, Callable[[], object]]
 
 KITTI = ("kitti_00", "kitti_07", "kitti_raw_0013")
 # Parts that run on the host, and the sum of parts that are compiled by then.
 NOT_COMPILED = ("preprocess", "pyramid", "preprocess + encode")
-
 # 2048 descriptors at the size of the paper.
 SCANS_IN_MAP = 8
 
+# The authors' program was measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI scan of
+# 122,500 points): milliseconds by case, and GB of the one process that does all of it.
+THEIRS = {
+    "paper, KITTI scan: preprocess": 98.0,
+    "paper, KITTI scan: pyramid": 990.0,
+    "paper, KITTI scan: network": 250.0,
+    "paper, KITTI scan: preprocess + encode": 1318.0,
+    "paper, 256 x 256: registration (correlate, match, align)": 75.0,
+    "paper, 256 x 2048: registration (correlate, match, align)": 540.0,
+    "paper, one pair: overlap": 82.0,
+    "process of everything paper": 1.0,
+}
 
-def make_scans(folder: Path, quick: bool) -> list[Row]:
-    """Writes scans for the later stages and returns their sizes: a simulated one, one of KITTI if found."""
+
+def run(quick: bool) -> list[Row]:
+    """Returns rows of all stages on the CPU; then on the GPU, where JAX has one, under names that say so."""
+    # Several processes share the GPU.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     sensor = HDL64E.with_azimuths(256) if quick else HDL64E
-    scans = {"town": simulate_scene(Scene(0, TownConfig(), DriveConfig(), sensor)).read_scan(10)}
+    scans: Scans = {"town": simulate_scene(Scene(0, TownConfig(), DriveConfig(), sensor)).read_scan(10)}
     recorded = [path for name in KITTI if not quick and (path := DATA / "lidar_3d" / name).is_dir()]
     if recorded:
         scans["KITTI"] = open_lidar_sequence(recorded[0]).read_scan(0)
-    for name, points in scans.items():
-        np.save(folder / f"{name}.npy", points)
-    return [Row(f"{name} scan", "size", len(points), "points") for name, points in scans.items()]
+    rows = [Row(f"{name} scan", "size", len(points), "points") for name, points in scans.items()]
+    devices = {"": "cpu"} | ({"GPU, ": "cuda"} if jax.default_backend() == "gpu" else {})
+    for prefix, platform in devices.items():
+        for stage in QUICK if quick else FULL:
+            found = in_new_process(stage_rows, stage, scans, quick, JAX_PLATFORMS=platform)
+            rows += [row._replace(case=prefix + row.case) for row in (found if prefix else with_theirs(found))]
+    return rows
 
 
-def read_scans(folder: Path) -> dict[str, np.ndarray]:
-    """Returns the scans that `make_scans` wrote, by name."""
-    return {file.stem: np.load(file) for file in sorted(folder.glob("*.npy"), reverse=True)}
+def stage_rows(stage: str, scans: Scans, quick: bool) -> list[Row]:
+    """Returns the rows of one stage, with the peak memory of this process."""
+    return [*STAGES[stage](scans, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]
 
 
-def time_encoding(folder: Path, quick: bool, *, preset: str) -> list[Row]:
+def with_theirs(rows: list[Row]) -> list[Row]:
+    """Returns the rows, each followed by the number of the authors' program, where there is one."""
+    result = []
+    for row in rows:
+        result.append(row)
+        if row.case in THEIRS and row.metric in ("median", "peak memory"):
+            result.append(row._replace(metric=f"{row.metric}, authors' program", value=THEIRS[row.case]))
+    return result
+
+
+def time_encoding(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
     """Returns times of `dpmjax.encode` and of its parts: two on the host, one on the device."""
-    model = _model(preset)
-    rows = []
-    for name, points in read_scans(folder).items():
+    model, rows = _model(preset), []
+    for name, points in scans.items():
         cloud = preprocess_scan_on_host(points, None, model.config.preprocess)
-        pyramid = dpm.pyramid_of_cloud(cloud, model.config)
-        parts: dict[str, Callable[[], object]] = {
+        parts: Parts = {
             "preprocess": partial(preprocess_scan_on_host, points, None, model.config.preprocess),
             "pyramid": partial(dpm.pyramid_of_cloud, cloud, model.config),
-            "network": partial(dpmjax.encode_pyramid, model, pyramid),
+            "network": partial(dpmjax.encode_pyramid, model, dpm.pyramid_of_cloud(cloud, model.config)),
             "preprocess + encode": partial(dpmjax.encode, model, points),
         }
         rows += _timed(f"{preset}, {name} scan", parts, quick)
     return rows
 
 
-def time_jax_builders(folder: Path, quick: bool, *, preset: str) -> list[Row]:
-    """Returns times of preprocessing and pyramid by the JAX kernels."""
-    model = _model(preset)
-    points = jnp.asarray(read_scans(folder)["town"])
-    config = model.config
-    cloud = preprocess_scan(points, None, config.preprocess)
-    scaled = cloud.points / config.scale_m
-    parts: dict[str, Callable[[], object]] = {
-        "preprocess in JAX": partial(preprocess_scan, points, None, config.preprocess),
-        "pyramid in JAX": partial(build_pyramid, scaled, cloud.mask, config.pyramid),
-        "network": partial(dpmjax.encode_pyramid, model, build_pyramid(scaled, cloud.mask, config.pyramid)),
-    }
-    return _timed(f"{preset}, town scan", parts, quick, repeats=5)
-
-
-def time_matching(folder: Path, quick: bool, *, preset: str, num_target: int) -> list[Row]:
+def time_matching(scans: Scans, quick: bool, *, preset: str, num_target: int) -> list[Row]:
     """Returns times of the decoder alone, and of the whole registration of two descriptor clouds."""
     model = _model(preset)
     source, target = _cloud(model, model.config.num_descriptors, seed=0), _cloud(model, num_target, seed=1)
-    parts: dict[str, Callable[[], object]] = {
+    parts: Parts = {
         "correlate": partial(dpmjax.correlate, model, source, target),
         "registration (correlate, match, align)": partial(dpmjax.register, model, source, target),
     }
     return _timed(f"{preset}, {model.config.num_descriptors} x {num_target}", parts, quick)
 
 
-def time_overlap(folder: Path, quick: bool, *, preset: str) -> list[Row]:
+def time_overlap(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
     """Returns times of the overlap prediction."""
     model = _model(preset)
     clouds = [_cloud(model, model.config.num_descriptors, seed=seed) for seed in range(2)]
     return _timed(f"{preset}, one pair", {"overlap": partial(dpmjax.overlap, model, *clouds)}, quick)
 
 
-def time_training(folder: Path, quick: bool, *, preset: str) -> list[Row]:
+def time_training(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
     """Returns times of a training step on pairs of scans, as the curriculum begins, and the scans a second."""
     settings = dpm.training_preset(preset)
     num_scans = 4 if quick else settings.sampling.num_scans
     sampling = replace(settings.sampling, num_scans=num_scans)
     settings = replace(settings, curriculum=(dpm.CurriculumStage(2, 1),), sampling=sampling, num_variants=1)
-    points = read_scans(folder)["town"]
     T_world_lidar = np.tile(np.eye(4), (num_scans, 1, 1))
     T_world_lidar[:, 0, 3] = np.linspace(0, 10, num_scans)
-    drive = LidarSequence("town", ("town",) * num_scans, lambda _: points, T_world_lidar)
+    drive = LidarSequence("town", ("town",) * num_scans, lambda _: scans["town"], T_world_lidar)
     with dpm.SampleMaker(dpm.ScanStore([dpm.prepare_drive(drive, settings)]), settings, seed=0) as maker:
         batch = maker(0)
-    step = dpm.make_step(settings)
     state = dpm.init_training(jax.random.key(0), settings)
-    timing = measure(step, state, batch, repeats=3 if quick else 12)
+    timing = measure(dpm.make_step(settings), state, batch, repeats=3 if quick else 12)
     case = f"{preset}, K = 2, {num_scans} scans: training step"
     return [*timing.rows(case), Row(case, "speed", num_scans / timing.median_s, "scans/s")]
 
 
-def run_everything(folder: Path, quick: bool, *, preset: str) -> list[Row]:
+def run_everything(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
     """Returns no rows; runs encoding, registration of scans and maps, and overlap, to measure the memory."""
-    model = _model(preset)
-    scan = next(iter(read_scans(folder).values()))
+    model, scan = _model(preset), scans["town"]
     cloud = dpmjax.encode(model, scan)
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * SCANS_IN_MAP), cloud)
     poses = jnp.tile(jnp.eye(4), (SCANS_IN_MAP, 1, 1)).at[:, 0, 3].set(jnp.arange(SCANS_IN_MAP))
-    targets = (scan, dpm.merge_clouds(stacked, poses))
-    motions = [dpmjax.register(model, cloud, target) for target in targets]
+    motions = [dpmjax.register(model, cloud, target) for target in (scan, dpm.merge_clouds(stacked, poses))]
     jax.block_until_ready((motions, dpmjax.overlap(model, cloud, cloud)))
     return []
-
-
-def time_products(folder: Path, quick: bool) -> list[Row]:
-    """Returns the speed of the decoder's largest matrix product, which shows if the machine is busy."""
-    product = jax.jit(jnp.matmul)
-    a, b = jnp.ones((2304, 256)), jnp.ones((256, 768))
-    timing = measure(product, a, b, repeats=5 if quick else 30)
-    return [Row("float32 product 2304x256x768", "speed", 2e-9 * 2304 * 256 * 768 / timing.median_s, "GFLOP/s")]
 
 
 def _model(preset: str) -> dpmjax.Model:
@@ -154,82 +153,22 @@ def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.De
     return dpmjax.DescriptorCloud(jnp.asarray(positions), jnp.asarray(features), jnp.ones(num_descriptors, bool))
 
 
-def _timed(case: str, parts: dict[str, Callable[[], object]], quick: bool, repeats: int = 12) -> list[Row]:
+def _timed(case: str, parts: Parts, quick: bool) -> list[Row]:
     rows: list[Row] = []
     for name, function in parts.items():
-        timing = measure(function, repeats=3 if quick else repeats)
+        timing = measure(function, repeats=3 if quick else 12)
         rows += timing.rows(f"{case}: {name}", is_compiled=name not in NOT_COMPILED)
     return rows
 
 
-STAGES: dict[str, Callable[[Path, bool], list[Row]]] = {
-    "scans": make_scans,
-    "products": time_products,
+QUICK = ("encode tiny", "match tiny", "everything tiny")
+STAGES: dict[str, Callable[[Scans, bool], list[Row]]] = {
     **{f"encode {preset}": partial(time_encoding, preset=preset) for preset in ("tiny", "small", "paper")},
-    "JAX builders paper": partial(time_jax_builders, preset="paper"),
     "match tiny": partial(time_matching, preset="tiny", num_target=256),
     "match scan": partial(time_matching, preset="paper", num_target=256),
     "match map": partial(time_matching, preset="paper", num_target=256 * SCANS_IN_MAP),
     "overlap": partial(time_overlap, preset="paper"),
     **{f"train {preset}": partial(time_training, preset=preset) for preset in ("tiny", "small")},
-    "everything tiny": partial(run_everything, preset="tiny"),
-    "everything paper": partial(run_everything, preset="paper"),
+    **{f"everything {preset}": partial(run_everything, preset=preset) for preset in ("tiny", "paper")},
 }
-QUICK = ("products", "encode tiny", "match tiny", "everything tiny")
-FULL = tuple(stage for stage in STAGES if stage not in ("scans", "match tiny", "everything tiny"))
-
-
-def stage_rows(stage: str, folder: Path, quick: bool) -> list[Row]:
-    """Returns the rows of one stage, with the peak memory of this process."""
-    return [*STAGES[stage](folder, quick), Row(f"process of {stage}", "peak memory", peak_rss_gb(), "GB")]
-
-
-# The authors' program was measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI scan of
-# 122,500 points).
-THEIRS, GOAL = "authors' program", "goal"
-# By case. Held against the median, or against the peak memory of the one process that does all of it.
-FIGURES: dict[str, dict[str, float]] = {
-    "paper, KITTI scan: preprocess": {THEIRS: 98.0},
-    "paper, KITTI scan: pyramid": {THEIRS: 990.0},
-    "paper, KITTI scan: network": {THEIRS: 250.0},
-    "paper, KITTI scan: preprocess + encode": {THEIRS: 1318.0, GOAL: 60.0},
-    "paper, town scan: preprocess + encode": {GOAL: 60.0},
-    "small, KITTI scan: preprocess + encode": {GOAL: 30.0},
-    "small, town scan: preprocess + encode": {GOAL: 30.0},
-    "paper, 256 x 256: registration (correlate, match, align)": {THEIRS: 75.0, GOAL: 40.0},
-    "paper, 256 x 2048: registration (correlate, match, align)": {THEIRS: 540.0, GOAL: 300.0},
-    "paper, one pair: overlap": {THEIRS: 82.0, GOAL: 40.0},
-    "small, K = 2, 16 scans: training step": {GOAL: 450.0},
-    "process of everything paper": {THEIRS: 1.0, GOAL: 1.0},
-}
-
-
-def run(quick: bool) -> list[Row]:
-    """Returns rows of all stages on the CPU; then on the GPU, where JAX has one, under names that say so."""
-    # Several processes share the GPU.
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    with tempfile.TemporaryDirectory() as name:
-        folder, stages = Path(name), QUICK if quick else FULL
-        rows = [row for row in run_stage("scans", folder, quick) if row.metric == "size"]
-        for stage in stages:
-            rows += with_figures(run_stage(stage, folder, quick, platform="cpu"))
-        if jax.default_backend() == "gpu":
-            for stage in stages:
-                rows += [row._replace(case=f"GPU, {row.case}") for row in run_stage(stage, folder, quick)]
-    return rows
-
-
-def run_stage(stage: str, folder: Path, quick: bool, *, platform: str | None = None) -> list[Row]:
-    """Returns rows of one stage, run in a fresh process on a platform, or on the device that JAX chooses."""
-    return in_new_process(stage_rows, stage, folder, quick, **({} if platform is None else {"JAX_PLATFORMS": platform}))
-
-
-def with_figures(rows: list[Row]) -> list[Row]:
-    """Returns the rows, each followed by the authors' figure and by the goal, where they exist."""
-    result = []
-    for row in rows:
-        result.append(row)
-        if row.metric in ("median", "peak memory"):
-            figures = FIGURES.get(row.case, {}).items()
-            result += [row._replace(metric=f"{row.metric}, {name}", value=value) for name, value in figures]
-    return result
+FULL = tuple(stage for stage in STAGES if stage not in ("match tiny", "everything tiny"))

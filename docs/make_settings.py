@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dpmjax.cli.program import COMMANDS
-from dpmjax.cli.run_folder import RunOptions
+from dpmjax.cli.run import RunOptions
 
 PAGE = Path(__file__).with_name("settings.md")
 

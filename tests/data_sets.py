@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
+from dpmjax.cli.run import Run, RunOptions
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, ScanSequence, write_kitti
 from dpmjax.io.clouds import parse_pcd, parse_ply
@@ -77,3 +78,11 @@ def read_pcd(path: Path) -> np.ndarray:
 def read_ply(path: Path) -> np.ndarray:
     """Reads the points of a PLY file, NaN too."""
     return parse_ply(read_bytes(path), str(path)).points
+
+
+def run_in(folder: Path) -> Run:
+    """A run of a command in a folder, which may hold an earlier part of it."""
+    run = Run("toy", RunOptions())
+    folder.mkdir(exist_ok=True)
+    run.path = folder
+    return run

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli import localize, map2d, program, slam
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.result_files import load_json
+from dpmjax.cli import localize, map2d, program
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from tests.cli.test_slam import run, table
 from tests.cli.test_slam_fuzz import leave_networks_out
 from tests.data_sets import write_pcd
@@ -62,10 +61,12 @@ def test_scans_of_a_bag_are_deskewed_by_their_times(tmp_path: Path, without_netw
     assert run(bag, "--deskew", "--topic", "/points", "-o", tmp_path / "a") == EXIT_OK
 
 
-@pytest.mark.parametrize("command", [slam, map2d])
-def test_a_topic_that_is_not_there_is_one_line(tmp_path: Path, scans, command, capsys: pytest.CaptureFixture) -> None:
+@pytest.mark.parametrize("command", ["slam", "map2d"])
+def test_a_topic_that_is_not_there_is_one_line(
+    tmp_path: Path, scans, command: str, capsys: pytest.CaptureFixture
+) -> None:
     bag = write_bag(tmp_path / "drive", "bag", scans)
-    assert program.main([command.NAME, str(bag), "--topic", "/none", "-o", str(tmp_path / "out")]) == EXIT_BAD_INPUT
+    assert program.main([command, str(bag), "--topic", "/none", "-o", str(tmp_path / "out")]) == EXIT_BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
     assert "no topic /none, it has /points (PointCloud2), /scan (LaserScan)" in line
     assert not (tmp_path / "out").exists()
@@ -73,7 +74,7 @@ def test_a_topic_that_is_not_there_is_one_line(tmp_path: Path, scans, command, c
 
 def test_map2d_reads_the_planar_scans_of_the_same_bag(tmp_path: Path, scans) -> None:
     bag = write_bag(tmp_path / "drive", "db3", scans)
-    sequence = map2d.read_scans(map2d.Config(data=bag, jump=2))
+    sequence = map2d.read_scans(map2d.Map2dOptions(data=bag, jump=2))
     assert len(sequence) == 3
     np.testing.assert_allclose(np.linalg.norm(sequence.points, axis=2)[:, 0], [3.0, 3.2, 3.4], rtol=1e-6)
-    assert localize.Config(map=bag, scans=bag, topic="/points").topic == "/points"
+    assert localize.LocalizeOptions(map=bag, scans=bag, topic="/points").topic == "/points"

@@ -8,7 +8,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dpmjax.cli import depth_errors
-from dpmjax.cli.depth import Config, read_images
+from dpmjax.cli.depth import DepthOptions, read_images
 from dpmjax.geometry import rigid
 from dpmjax.sequences import DepthSequence, InputError
 
@@ -46,10 +46,10 @@ def test_a_blank_image_is_named(tmp_path) -> None:
     for name, depth_mm in (("1", 2000), ("2", 0), ("3", 2000)):
         Image.fromarray(np.full((48, 64), depth_mm, np.uint16)).save(tmp_path / f"{name}.depth.png")
     with pytest.raises(InputError, match=r"2\.depth\.png: no pixel measures up to .* leave out such images, 1 of 3"):
-        read_images(Config(data=tmp_path))
+        read_images(DepthOptions(data=tmp_path))
 
 
 def test_a_folder_without_images_is_refused_and_a_selection_is_taken(tmp_path) -> None:
     with pytest.raises(InputError, match="0 .depth.png files"):
-        read_images(Config(data=tmp_path))
-    assert len(read_images(Config(n_scans=2, jump=2))) == 2
+        read_images(DepthOptions(data=tmp_path))
+    assert len(read_images(DepthOptions(n_scans=2, jump=2))) == 2

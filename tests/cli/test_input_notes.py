@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.cli.result_files import load_json
-from dpmjax.cli.slam_numbers import run_status, why_failed
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json
+from dpmjax.cli.slam_numbers import status_of, why_failed
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from tests.cli.test_slam import run
@@ -64,20 +63,19 @@ def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found:
 
 
 @pytest.mark.parametrize(
-    ("statuses", "num_unknown_along", "is_interrupted", "status"),
+    ("statuses", "num_unknown_along", "status"),
     [
-        ({"first": 1, "tracked": 9}, 0, False, "done"),
-        ({"first": 1, "tracked": 9}, 4, False, "done"),
-        ({"first": 1, "tracked": 9}, 6, False, "uncertain"),
-        ({"first": 1, "tracked": 1, "predicted": 9}, 0, False, "uncertain"),
-        ({"empty": 3}, 0, False, "failed"),
-        ({"empty": 3}, 0, True, "interrupted"),
+        ({"first": 1, "tracked": 9}, 0, "done"),
+        ({"first": 1, "tracked": 9}, 4, "done"),
+        ({"first": 1, "tracked": 9}, 6, "uncertain"),
+        ({"first": 1, "tracked": 1, "predicted": 9}, 0, "uncertain"),
+        ({"empty": 3}, 0, "failed"),
     ],
 )
-def test_run_status_a_run(statuses: dict[str, int], num_unknown_along: int, is_interrupted: bool, status: str) -> None:
+def test_the_status_follows_from_the_scans(statuses: dict[str, int], num_unknown_along: int, status: str) -> None:
     numbers = {"scan_statuses": statuses, "num_unknown_along": num_unknown_along}
-    assert run_status({**numbers, "num_parts": 1}, is_interrupted) == status
-    assert run_status({**numbers, "num_parts": 2}, is_interrupted) == ("uncertain" if status == "done" else status)
+    assert status_of({**numbers, "num_parts": 1}) == status
+    assert status_of({**numbers, "num_parts": 2}) == ("uncertain" if status == "done" else status)
 
 
 def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(

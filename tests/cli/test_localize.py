@@ -11,14 +11,13 @@ import pytest
 
 import dpmjax
 from dpmjax.cli import localize
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.program import main
-from dpmjax.cli.result_files import load_json, read_history
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json
 from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.geometry import rigid
 from dpmjax.io import open_lidar_sequence, read_poses
 from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods
-from tests.data_sets import write_kitti_sequence
+from tests.data_sets import run_in, write_kitti_sequence
 from tests.deeppointmap import toy
 
 # T_lidar_camera: the camera looks along its z axis.
@@ -83,7 +82,7 @@ def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, wi
     assert "5 of 6 scans found" in printed
     assert "these weights are not calibrated" in printed
     table = out / "localizations.csv"
-    rows = read_history(table)
+    rows = run_in(out).read_table(table.name)
     assert [row["scan"] for row in rows] == list(map(str, range(6)))
     metrics = load_json(out / "metrics.json")
     assert metrics["num_inside"] == 6
@@ -101,7 +100,7 @@ def test_every_scan_gets_a_row_and_a_resumed_run_equals_an_unbroken_one(case, wi
     cut = text.splitlines(keepends=True)
     table.write_text("".join(cut[:4]) + cut[4][:9])
     assert run("--resume", "-o", out) == EXIT_OK
-    without_time = [{**row, "seconds": ""} for row in read_history(table)]
+    without_time = [{**row, "seconds": ""} for row in run_in(out).read_table(table.name)]
     assert without_time == [{**row, "seconds": ""} for row in rows]
 
 

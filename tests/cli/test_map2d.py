@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from dpmjax.cli.command import Interrupted, run_command
-from dpmjax.cli.map2d import NAME, Config, fit_settings, main
+from dpmjax.cli.map2d import Map2dOptions, fit_settings, main
+from dpmjax.cli.run import Run, run_command
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
@@ -46,7 +46,7 @@ def scans_npz(walk, tmp_path_factory) -> Path:
     ("preset", "unit", "expected"), [("paper", "px", 512.0), ("paper", "m", None), ("fast", "px", None)]
 )
 def test_unit_of_the_fit_is_that_of_the_worlds_of_the_paper(walk, preset, unit, expected) -> None:
-    assert fit_settings(Config(preset=preset), replace(walk, unit=unit)).unit == expected
+    assert fit_settings(Map2dOptions(preset=preset), replace(walk, unit=unit)).unit == expected
 
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
@@ -55,9 +55,9 @@ def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProces
     if interrupt:
         code = (
             "import os, signal; from dpmjax.cli import recorded_fit as fit, map2d as m;"
-            "from dpmjax.cli.command import run_command;"
-            "fit.show_progress = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
-            "raise SystemExit(run_command(m.main, m.Config, name=m.NAME, description=None))"
+            "from dpmjax.cli.run import run_command;"
+            "fit.FitRecorder._show = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
+            "raise SystemExit(run_command(m.main, name='map2d', description=None))"
         )
         command = ["-c", code]
     return subprocess.run(
@@ -133,8 +133,8 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
         return register_scans(*options, **hooks)  # type: ignore[arg-type]
 
     monkeypatch.setattr("dpmjax.registration2d.register_scans", interrupted)
-    with pytest.raises(Interrupted):
-        main(Config(data=scans_npz, init="zero", output=tmp_path / "out"))
+    arguments = [str(scans_npz), "--init", "zero", "-o", str(tmp_path / "out")]
+    assert run_command(main, name="map2d", description=None, args=arguments) == 130
     found = metrics_of(tmp_path / "out")
     assert found["status"] == "interrupted"
     assert (found["steps"], found["kept"]) == (0, "zero poses")
@@ -170,7 +170,7 @@ def refused(tmp_path: Path, capsys, *options: object) -> str:
     """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
     out = tmp_path / "out"
     arguments = [*map(str, options), "-o", str(out)]
-    code = run_command(main, Config, name=NAME, description=None, args=arguments)
+    code = run_command(main, name="map2d", description=None, args=arguments)
     error = capsys.readouterr().err.strip()
     assert code == 2, error
     assert not out.exists()
@@ -184,7 +184,8 @@ def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch)
     astray = np.random.default_rng(0).normal(size=(24, 3)) * [200.0, 200.0, 1.0]
     drive = replace(drive, odometry_poses=astray)
     monkeypatch.setattr("dpmjax.cli.map2d.read_scans", lambda _config: drive)
-    found = main(Config(steps=2, output=tmp_path / "out"))
+    options = Map2dOptions(steps=2, output=tmp_path / "out")
+    found = main(options, Run("map2d", options))
     assert found["start"] == "odometry"
     assert found["kept"] == "incremental ICP, point to line, refined"
     assert found["assessment"]["is_trusted"]
@@ -241,8 +242,8 @@ def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys
 )
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        Config(**options)
+        Map2dOptions(**options)
 
 
 def test_a_resumed_run_has_data_and_start_of_its_own() -> None:
-    assert Config(resume=True, topic="/scan", ordered=False).resume
+    assert Map2dOptions(resume=True, topic="/scan", ordered=False).resume

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.program import main
-from dpmjax.cli.register import confidence_numbers, motion_text
-from dpmjax.cli.result_files import load_json
+from dpmjax.cli.register import verdict_numbers
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json
 from dpmjax.io import read_lidar_file
 from dpmjax.types import Registration
 from tests.data_sets import read_ply, write_pcd
@@ -53,16 +52,8 @@ def test_files_hold_the_motion_that_the_library_finds(files, tmp_path, capsys) -
     assert "maps points of a.pcd to the frame of b.npy" in printed
     # The network is untrained, so its score is no probability.
     assert metrics["is_calibrated"] is False
-    assert "score of the matches (these weights are not calibrated)" in printed
+    assert "(these weights are not calibrated)" in printed
     assert "probability" not in printed
-
-
-@pytest.mark.parametrize(("confidence", "is_sure"), [(0.5, False), (0.95, True)])
-def test_a_calibrated_confidence_is_a_probability_with_a_limit(confidence: float, is_sure: bool) -> None:
-    metrics = {"source": "a", "target": "b", "translation_m": 1.0, "rotation_deg": 2.0, "confidence": confidence}
-    *_, last = motion_text(np.eye(4), {**metrics, "is_calibrated": True}).splitlines()
-    assert last.startswith(f"probability that it is right within 2 m and 5 degrees: {confidence:.2f}")
-    assert ("NOT SURE" not in last) == is_sure
 
 
 @pytest.mark.parametrize(
@@ -121,6 +112,8 @@ def test_a_folder_is_no_scan(files, tmp_path, capsys) -> None:
     ("num_inliers", "confidence", "is_calibrated", "status"),
     [(9, 0.95, True, "done"), (9, 0.5, True, "uncertain"), (9, 0.5, False, "done"), (0, 0.95, True, "failed")],
 )
-def test_the_status_follows_from_the_confidence(num_inliers, confidence, is_calibrated, status) -> None:
+def test_status_and_verdict_follow_from_the_confidence(num_inliers, confidence, is_calibrated, status) -> None:
     found = Mock(spec=Registration, verification=None, num_inliers=num_inliers, confidence=confidence)
-    assert confidence_numbers(found, is_calibrated)["status"] == status
+    numbers = verdict_numbers(found, is_calibrated)
+    assert numbers["status"] == status
+    assert ("NOT SURE" in numbers["verdict"]) == (status == "uncertain")

@@ -13,7 +13,7 @@ import pytest
 
 from dpmjax import model_preset
 from dpmjax.cli import slam, slam_files
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.io import write_kitti, write_ply, write_tum
 from dpmjax.slam import Match, Proposal, SlamConfig, SlamMethods, SurfaceGeometry
 from tests.cli.test_slam import run

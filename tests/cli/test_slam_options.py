@@ -11,10 +11,9 @@ import pytest
 
 import dpmjax
 from dpmjax.cli import slam
-from dpmjax.cli.command import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, with_raised_beams
-from dpmjax.cli.info import why_not_importable
-from dpmjax.cli.result_files import load_json
+from dpmjax.cli.machine import why_not_importable
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, slam_preset
@@ -92,13 +91,13 @@ def test_deskewing_and_odometry_alone_are_options(room, tmp_path) -> None:
 
 def test_options_of_odometry_and_loops_reach_the_settings(room) -> None:
     _, weights = room
-    given = slam.slam_methods(slam.Config(weights=str(weights), odometry="network", no_loop=True))
+    given = slam.slam_methods(slam.SlamOptions(weights=str(weights), odometry="network", no_loop=True))
     assert given.config.odometry.proposer == "network"
     assert not given.config.loops.is_on
     # Those of the geometry and of the matcher are the same.
     assert given.geometry.config is given.config.odometry
-    assert slam.slam_methods(slam.Config(weights=str(weights))).config == SlamConfig()
-    paper = slam.slam_methods(slam.Config(weights=str(weights), preset="paper", no_loop=True)).config
+    assert slam.slam_methods(slam.SlamOptions(weights=str(weights))).config == SlamConfig()
+    paper = slam.slam_methods(slam.SlamOptions(weights=str(weights), preset="paper", no_loop=True)).config
     assert paper == replace(slam_preset("paper"), loops=given.config.loops)
 
 

@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 
 from dpmjax.cli import train_preparation, train_run
-from dpmjax.cli.command import run_command
-from dpmjax.cli.result_files import read_history
-from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY, RunFolder
-from dpmjax.cli.train import NAME, Config, for_devices, main, training_settings
+from dpmjax.cli.run import CHECKPOINTS, HISTORY, run_command
+from dpmjax.cli.train import TrainOptions, for_devices, main, training_settings
 from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
@@ -40,6 +38,7 @@ from dpmjax.deeppointmap.training.loop import Speed, after_evaluation
 from dpmjax.deeppointmap.training.objective import ObjectiveTerms
 from dpmjax.metrics.poses import registration_recall
 from dpmjax.weights import load_model
+from tests.data_sets import run_in
 from tests.deeppointmap import toy
 
 TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
@@ -60,16 +59,14 @@ BOTH = replace(TRAINING, stages=("registration", "overlap"), overlap=OverlapConf
 """Four steps of each stage."""
 
 
-def train_both(folder: Path, *, stop_after: int = 99, is_resumed: bool = False):
-    folder.mkdir(exist_ok=True)
-    records = Records(RunFolder(folder, is_resumed), BOTH, Selection(None, "the last step"), seed=0)
+def train_both(folder: Path, *, stop_after: int = 99):
+    records = Records(run_in(folder), BOTH, Selection(None, "the last step"), seed=0)
     return run_training(records, toy.store(), BOTH, TrainingHooks(stop=StopAfter(stop_after)), seed=0)
 
 
-def train(folder: Path, *, stop_after: int = 99, is_resumed: bool = False, total_s: float = math.inf):
-    folder.mkdir(exist_ok=True)
+def train(folder: Path, *, stop_after: int = 99, total_s: float = math.inf):
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
-    records = Records(RunFolder(folder, is_resumed), TRAINING, Selection(pairs, "a toy"), seed=0)
+    records = Records(run_in(folder), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
 
@@ -89,7 +86,7 @@ def assert_same_run(parts, folder: Path, whole) -> None:
     """Parameters and history bit for bit, but for the seconds."""
     toy.assert_trees_equal(parts.progress, whole[0].progress)
     toy.assert_trees_equal(parts.model.params, whole[0].model.params)
-    rows = [read_history(where / HISTORY) for where in (whole[1], folder)]
+    rows = [run_in(where).read_table(HISTORY) for where in (whole[1], folder)]
     for one, other in zip(*rows, strict=True):
         assert {**one, "run_s": ""} == {**other, "run_s": ""}
 
@@ -100,25 +97,25 @@ def test_a_broken_off_run_goes_on_with_the_numbers_of_an_unbroken_one(tmp_path: 
     # Before the first step, before and after the first recall.
     assert num_steps(whole[0]) == TRAINING.num_steps
     assert num_steps(train(tmp_path, stop_after=num_before)) == num_before
-    assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
+    assert_same_run(train(tmp_path), tmp_path, whole)
 
 
 @pytest.mark.slow
 def test_the_second_stage_goes_on_where_it_was_broken_off_and_has_rows_of_its_own(tmp_path: Path) -> None:
     whole = train_both(tmp_path / "whole")
     assert whole.model.config.trained == ("registration", "overlap")
-    rows = read_history(tmp_path / "whole" / HISTORY)
+    rows = run_in(tmp_path / "whole").read_table(HISTORY)
     assert [(row["step"], row["stage"]) for row in rows[3:5]] == [("4", "K=2"), ("5", "overlap")]
     assert len(rows) == 8
     assert all(float(row["overlap_loss"]) > 0 for row in rows[4:])
     broken = train_both(tmp_path / "parts", stop_after=6)
     assert (broken.stopped_by, broken.model.config.trained) == (1, ("registration",))
-    assert len(read_history(tmp_path / "parts" / HISTORY)) == 6
-    resumed = train_both(tmp_path / "parts", is_resumed=True)
+    assert len(run_in(tmp_path / "parts").read_table(HISTORY)) == 6
+    resumed = train_both(tmp_path / "parts")
     assert resumed.stopped_by == 0
     toy.assert_trees_equal((resumed.progress.state, resumed.overlap), (whole.progress.state, whole.overlap))
     toy.assert_trees_equal(resumed.model.params, whole.model.params)
-    again = read_history(tmp_path / "parts" / HISTORY)
+    again = run_in(tmp_path / "parts").read_table(HISTORY)
     assert [{**row, "run_s": ""} for row in again] == [{**row, "run_s": ""} for row in rows]
 
 
@@ -140,12 +137,12 @@ def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path
     found = Evaluation(recalls, (), (known, known), toy.cloud(np.zeros((1, 3))))
     monkeypatch.setattr(train_run.dpm, "evaluate_registration", lambda model, pairs: found)
     nothing, one = draw_evaluation_pairs(toy.drive(), 1, toy.MODEL, kinds=KINDS[:1]), np.ones(())
-    records = Records(RunFolder(tmp_path, False), TRAINING, Selection(nothing, "a toy"), seed=0)
+    records = Records(run_in(tmp_path), TRAINING, Selection(nothing, "a toy"), seed=0)
     report = TrainingReport(one, ObjectiveTerms(one, one, one, one, np.ones((), int)), one, one)
     with records:
         for step, score in ((1, math.nan), (2, records.evaluate(records.untrained))):
             records.on_report(StepRecord(step, TRAINING.stage_at(step), report, score, Speed()), records.start)
-    between, evaluated = read_history(tmp_path / HISTORY)
+    between, evaluated = run_in(tmp_path).read_table(HISTORY)
     r2 = measure_offsets([known]).r2
     assert r2[1] == 1 > r2[0] > r2[2]
     np.testing.assert_allclose([float(evaluated[name]) for name in train_run.OFFSETS], r2, rtol=1e-5)
@@ -162,7 +159,7 @@ def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, 
     for file in saved[-1].rglob("*"):
         if file.is_file() and file.stat().st_size > 100:
             file.write_bytes(file.read_bytes()[:50])
-    assert_same_run(train(tmp_path, is_resumed=True), tmp_path, whole)
+    assert_same_run(train(tmp_path), tmp_path, whole)
     assert "checkpoint 3 cannot be read" in caplog.text
 
 
@@ -205,48 +202,48 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
 )
 def test_options_out_of_range_are_refused(options, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Config(**options)
+        TrainOptions(**options)
 
 
 def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:
-    settings = training_settings(Config(groups=(8, 16, 8), steps=60))
+    settings = training_settings(TrainOptions(groups=(8, 16, 8), steps=60))
     assert [(stage.max_group, stage.num_steps) for stage in settings.curriculum] == [(8, 20), (16, 20), (8, 20)]
 
 
 def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_groups() -> None:
-    settings = training_settings(Config(scans=96, groups=(32,)))
+    settings = training_settings(TrainOptions(scans=96, groups=(32,)))
     assert settings.sampling.num_scans == 96
     assert max(settings.layout_at(step, seed=0).num_scans for step in range(20)) == 96
     with pytest.raises(ValueError, match="num_scans: expected at least the largest group, 4, got 3"):
-        training_settings(Config(scans=3, groups=(4,)))
+        training_settings(TrainOptions(scans=3, groups=(4,)))
 
 
 def test_the_paper_trains_for_epochs_and_options_have_its_values_as_defaults() -> None:
-    paper = training_settings(Config(preset="paper"))
+    paper = training_settings(TrainOptions(preset="paper"))
     assert (paper.num_epochs, paper.num_variants, paper.refines_labels) == (12, 0, False)
-    assert training_settings(Config(preset="paper", steps=500)).num_epochs is None
-    changed = training_settings(Config(preset="paper", epochs=3, variants=2, refine_labels=True))
+    assert training_settings(TrainOptions(preset="paper", steps=500)).num_epochs is None
+    changed = training_settings(TrainOptions(preset="paper", epochs=3, variants=2, refine_labels=True))
     assert (changed.num_epochs, changed.num_variants, changed.refines_labels) == (3, 2, True)
     assert for_devices(changed, 1000).num_steps == 3000 // jax.device_count()
 
 
 def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert training_settings(Config(scans=96)).scans_at_once == training_preset("tiny").scans_at_once
+    assert training_settings(TrainOptions(scans=96)).scans_at_once == training_preset("tiny").scans_at_once
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert training_settings(Config(scans=96)).scans_at_once == 96
+    assert training_settings(TrainOptions(scans=96)).scans_at_once == 96
 
 
 @pytest.mark.slow
 def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(tmp_path: Path) -> None:
     weights = load_model("dpm_small")
-    settings = training_settings(Config(weights="dpm_small"), weights)
+    settings = training_settings(TrainOptions(weights="dpm_small"), weights)
     assert settings.model == replace(weights.config, calibration=None, overlap=None, trained=())
-    assert settings.learning_rate == pytest.approx(0.2 * training_settings(Config()).learning_rate)
+    assert settings.learning_rate == pytest.approx(0.2 * training_settings(TrainOptions()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
     pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
     sets = Selection(pairs, "a toy")
-    with Records(RunFolder(tmp_path, False), TRAINING, sets, seed=0, weights=some) as records:
+    with Records(run_in(tmp_path), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)
         toy.assert_trees_equal(records.untrained.params, some.params)
         assert int(records.start.state.step) == 0
@@ -268,7 +265,7 @@ def refused(tmp_path: Path, capsys, *options: object) -> str:
     """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
     out = tmp_path / "out"
     arguments = [*map(str, options), *(() if "-o" in options else ("-o", str(out)))]
-    code = run_command(main, Config, name=NAME, description=None, args=arguments)
+    code = run_command(main, name="train", description=None, args=arguments)
     error = capsys.readouterr().err.strip()
     assert code == 2, error
     assert not out.exists()
@@ -307,19 +304,19 @@ def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, capsys) -> 
 def test_a_training_ends_after_its_seconds_at_the_end_of_its_cosine(tmp_path: Path) -> None:
     """The first step compiles and the second one shows the pace: then no second is left."""
     train(tmp_path, total_s=0.01)
-    rows = read_history(tmp_path / HISTORY)
+    rows = run_in(tmp_path).read_table(HISTORY)
     assert len(rows) == 3 < TRAINING.num_steps
     assert np.all(np.diff([float(row["run_s"]) for row in rows]) > 0)
-    trained = train(tmp_path, is_resumed=True, total_s=3600.0)
+    trained = train(tmp_path, total_s=3600.0)
     assert num_steps(trained) == 3
 
 
 @pytest.mark.slow
 def test_a_resumed_training_that_finishes_takes_a_quarter_of_its_steps(tmp_path: Path) -> None:
     train(tmp_path, stop_after=2)
-    trained = train(tmp_path, is_resumed=True, total_s=0.0)
+    trained = train(tmp_path, total_s=0.0)
     assert num_steps(trained) == int(trained.progress.state.end) == 3
-    rates = [float(row["learning_rate"]) for row in read_history(tmp_path / HISTORY)]
+    rates = [float(row["learning_rate"]) for row in run_in(tmp_path).read_table(HISTORY)]
     assert rates[2] == pytest.approx(1e-5 + (1e-3 - 1e-5) * (1 + math.cos(math.pi * 0.5)) / 2, rel=1e-4)
 
 
@@ -331,7 +328,7 @@ def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path, monkeypatch) -
     monkeypatch.setattr(Records, "save", full)
     with pytest.raises(OSError, match="No space left"):
         train(tmp_path, stop_after=1)
-    assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1"]
+    assert [row["step"] for row in run_in(tmp_path).read_table(HISTORY)] == ["1"]
 
 
 def broken_drive() -> None:

@@ -15,8 +15,7 @@ import pytest
 from optax.tree_utils import tree_get
 
 from dpmjax.checkpoints import Checkpoints
-from dpmjax.cli.result_files import read_history
-from dpmjax.cli.run_folder import CHECKPOINTS, HISTORY
+from dpmjax.cli.run import CHECKPOINTS, HISTORY, read_history
 from dpmjax.deeppointmap import (
     CurriculumStage,
     SampleMaker,
@@ -40,8 +39,8 @@ join_processes(coordinator, 2, number)
 from dpmjax.deeppointmap import TrainingHooks, draw_evaluation_pairs
 from dpmjax.cli.train_run import KINDS, Selection
 from dpmjax.cli.train_run import Records, run_training
-from dpmjax.cli.run_folder import RunFolder
-from dpmjax.cli.command import Interrupted, StopFlag
+from dpmjax.cli.run import RunFolder
+from dpmjax.cli.run import Interrupted, StopFlag
 from pathlib import Path
 from tests.deeppointmap import toy
 from tests.cli.test_train_processes import TRAINING

@@ -1,53 +1,63 @@
-"""Curves: phases of a fit in order, gaps left out, axes that suit the values; times and memory by size."""
+"""Curves: phases in order, gaps left out, axes that suit the values; reliability by bins."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from dpmjax.viz import history_figure, save_figure
+from dpmjax import viz
 
 
-def example(num_records=30):
-    seconds = np.linspace(0.0, 6.0, num_records)
-    ate = np.full(num_records, np.nan)
+def test_phases_are_named_once_in_order_and_wide_values_get_a_logarithmic_axis():
+    seconds, ate = np.linspace(0.0, 6.0, 30), np.full(30, np.nan)
     ate[::5] = 100.0 * np.exp(-seconds[::5])
-    phase = ["L-Net"] * 10 + ["free poses"] * (num_records - 11) + ["polish"]
-    return seconds, 1.0 / (1.0 + seconds), phase, ate
+    phases = ["L-Net"] * 10 + ["free poses"] * 19 + ["polish"]
+    curves = {"loss": 1.0 / (1.0 + seconds), "ATE, px": ate}
+    first, second = viz.curves_figure(seconds, curves, x_label="run time, s", phases=phases).axes
+    assert [text.get_text() for text in first.texts] == ["L-Net", "free poses", "polish"]
+    assert len(first.patches) == len(second.patches) == 3
+    assert (first.get_yscale(), second.get_yscale()) == ("linear", "log")
+    np.testing.assert_array_equal(second.lines[0].get_xdata(), seconds[::5])
+    assert second.get_xlabel() == "run time, s"
 
 
-def test_phases_are_named_once_in_order():
-    figure = history_figure(*example(), "px")
-    names = [text.get_text() for text in figure.axes[0].texts]
-    assert names == ["L-Net", "free poses", "polish"]
-    assert len(figure.axes[0].lines) == 3
+def test_training_curves_leave_out_what_was_not_measured():
+    steps, loss, recall = np.arange(100), np.linspace(2.0, 1.0, 100), np.full(100, np.nan)
+    recall[[0, 50]] = [0.1, 0.6]
+    rows = viz.curves_figure(steps, {"loss": loss, "recall": recall}).axes
+    assert [axes.get_ylabel() for axes in rows] == ["loss", "recall"]
+    np.testing.assert_array_equal(rows[1].lines[0].get_xydata(), [[0, 0.1], [50, 0.6]])
+    # The running mean of a straight line is that line, away from its ends.
+    np.testing.assert_allclose(rows[0].lines[1].get_ydata()[5:-5], loss[5:-5])
 
 
-def test_ate_joins_the_measured_records_and_ends_with_its_value():
-    seconds, *columns = example()
-    axes = history_figure(seconds, *columns, "px").axes[1]
-    np.testing.assert_array_equal(axes.lines[0].get_xdata(), seconds[::5])
-    assert axes.texts[-1].get_text() == "0.567 px"
-    assert axes.get_ylabel() == "ATE (px)"
-
-
-def test_wide_positive_values_get_a_logarithmic_axis():
-    loss_axes, ate_axes = history_figure(*example(), "m").axes
-    assert loss_axes.get_yscale() == "linear"
-    assert ate_axes.get_yscale() == "log"
-
-
-def test_without_reference_there_is_one_panel():
-    seconds, loss, phase, _ = example()
-    assert len(history_figure(seconds, loss, phase, np.full(30, np.nan), "m").axes) == 1
-
-
-def test_a_single_record_and_missing_losses_still_give_a_picture(tmp_path):
-    figure = history_figure(np.zeros(1), np.full(1, np.nan), ["polish"], np.ones(1), "px")
-    save_figure(figure, tmp_path / "loss.png", dpi=50)
+def test_a_single_record_without_a_loss_gives_a_picture_and_other_lengths_are_refused(tmp_path):
+    viz.save_figure(viz.curves_figure([0.0], {"loss": [np.nan]}, phases=["polish"]), tmp_path / "loss.png", dpi=50)
     assert (tmp_path / "loss.png").stat().st_size > 1000
+    for curves in ({}, {"loss": [1.0, 2.0]}):
+        with pytest.raises(ValueError, match="expected one or more steps"):
+            viz.curves_figure([0.0], curves)
 
 
-def test_columns_of_different_lengths_are_refused():
-    with pytest.raises(ValueError, match=r"\[3, 3, 2, 3\]"):
-        history_figure(np.zeros(3), np.zeros(3), ["a", "b"], np.zeros(3), "px")
+def test_reliability_puts_each_bin_at_its_means():
+    figure = viz.reliability_figure(np.array([0.05, 0.05, 0.93, 0.97]), [False, True, True, True], title="t")
+    x, y = figure.axes[0].lines[1].get_data()
+    np.testing.assert_allclose(x, [0.05, 0.95])
+    np.testing.assert_allclose(y, [0.5, 1.0])
+    assert "4 pairs" in figure.axes[0].get_title()
+    assert viz.reliability_figure([], [], title="t").axes
+
+
+def test_figure_14_marks_the_ends_of_both_forms():
+    x = np.linspace(-6.0, 6.0, 101)
+    visited = np.array([3.0, 1.0, -1.4]), np.array([5.0, 2.0, -23.0])
+    figure = viz.toy_figure((x, x**2), (x, np.cos(x)), visited=visited, direct_end=(3.4, 1.0), network_end_z=0.7)
+    (axes,) = figure.axes
+    drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
+    np.testing.assert_array_equal(drawn["L(x)"], np.stack([x, x**2], -1))
+    np.testing.assert_array_equal(drawn["x visited by the network"], np.stack(visited, -1))
+    np.testing.assert_array_equal(drawn["direct descent ends"], [[3.4, 1.0]])
+    np.testing.assert_array_equal(drawn["x* = f(z*)"], [[-1.4, -23.0]])
+    np.testing.assert_array_equal(drawn["z* of the network"], [[0.7, -23.0]])
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == list(drawn)
+    assert axes.get_xlim() == (-6.0, 6.0)

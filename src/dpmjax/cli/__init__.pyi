@@ -65,7 +65,7 @@ from .slam_files import accepted_ends as accepted_ends
 from .slam_files import count_meetings as count_meetings
 from .slam_files import gather_map as gather_map
 from .slam_files import loop_rows as loop_rows
-from .slam_files import map_track as map_track
+from .slam_files import map_layers as map_layers
 from .slam_files import open_map as open_map
 from .slam_files import require_same_weights as require_same_weights
 from .slam_files import write_loops as write_loops

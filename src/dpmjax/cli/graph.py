@@ -59,10 +59,10 @@ def main(options: GraphOptions, run: Run) -> Numbers:
     io.write_tum(run / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
     title = f"{options.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
     tracks = [
-        viz.Track(f"before, chi2 {found.chi2_initial:.4g}", positions(graph.poses)),
-        viz.Track(f"optimised, chi2 {found.chi2:.4g}", positions(poses)),
+        viz.Track(positions(graph.poses), viz.ODOMETRY, f"before, chi2 {found.chi2_initial:.4g}"),
+        viz.Track(positions(poses), viz.PATH, f"optimised, chi2 {found.chi2:.4g}"),
     ]
-    viz.save_figure(viz.trajectory_figure(title, tracks, None, np.zeros((0, 2, 3))), run / "trajectory.png")
+    viz.save_figure(viz.trajectory_figure(title, tracks), run / "trajectory.png")
     num_let_go = int((found.weights < LET_GO).sum())
     verdict = f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations"
     verdict += f", {num_let_go} edges let go" if num_let_go else ""

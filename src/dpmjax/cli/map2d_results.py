@@ -181,18 +181,19 @@ def draw_map(
 ) -> viz.Limits:
     """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
     scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
-    panels = []
+    poses, anchor = {}, None
     titles = dict(zip(result.candidates, numbers["candidates"], strict=True))
     shown = dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept))
     for name in [name for name in shown if name in result.candidates]:
         title, found, is_kept = titles[name], numbers["candidates"][titles[name]], name == result.kept
         ate, distance = found.get(f"ate_{unit}"), found.get(f"point_distance_{unit}")
-        title = title[0].upper() + title[1:] + (" (kept)" if is_kept else "")
-        is_anchor = is_kept and reference is None
-        panels.append(viz.Panel(title, scans, result.candidates[name].poses, ate, distance, is_anchor))
+        title = title[0].upper() + title[1:] + (" (kept)" if is_kept else "") + "\n"
+        errors = {"ATE": ate, "points": distance}.items()
+        title += "   ".join(f"{name} {viz.format_length(e, unit)}" for name, e in errors if e is not None)
+        poses[title], anchor = result.candidates[name].poses, title if is_kept else anchor
     if reference is not None:
-        panels.append(viz.Panel("Reference", scans, reference, is_reference=True))
-    figure = viz.registered_scans_figure(panels, unit)
+        poses["Reference\n"], anchor = reference, None
+    figure = viz.registered_scans_figure(scans, poses, unit, anchor=anchor)
     viz.save_figure(figure, run / "map.png")
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 

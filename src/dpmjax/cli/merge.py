@@ -58,7 +58,7 @@ def main(options: MergeOptions, run: Run) -> Numbers:
     parts = len(merged.maps)
     title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
     panels = [panel_of(options.maps, merged, part) for part in range(parts)]
-    viz.save_figure(viz.agents_figure(title, panels), run / "map.png")
+    viz.save_figure(viz.figure(panels, title=title), run / "map.png")
     return numbers
 
 
@@ -115,24 +115,25 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
     return {"verdict": merge_text(numbers), **numbers}
 
 
-def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.AgentPanel:
+def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.Panel:
     """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
     members = [number for number, component in enumerate(merged.component) if component == part]
     ends = cli.accepted_ends(merged.loops)
     ends = ends[np.isin(merged.joined.map_of_keyframe[ends[:, 0]], members)]
     is_joined = len(members) > 1
     text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
-    tracks = [track_of(paths[number], merged, number) for number in members]
-    return viz.AgentPanel(text, tracks, merged.joined.slam_map.T_world_keyframe[ends, :3, 3])
+    layers = [layer for number in members for layer in layers_of(paths[number], merged, number)]
+    loops = merged.joined.slam_map.T_world_keyframe[ends, :3, 3]
+    return viz.Panel(text, [*layers, viz.Edges(loops, viz.INK, "loops between them")])
 
 
-def track_of(path: Path, merged: slam.MergedMaps, number: int) -> viz.AgentTrack:
+def layers_of(path: Path, merged: slam.MergedMaps, number: int) -> list[viz.Layer]:
     """Returns the keyframes of a map and the points of their surfaces, in its colour."""
     slam_map = merged.joined.slam_map
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
     cloud = cli.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
-    return cli.map_track(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
+    return cli.map_layers(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 
 def merge_text(metrics: Numbers) -> str:

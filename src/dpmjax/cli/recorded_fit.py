@@ -116,5 +116,6 @@ def draw_loss(run: Run, unit: str) -> None:
         seconds, loss, ate = (
             np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
         )
-        figure = viz.history_figure(seconds, loss, [row["phase"] for row in rows], ate, unit)
+        curves = {"loss": loss} | ({f"ATE, {unit}": ate} if np.isfinite(ate).any() else {})
+        figure = viz.curves_figure(seconds, curves, x_label="run time, s", phases=[row["phase"] for row in rows])
         viz.save_figure(figure, run / "loss.png")

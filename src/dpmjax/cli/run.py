@@ -20,6 +20,7 @@ import json
 import logging
 import math
 import os
+import re
 import shutil
 import signal
 import sys
@@ -401,9 +402,10 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
             raise
     finally:
         os.environ.pop("COLUMNS", None) if width is None else os.environ.update(COLUMNS=width)
-    # tyro draws a box: a title, the message, a line, and help.
-    rows = [row.strip("│ ") for row in box.getvalue().splitlines() if row.startswith("│")]
-    message = " ".join(itertools.takewhile(lambda row: not row.startswith("──"), rows))
+    # tyro draws a box: a line with the title, the message, a line across, and help.
+    rows = (row[2:].strip("│ ") for row in re.sub("\x1b[^m]*m", "", box.getvalue()).splitlines()[1:])
+    is_text = lambda row: bool(row.strip(" ─-"))  # noqa: E731
+    message = " ".join(itertools.takewhile(is_text, itertools.dropwhile(lambda row: not is_text(row), rows)))
     raise ValueError(f"{message.rstrip('.') or 'wrong options'}; --help describes the options")
 
 

@@ -17,6 +17,8 @@ from dpmjax.sequences import LidarSequence, counted
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
+# Points below this height above the lidar are the ground.
+GROUND_M = -1.0
 LOOP_CELLS = ("found_by", "status", "overlap", "probability", "rmse_m")
 SCAN_COLUMNS = (
     "scan", "status", "is_keyframe", "keyframe_scan", "score", "probability", "weak_sigma_m", "num_accepted", "reason",
@@ -89,10 +91,11 @@ def count_meetings(joined: slam.JoinedMaps) -> list[tuple[list[int], int]]:
     return [(list(pair), number) for pair, number in sorted(Counter(map(tuple, pairs.tolist())).items())]
 
 
-def map_track(label: str, number: int, T_world_scan: np.ndarray, cloud: Cloud) -> viz.AgentTrack:
-    """Returns the trajectory and the points of one of several maps in its colour."""
-    color = viz.COLORS[number % len(viz.COLORS)]
-    return viz.AgentTrack(label, color, T_world_scan[:, :3, 3], None, cloud.points, cloud.heights_m)
+def map_layers(label: str, number: int, T_world_scan: np.ndarray, cloud: Cloud) -> list[viz.Layer]:
+    """Returns the points above the ground and the trajectory of one of several maps in its colour."""
+    color = viz.AGENTS[number % len(viz.AGENTS)]
+    points = viz.Points(cloud.points[cloud.heights_m > GROUND_M], color)
+    return [points, viz.Track(T_world_scan[:, :3, 3], color, label)]
 
 
 def write_scans(
@@ -176,10 +179,10 @@ def draw_pictures(
     # Odometry alone begins where the drive begins, also in a map that was there before.
     odometry = T[0] @ geometry.rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
     reference, ends = sequence.T_world_lidar, accepted_ends(result.loops)
-    tracks = [_track("odometry alone", odometry, reference)] if len(ends) else []
+    tracks = [_track("odometry alone", viz.ODOMETRY, odometry, reference)] if len(ends) else []
     if num_old:
-        tracks = [viz.Track("the map before", slam_map.T_world_keyframe[:num_old, :3, 3]), *tracks]
-    tracks.append(_track("SLAM", T, reference))
+        tracks = [viz.Track(slam_map.T_world_keyframe[:num_old, :3, 3], viz.INK, "the map before", "--"), *tracks]
+    tracks.append(_track("SLAM", viz.PATH, T, reference))
     shown, known = None, sequence.has_reference
     if reference is not None and known.any():
         positions = reference[known, :3, 3]
@@ -194,10 +197,10 @@ def draw_pictures(
     viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
 
 
-def _track(name: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> viz.Track:
+def _track(name: str, color: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> viz.Track:
     errors = distances_to_reference(T_world_scan, reference)
     label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.3f} m"
-    return viz.Track(label, T_world_scan[:, :3, 3], errors)
+    return viz.Track(T_world_scan[:, :3, 3], color, label)
 
 
 def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:

@@ -240,15 +240,17 @@ def write_ply(path: str | Path, points: ArrayLike, *, colors: ArrayLike | None =
     Raises:
         ValueError: another shape.
     """
-    groups = {"points": ("float", ("x", "y", "z"), np.asarray(points, "<f4"))}
+    columns = {"points": np.asarray(points, "<f4")}
     if colors is not None:
-        groups["colors"] = ("uchar", ("red", "green", "blue"), np.asarray(colors, np.uint8))
-    shape = (len(groups["points"][2]), 3)
-    records = np.empty(shape[0], [(name, values.dtype, 3) for name, (_, _, values) in groups.items()])
-    for name, (_, _, values) in groups.items():
-        if values.shape != shape:
-            raise ValueError(f"{name} must be {shape}, got {values.shape}")
+        columns["colors"] = np.asarray(colors, np.uint8)
+    count = len(columns["points"])
+    for name, values in columns.items():
+        if values.shape != (count, 3):
+            raise ValueError(f"{name} must be ({count}, 3), got {values.shape}")
+    records = np.empty(count, [(name, values.dtype, 3) for name, values in columns.items()])
+    for name, values in columns.items():
         records[name] = values
-    lines = [f"property {kind} {axis}" for kind, axes, _ in groups.values() for axis in axes]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {shape[0]}", *lines, "end_header", ""]
+    properties = [f"property float {axis}" for axis in "xyz"]
+    properties += [f"property uchar {color}" for color in ("red", "green", "blue") if colors is not None]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
     return write_atomically(path, "\n".join(header).encode() + records.tobytes())

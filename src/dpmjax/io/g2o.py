@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dpmjax.io.files import is_number, read_lines, refusing, write_atomically
@@ -23,44 +22,40 @@ from dpmjax.sequences import FloatArray, InputError, homogeneous, require
 
 
 class _Tag(NamedTuple):
-    """A kind of line.
-
-    Attributes:
-        num_nodes: 1 for a vertex, 2 for an edge.
-        pose_size: numbers of its pose: x y heading, x y z roll pitch yaw, or x y z qx qy qz qw.
-        triangle: rows and columns of the information matrix, in the order of its numbers.
-    """
+    """A kind of line: number of nodes, and of the numbers of its pose and of its information matrix."""
 
     num_nodes: int
     pose_size: int
-    triangle: tuple[NDArray[np.int64], NDArray[np.int64]] = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    information_size: int = 0
 
     @property
-    def tangent_size(self) -> int:
-        """Degrees of freedom of the pose."""
-        return 3 if self.pose_size == 3 else 6
+    def is_planar(self) -> bool:
+        """True for x, y, heading; else x y z and roll pitch yaw, or a quaternion."""
+        return self.pose_size == 3
 
 
 class _Line(NamedTuple):
     """A vertex or an edge: its line in the file, tag, nodes and numbers."""
 
-    number: int
+    source: str
     tag: str
     nodes: list[int]
     values: list[float]
 
 
-# Four tags of g2o, then four of TORO. Its EDGE2 has xx xy yy, then heading heading, x heading, y heading.
+# Four tags of g2o, then four of TORO.
 _TAGS = {
     "VERTEX_SE2": _Tag(1, 3),
     "VERTEX_SE3:QUAT": _Tag(1, 7),
-    "EDGE_SE2": _Tag(2, 3, np.triu_indices(3)),
-    "EDGE_SE3:QUAT": _Tag(2, 7, np.triu_indices(6)),
+    "EDGE_SE2": _Tag(2, 3, 6),
+    "EDGE_SE3:QUAT": _Tag(2, 7, 21),
     "VERTEX2": _Tag(1, 3),
     "VERTEX3": _Tag(1, 6),
-    "EDGE2": _Tag(2, 3, (np.array([0, 0, 1, 2, 0, 1]), np.array([0, 1, 1, 2, 2, 2]))),
-    "EDGE3": _Tag(2, 6, np.triu_indices(6)),
+    "EDGE2": _Tag(2, 3, 6),
+    "EDGE3": _Tag(2, 6, 21),
 }
+# TORO's EDGE2 has xx xy yy, then heading heading, x heading, y heading; iSAM's the upper triangle.
+_TORO_ORDER = [0, 1, 4, 2, 5, 3]
 # EQUIV marks nodes that TORO may collapse on request; their edges stand in the file, too.
 _IGNORED = ("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET", "EQUIV")
 _LARGEST_NUMBER = 1e75  # Squared and weighted errors of larger numbers overflow.
@@ -83,8 +78,9 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
     A file of edges alone gets poses along a spanning tree; `optimize_pose_graph` also tries the chordal relaxation.
 
     Args:
-        path: the file: VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO). Empty
-            lines, lines with # in front and sensor offsets (PARAMS_...) and EQUIV lines are ignored.
+        path: the file: VERTEX and EDGE lines of SE2 or SE3:QUAT (g2o), or VERTEX2, EDGE2, VERTEX3, EDGE3 (TORO; EDGE2
+            of iSAM, too). Empty lines, lines with # in front and sensor offsets (PARAMS_...) and EQUIV lines are
+            ignored.
         nearest_psd: replaces an information matrix that is not positive semidefinite by the nearest one that is.
 
     Returns:
@@ -95,138 +91,118 @@ def read_g2o(path: str | Path, *, nearest_psd: bool = False) -> PoseGraph:
             file. Also a repeated or missing node, and invalid poses or information matrices. The message names line and
             edge.
     """
-    lines, fixed = _read_lines(path)
-    _check_nodes(path, lines)
-    vertices = [line for line in lines if _TAGS[line.tag].num_nodes == 1]
-    edge_lines = [line for line in lines if _TAGS[line.tag].num_nodes == 2]
-    require(len(lines) > 0, path, "no vertices and no edges", _READ)
-    if vertices:
-        ids = np.array([line.nodes[0] for line in vertices], np.int64)
-    else:
-        ids = np.unique([node for line in edge_lines for node in line.nodes])
-    row_of = {int(node): row for row, node in enumerate(ids)}
-    for number, node in [*fixed, *((line.number, node) for line in edge_lines for node in line.nodes)]:
-        require(node in row_of, f"{path}: line {number}", f"node {node} has no vertex", "add its VERTEX line")
-    size = _TAGS[lines[0].tag].tangent_size
+    lines = _read_lines(path)
+    vertices, edge_lines, fixed = (
+        [line for line in lines if (line.tag == "FIX", len(line.nodes)) == kind]
+        for kind in ((False, 1), (False, 2), (True, 1))
+    )
+    require(len(vertices) + len(edge_lines) > 0, path, "no vertices and no edges", _READ)
+    ids = sorted({node for line in edge_lines for node in line.nodes}) if not vertices else []
+    row_of = {node: row for row, node in enumerate(ids)}
+    for line in vertices:
+        found = f"node {line.nodes[0]} has a vertex in an earlier line, too"
+        require(row_of.setdefault(line.nodes[0], len(row_of)) == len(row_of) - 1, line.source, found, "give it once")
+    for line in edge_lines + fixed:
+        missing = next((node for node in line.nodes if node not in row_of), None)
+        require(missing is None, line.source, f"node {missing} has no vertex", "add its VERTEX line")
+        found = f"an edge from node {line.nodes[0]} to itself"
+        require(line.tag == "FIX" or line.nodes[0] != line.nodes[1], line.source, found, "remove it")
     target, source = np.array([[row_of[node] for node in line.nodes] for line in edge_lines], np.int64).reshape(-1, 2).T
-    measurements, information = _poses(path, edge_lines, size), _information(path, edge_lines, size, nearest_psd)
-    edges, poses = Edges(source, target, measurements, information), _poses(path, vertices, size)
+    is_planar = _TAGS[(vertices + edge_lines)[0].tag].is_planar
+    information = _information(edge_lines, 3 if is_planar else 6, nearest_psd)
+    edges, poses = Edges(source, target, _poses(edge_lines, is_planar), information), _poses(vertices, is_planar)
     with refusing(path, "{error}", "mend the file", (ValueError,)):
-        is_fixed = np.zeros(len(ids), bool)
-        is_fixed[[row_of[node] for _, node in fixed]] = True
-        poses = poses if vertices else spanning_tree_poses(len(ids), edges)
-        return PoseGraph.create(poses, edges, is_fixed=is_fixed, ids=ids)
+        is_fixed = np.isin(list(row_of), [line.nodes[0] for line in fixed])
+        poses = poses if vertices else spanning_tree_poses(len(row_of), edges)
+        return PoseGraph.create(poses, edges, is_fixed=is_fixed, ids=np.array(list(row_of), np.int64))
 
 
-def _check_nodes(path: str | Path, lines: list[_Line]) -> None:
-    """Refuses a second vertex of a node, and an edge from a node to itself."""
-    line_of: dict[int, int] = {}
-    for line in lines:
-        source, node = f"{path}: line {line.number}", line.nodes[0]
-        if len(line.nodes) == 1:
-            found = f"node {node} has a vertex in line {line_of.get(node)}, too"
-            require(line_of.setdefault(node, line.number) == line.number, source, found, "give every node once")
-        else:
-            require(node != line.nodes[1], source, f"an edge from node {node} to itself", "remove it")
-
-
-def _read_lines(path: str | Path) -> tuple[list[_Line], list[tuple[int, int]]]:
-    """Reads vertices and edges in the order of the file, and the nodes after FIX, each with its line."""
+def _read_lines(path: str | Path) -> list[_Line]:
+    """Reads vertices, edges, and a line for each node after FIX, in the order of the file."""
     lines: list[_Line] = []
-    fixed: list[tuple[int, int]] = []
+    first = None
     for number, text in enumerate(read_lines(path), 1):
         tag, *words = text.split() or ["#"]
+        source = f"{path}: line {number}"
         if tag.startswith("#") or tag in _IGNORED:
             continue
-        source = f"{path}: line {number}"
         if tag == "FIX":
             with refusing(source, "{error}", "give the numbers of nodes after FIX", (ValueError,)):
-                fixed += [(number, int(word)) for word in words]
+                lines += [_Line(source, tag, [int(word)], []) for word in words]
             continue
         advice = next((advice for parts, advice in _OTHER_TAGS.items() if any(part in tag for part in parts)), _READ)
         require(tag in _TAGS, source, f"'{tag[:40]}' is not read here", advice)
-        if lines and _TAGS[lines[0].tag].tangent_size != _TAGS[tag].tangent_size:
-            found = f"'{tag}' is not read here, line {lines[0].number} is '{lines[0].tag}'"
-            raise InputError(source, found, "give a graph in the plane, or one in space")
-        lines.append(_parse(source, number, tag, words))
-    return lines, fixed
+        first = first or tag
+        found = f"'{tag}' is not read here, the first line is '{first}'"
+        is_same = _TAGS[first].is_planar == _TAGS[tag].is_planar
+        require(is_same, source, found, "give a graph in the plane, or one in space")
+        lines.append(_parse(source, tag, words))
+    return lines
 
 
-def _parse(source: str, number: int, tag: str, words: list[str]) -> _Line:
+def _parse(source: str, tag: str, words: list[str]) -> _Line:
     """Parses a vertex or an edge from the words after its tag."""
-    num_nodes, pose_size, triangle = _TAGS[tag]
-    count = num_nodes + pose_size + len(triangle[0])
+    num_nodes, pose_size, information_size = _TAGS[tag]
+    count = num_nodes + pose_size + information_size
     found = f"{len(words)} values after {tag}"
     if len(words) == num_nodes + pose_size != count:
         found += ", the information matrix is missing"
     require(len(words) == count, source, found, f"give {count} values")
-    try:
-        nodes, values = [int(word) for word in words[:num_nodes]], [float(word) for word in words[num_nodes:]]
-    except ValueError as error:
-        kinds = [int] * num_nodes + [float] * (count - num_nodes)
-        wrong = next(i for i, (word, kind) in enumerate(zip(words, kinds, strict=True)) if not is_number(word, kind))
-        what = "a whole number" if wrong < num_nodes else "a number"
-        found = f"column {wrong + 2}, {words[wrong][:40]!r}, is not {what}"
-        raise InputError(source, found, "write plain numbers, with a decimal point") from error
+    kinds: list[type[int | float]] = [int] * num_nodes + [float] * (count - num_nodes)
+    for column, (word, kind) in enumerate(zip(words, kinds, strict=True), 2):
+        found = f"column {column}, {word[:40]!r}, is not a{' whole' * (kind is int)} number"
+        require(is_number(word, kind), source, found, "write plain numbers, with a decimal point")
+    nodes, values = [int(word) for word in words[:num_nodes]], [float(word) for word in words[num_nodes:]]
     is_small = max(map(abs, nodes)) <= np.iinfo(np.int64).max
     require(is_small, source, "a node number above 2^63", "number the nodes from 0")
-    return _Line(number, tag, nodes, values)
+    wrong = next((value for value in values[:pose_size] if not abs(value) < _LARGEST_NUMBER), None)
+    found = f"expected finite numbers below {_LARGEST_NUMBER:g}, got {wrong}"
+    require(wrong is None, source, found, "mend the line")
+    is_unit = pose_size != 7 or abs(float(np.linalg.norm(np.clip(values[3:7], -2, 2))) - 1) <= 0.1
+    require(is_unit, source, "a quaternion that is not of length 1", "mend the line")
+    if pose_size == 6:
+        values[3:6] = Rotation.from_euler("ZYX", values[5:2:-1]).as_quat().tolist()
+    return _Line(source, tag, nodes, values)
 
 
-def _by_tag(lines: list[_Line]) -> Iterable[tuple[_Tag, NDArray[np.int64], FloatArray]]:
-    """Yields the numbers of the lines of each tag, with their indices among all lines."""
-    for tag in dict.fromkeys(line.tag for line in lines):
-        places = np.array([place for place, line in enumerate(lines) if line.tag == tag])
-        yield _TAGS[tag], places, np.array([lines[place].values for place in places])
+def _poses(lines: list[_Line], is_planar: bool) -> FloatArray:
+    """Returns the poses of vertices or edges, (n, 3) or (n, 4, 4)."""
+    size = 3 if is_planar else 7
+    values = np.array([line.values[:size] for line in lines]).reshape(-1, size)
+    if is_planar or not lines:
+        return values if is_planar else np.zeros((0, 4, 4))
+    return homogeneous(Rotation.from_quat(values[:, 3:]).as_matrix(), values[:, :3])
 
 
-def _poses(path: str | Path, lines: list[_Line], size: int) -> FloatArray:
-    """Returns the poses of vertices or edges, (n, 3) or (n, 4, 4), in the order of the file."""
-    poses = np.zeros((len(lines), 3) if size == 3 else (len(lines), 4, 4))
-    for tag, places, values in _by_tag(lines):
-        numbers = values[:, : tag.pose_size]
-        is_finite: NDArray[np.bool_] = np.asarray((np.abs(numbers) < _LARGEST_NUMBER).all(axis=1))
-        lengths = np.linalg.norm(np.clip(numbers[:, 3:], -2, 2), axis=1)
-        is_good = is_finite & ((tag.pose_size != 7) | (np.abs(lengths - 1) <= 0.1))
-        if not is_good.all():
-            row = int(np.argmin(is_good))
-            found = "a quaternion that is not of length 1"
-            if not is_finite[row]:
-                wrong = numbers[row][~(np.abs(numbers[row]) < _LARGEST_NUMBER)][0]
-                found = f"expected finite numbers below {_LARGEST_NUMBER:g}, got {wrong:g}"
-            raise InputError(f"{path}: line {lines[places[row]].number}", found, "mend the line")
-        if tag.pose_size == 3:
-            poses[places] = numbers
-        else:
-            angles, quaternions, is_euler = numbers[:, [5, 4, 3]], numbers[:, 3:], tag.pose_size == 6
-            turns = Rotation.from_euler("ZYX", angles) if is_euler else Rotation.from_quat(quaternions)
-            poses[places] = homogeneous(turns.as_matrix(), numbers[:, :3])
-    return poses
+def _information(lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray:
+    """Returns the information matrices (e, size, size)."""
+    rows, columns = np.triu_indices(size)
+    values = np.array([line.values[-len(rows) :] for line in lines]).reshape(-1, len(rows))
 
+    def as_matrices(values: FloatArray) -> FloatArray:
+        matrices = np.zeros((len(values), size, size))
+        matrices[:, rows, columns] = matrices[:, columns, rows] = values
+        return matrices
 
-def _information(path: str | Path, lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray:
-    """Returns the information matrices in the order of the file."""
-    matrices = np.zeros((len(lines), size, size))
-    for tag, places, values in _by_tag(lines):
-        rows, columns = tag.triangle
-        places, numbers = places[:, None], values[:, tag.pose_size :]
-        matrices[places, rows, columns] = matrices[places, columns, rows] = numbers
-    is_small = np.abs(matrices.reshape(len(lines), size * size)) < _LARGEST_NUMBER
-    is_finite: NDArray[np.bool_] = np.asarray(is_small.all(axis=1))
-    is_good = np.zeros(len(lines), bool)
+    is_finite = np.asarray((np.abs(values) < _LARGEST_NUMBER).all(axis=1))
+    is_edge2 = np.array([line.tag == "EDGE2" for line in lines], bool)
+    toro = values[is_edge2][:, _TORO_ORDER] if is_edge2.any() else values[is_edge2]
+    is_isam = not is_semidefinite(as_matrices(toro[is_finite[is_edge2]])).all()
+    if not is_isam or not is_semidefinite(as_matrices(values[is_edge2 & is_finite])).all():
+        values[is_edge2] = toro
+    matrices, is_good = as_matrices(values), is_finite.copy()
     is_good[is_finite] = is_semidefinite(matrices[is_finite])
     if nearest_psd:
         matrices[is_finite & ~is_good] = nearest_semidefinite(matrices[is_finite & ~is_good])
         is_good = is_finite
-    if not is_good.all():
-        place = int(np.argmin(is_good))
+    for row in np.flatnonzero(~is_good)[:1]:
         why, advice = "not finite, or huge", f"give finite numbers below {_LARGEST_NUMBER:g}"
-        if is_finite[place]:
-            least = float(np.linalg.eigvalsh(matrices[place])[0])
+        if is_finite[row]:
+            least = float(np.linalg.eigvalsh(matrices[row])[0])
             why = f"not positive semidefinite, its least eigenvalue is {least:.4g}"
             advice = "mend it, or take the nearest such matrix (--nearest-psd)"
-        found = f"the information of edge {lines[place].nodes[0]} {lines[place].nodes[1]} is {why}"
-        raise InputError(f"{path}: line {lines[place].number}", found, advice)
+        found = f"the information of edge {lines[row].nodes[0]} {lines[row].nodes[1]} is {why}"
+        raise InputError(lines[row].source, found, advice)
     return matrices
 
 

@@ -40,7 +40,6 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 _MAP_FRAMES = ("map", "world", "earth")
 # Odometry may end this long before or after a scan, s, for this share of the scans at least.
 _SLACK_S, _LEAST_SHARE = 0.2, 0.9
-_SAME_POSE = 1e-9  # Largest difference of the numbers of poses that count as the same.
 _KINDS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError)
 
 
@@ -62,7 +61,7 @@ class _Motion(NamedTuple):
     @property
     def is_constant(self) -> bool:
         """True for a mounting, also where it is published again and again."""
-        return float(np.ptp(self.T_parent_child, axis=0).max()) < _SAME_POSE
+        return float(np.ptp(self.T_parent_child, axis=0).max()) < 1e-9
 
 
 def is_bag(path: Path) -> bool:
@@ -115,8 +114,8 @@ class _Bag:
         require(topic is None or len(named) > 0, self.path, found, "name one of those with --topic")
         fitting = [name for name in self.of_kinds(kinds) if name in named]
         others = (advice for others, advice in _OTHER_KINDS.items() if {types[name] for name in named} & set(others))
-        advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
         found = f"no {what}{'' if topic is None else f' in topic {topic}'}; its topics are {held}"
+        advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
         require(len(fitting) > 0, self.path, found, advice)
         found = f"{len(fitting)} topics of {what}: {', '.join(fitting)}"
         require(len(fitting) == 1, self.path, found, "name one with --topic")
@@ -169,8 +168,8 @@ def _refusing_bag(path: Path) -> Any:
 def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
     """Reads the planar scans of a bag.
 
-    The odometry is that of the transforms (/tf) up to the odometry frame, or of the only topic of Odometry. A laser
-    with a pose on the robot in /tf_static gets its own poses. Beams of a laser mounted upside down are mirrored.
+    The odometry is that of the only topic of Odometry; without such a topic, that of the transform (/tf) that moves. A
+    laser with a constant pose on the robot gets its own poses. Beams of a laser mounted upside down are mirrored.
 
     Args:
         path: a bag, see `is_bag`.
@@ -264,46 +263,34 @@ def _transforms(bag: _Bag) -> dict[str, _Motion]:
 def _odometry(bag: _Bag, frame: str, times: FloatArray) -> tuple[FloatArray | None, bool, tuple[Note, ...]]:
     """Computes the odometry of the laser: the motion of the robot after the chain of constant transforms to the laser.
 
-    The motion of the robot is that of the transforms where they have the times of the scans, else that of the only
-    topic of Odometry.
-
     Returns:
         T_odom_laser at the times of the scans, None where the bag has no odometry; True where the laser is upside down;
         and notes.
     """
     motions, T_top_laser, top = _transforms(bag), np.eye(4), frame
-    is_upside_down = frame in motions and bool(np.median(motions[frame].T_parent_child[:, 2, 2]) < 0)
     for _ in range(len(motions)):  # transforms may form a circle
         if top in motions and motions[top].is_constant and motions[top].parent not in _MAP_FRAMES:
             T_top_laser, top = motions[top].T_parent_child[0] @ T_top_laser, motions[top].parent
-    found, what = motions.get(top), f"odometry of the transforms to {frame}"
-    above = None if found is None else motions.get(found.parent)
-    if (
-        found
-        and above
-        and not (found.is_constant or above.is_constant or {found.parent, above.parent} & {*_MAP_FRAMES})
-    ):
-        text = f"{bag.path}: {top} moves in {found.parent}, and this in {above.parent}; such odometry is not used"
-        return None, is_upside_down, (Note(text, is_doubt=True),)
-    if found is None or found.is_constant or found.parent in _MAP_FRAMES or not _covers(found.times, times):
-        topics = bag.of_kinds(_ODOMETRY)
-        names = ", ".join(topics)
-        if len(topics) != 1:
-            text = f"{bag.path}: {len(topics)} topics of odometry ({names}), none is used"
-            return None, is_upside_down, (Note(text, is_doubt=True),) if topics else ()
-        poses = [(_stamp_of(message), message.pose.pose) for message in bag.messages(names)]
+    topics, moving = bag.of_kinds(_ODOMETRY), motions.get(top)
+    above = motions.get(moving.parent) if moving else None
+    is_chain = above is not None and not above.is_constant and above.parent not in _MAP_FRAMES
+    if len(topics) == 1 and not is_chain:
+        what = f"odometry of {topics[0]}"
+        poses = [(_stamp_of(message), message.pose.pose) for message in bag.messages(topics[0])]
         found = _motion_of("odom", [(stamp, _pose_of(pose.position, pose.orientation)) for stamp, pose in poses])
-        what = f"odometry of {names}"
-    if not _covers(found.times, times):
+    elif moving is not None and not (is_chain or moving.is_constant or moving.parent in _MAP_FRAMES):
+        found, what = moving, f"odometry of the transforms to {frame}"
+    else:
+        text = (
+            f"{bag.path}: no odometry, of {len(topics)} topics ({', '.join(topics)}) and moving transforms to {frame}"
+        )
+        return None, bool(T_top_laser[2, 2] < 0), (Note(text, is_doubt=True),) if topics or is_chain else ()
+    is_near = (times >= found.times[0] - _SLACK_S) & (times <= found.times[-1] + _SLACK_S)
+    if len(found.times) < 2 or is_near.mean() < _LEAST_SHARE:
         text = f"{bag.path}: the {what} is not of the times of the scans; it is not used"
-        return None, is_upside_down, (Note(text, is_doubt=True),)
+        return None, bool(T_top_laser[2, 2] < 0), (Note(text, is_doubt=True),)
     T = np.asarray(interpolate_poses(found.times, found.T_parent_child, times) @ T_top_laser)
     return T, bool(np.median(T[:, 2, 2]) < 0), (Note(f"{bag.path}: {what}"),)
-
-
-def _covers(times: FloatArray, wanted: FloatArray) -> bool:
-    is_near = (wanted >= times[0] - _SLACK_S) & (wanted <= times[-1] + _SLACK_S)
-    return len(times) > 1 and float(is_near.mean()) >= _LEAST_SHARE
 
 
 def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:

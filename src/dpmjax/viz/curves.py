@@ -1,4 +1,4 @@
-"""Curves: a fit over its run time, a training over its steps, the reliability of a confidence."""
+"""Curves: values over steps or seconds, the reliability of a confidence, the toy of DeepMapping (figure 14)."""
 
 from __future__ import annotations
 
@@ -9,151 +9,86 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz import figures
-from dpmjax.viz.figures import ACCENT, FRAME, INK, MUTED
+from dpmjax.viz.figures import FRAME, INK, MUTED, PATH, WRONG
 
-Floats = NDArray[np.floating]
-
-PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
-LOSS_COLOR = "#30638e"
-RATIO_FOR_LOG_AXIS = 10.0
-_FEW_DECADES = 2
-SMOOTHED_PART = 0.03
-NUM_BINS = 10
+_PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
+_LEAST_RATIO_OF_LOG_AXIS = 10.0
+_NUM_BINS = 10
+_SOURCE, _VISITED, _DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
 
 
-def history_figure(seconds: Floats, loss: Floats, names: Sequence[str], ate: Floats, unit: str) -> Figure:
-    """Draws loss and ATE over run time, the phases of the fit shaded and named.
+def curves_figure(
+    x: ArrayLike, curves: Mapping[str, ArrayLike], *, x_label: str = "step", phases: Sequence[str] | None = None
+) -> Figure:
+    """Draws each curve in a row of its own; NaN is left out, and many values get a running mean.
 
-    The loss line breaks between phases, because each phase has an objective of its own. A value axis is logarithmic
-    where all its values are positive and span more than a factor of ten.
+    An axis is logarithmic where all its values are positive and span more than a factor of ten.
 
     Args:
-        seconds: (k,) run time of each record of the fit, never decreasing, compile time left out.
-        loss: (k,) value of the phase's own objective; NaN where there is none.
-        names: (k,) name of the phase of each record ("L-Net", "free poses", "polish").
-        ate: (k,) absolute trajectory error, NaN where not measured.
-        unit: unit of the ATE.
+        x: (k,) numbers of steps, or seconds; never decreasing.
+        curves: (k,) values by name.
+        x_label: label of x.
+        phases: (k,) name of the phase of each value; phases are shaded and named.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: no record, or columns of different lengths.
+        ValueError: if there is no value, no curve, or a curve of another length.
     """
-    lengths = [len(column) for column in (seconds, loss, names, ate)]
-    if len(set(lengths)) != 1 or lengths[0] == 0:
-        raise ValueError(f"expected one or more records and columns of one length; got lengths {lengths}")
-
-    is_known = np.isfinite(ate)
-    has_ate = bool(is_known.any())
-    figure = figures.new_figure(8.0, 5.2 if has_ate else 3.0)
-    rows = figure.subplots(2 if has_ate else 1, 1, sharex=True, squeeze=False)[:, 0]
-    phases = _phases(names)
-    for axes in rows:
-        for number, phase in enumerate(phases):
-            begin, end = seconds[max(0, phase.start - 1)], seconds[phase.stop - 1]
-            axes.axvspan(begin, end, color=PHASE_COLORS[number % len(PHASE_COLORS)], linewidth=0, zorder=0)
-    for phase in phases:
-        _draw_line(rows[0], seconds[phase], loss[phase], LOSS_COLOR)
-    _finish_value_axis(rows[0], loss, "loss")
-    if has_ate:
-        _draw_line(rows[1], seconds[is_known], ate[is_known], ACCENT)
-        _finish_value_axis(rows[1], ate, f"ATE ({unit})")
-        last = seconds[is_known][-1], ate[is_known][-1]
-        style: Any = {"va": "center", "fontsize": 9, "color": ACCENT, "annotation_clip": False}
-        rows[1].annotate(figures.format_length(last[1], unit), last, xytext=(7, 0), textcoords="offset points", **style)
-    _name_phases(rows[0], phases, names, seconds)
-    rows[-1].set_xlabel("run time (s)", color=INK)
-    first, last = seconds[0], seconds[-1]
-    rows[-1].set_xlim(first, last if last > first else first + 1.0)
-    top, bottom = (0.93, 0.1) if has_ate else (0.89, 0.17)
-    figure.subplots_adjust(left=0.12, right=0.9, top=top, bottom=bottom, hspace=0.08)
-    return figure
-
-
-def _phases(names: Sequence[str]) -> list[slice]:
-    """Returns the records of each phase, runs of equal names; it lasts from the last record before to its own last."""
-    borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
-    return [slice(first, last) for first, last in itertools.pairwise(borders)]
-
-
-def _name_phases(axes: Axes, phases: Sequence[slice], names: Sequence[str], seconds: Floats) -> None:
-    """Writes the names above the first row; a name that would run into its left neighbour moves right of it."""
-    first, last = seconds[0], seconds[-1]
-    taken_until = 0.0
-    for phase in phases:
-        name, begin = names[phase.start], seconds[max(0, phase.start - 1)]
-        start = max((begin - first) / max(last - first, 1e-9), taken_until)
-        style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 9.5, "color": MUTED}
-        axes.annotate(name, (start, 1), xytext=(2, 5), **style)
-        taken_until = start + 0.0135 * (len(name) + 2)
-
-
-def _draw_line(axes: Axes, seconds: Floats, values: Floats, color: str) -> None:
-    # A phase of one record has no line: it shows as a dot.
-    axes.plot(seconds, values, "-" if len(seconds) > 1 else "o", color=color, linewidth=1.6, markersize=4, zorder=3)
-
-
-def _finish_value_axis(axes: Axes, values: Floats, label: str) -> None:
-    known = values[np.isfinite(values)]
-    if len(known) and known.min() > 0.0 and known.max() > RATIO_FOR_LOG_AXIS * known.min():
-        axes.set_yscale("log")
-        _label_log_axis(axes, known)
-    axes.set_ylabel(label, color=INK)
-    axes.grid(axis="y", color=FRAME, linewidth=0.6, zorder=1)
-    axes.tick_params(which="both", colors=MUTED, labelsize=9, length=3)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(FRAME)
-
-
-def _label_log_axis(axes: Axes, values: Floats) -> None:
-    # Plain numbers at powers of ten; over few decades also at 2 and 5 times these. Other ticks have no label.
-    is_short = values.max() < RATIO_FOR_LOG_AXIS**_FEW_DECADES * values.min()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,), numticks=8))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def curves_figure(steps: ArrayLike, curves: Mapping[str, ArrayLike]) -> Figure:
-    """Draws each curve over the steps in a row of its own; NaN is left out.
-
-    Args:
-        steps: numbers of the steps.
-        curves: one value for each step, by name.
-
-    Returns:
-        The figure.
-
-    Raises:
-        ValueError: if there is no step, no curve, or a curve of another length.
-    """
-    x = np.asarray(steps, np.float64)
+    at = np.asarray(x, np.float64)
     values = {name: np.asarray(curve, np.float64) for name, curve in curves.items()}
-    if len(x) == 0 or not values or any(len(curve) != len(x) for curve in values.values()):
-        raise ValueError(f"expected one or more steps and curves as long; got {len(x)} steps, {len(values)} curves")
-    figure = figures.new_figure(8.0, 1.0 + 1.5 * len(values), layout="tight")
+    if len(at) == 0 or not values or any(len(curve) != len(at) for curve in values.values()):
+        raise ValueError(f"expected one or more steps and curves as long; got {len(at)} steps, {len(values)} curves")
+    figure = Figure((8.0, 1.0 + 1.5 * len(values)), facecolor="white", layout="tight")
     rows = figure.subplots(len(values), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, curve) in zip(rows, values.items(), strict=True):
         is_known = np.isfinite(curve)
-        many = int(is_known.sum()) > 40
-        style: dict[str, Any] = {"alpha": 0.3} if many else {"marker": "."}
-        axes.plot(x[is_known], curve[is_known], color=LOSS_COLOR, lw=1, **style)
+        known = curve[is_known]
+        is_dense = len(known) > 40
+        many = is_dense and phases is None
+        style: dict[str, Any] = {"alpha": 0.3 if many else 1.0, "marker": "" if is_dense else "."}
+        axes.plot(at[is_known], known, color=PATH, lw=1, **style)
         if many:
-            axes.plot(x[is_known], _smoothed(curve[is_known]), color=LOSS_COLOR, lw=1.6)
-        figures.style_axes(axes, "step" if axes is rows[-1] else "", name)
+            axes.plot(at[is_known], _smoothed(known), color=PATH, lw=1.6)
+        if len(known) and known.min() > 0.0 and known.max() > _LEAST_RATIO_OF_LOG_AXIS * known.min():
+            axes.set_yscale("log")
+        _label_axes(axes, x_label if axes is rows[-1] else "", name)
+        _shade_phases(axes, at, phases or [], is_named=axes is rows[0])
     return figure
 
 
-def _smoothed(values: Floats) -> Floats:
-    # Running mean over a small part of the curve; at the ends, of the values that are there.
-    width = max(3, int(SMOOTHED_PART * len(values)))
-    ones = np.ones(width)
+def _shade_phases(axes: Axes, x: NDArray[np.float64], names: Sequence[str], *, is_named: bool) -> None:
+    """Shades runs of equal names; a name that would run into its left neighbour moves right of it."""
+    borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
+    taken_until = 0.0
+    for number, (first, last) in enumerate(itertools.pairwise(borders) if names else ()):
+        begin = x[max(0, first - 1)]
+        axes.axvspan(begin, x[last - 1], color=_PHASE_COLORS[number % len(_PHASE_COLORS)], lw=0, zorder=0)
+        if is_named:
+            start = max((begin - x[0]) / max(x[-1] - x[0], 1e-9), taken_until)
+            style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 9, "color": MUTED}
+            axes.annotate(names[first], (start, 1), xytext=(2, 4), **style)
+            taken_until = start + 0.0135 * (len(names[first]) + 2)
+
+
+def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Computes a running mean over a small part of the curve; at the ends, of the values that are there."""
+    ones = np.ones(max(3, len(values) // 33))
     return np.convolve(values, ones, "same") / np.convolve(np.ones_like(values), ones, "same")
+
+
+def _label_axes(axes: Axes, x_label: str, y_label: str) -> None:
+    """Adds labels, a light grid, small ticks and a thin frame."""
+    axes.set_xlabel(x_label, fontsize=9, color=INK)
+    axes.set_ylabel(y_label, fontsize=9, color=INK)
+    axes.grid(color=FRAME, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(which="both", colors=MUTED, labelsize=8)
+    for spine in axes.spines.values():
+        spine.set_color(FRAME)
 
 
 def reliability_figure(
@@ -175,18 +110,52 @@ def reliability_figure(
         The figure.
     """
     confidence, right = np.asarray(confidence, float), np.asarray(is_right, bool)
-    bins = np.minimum((confidence * NUM_BINS).astype(int), NUM_BINS - 1)
-    figure = figures.new_figure(4.6, 5.0, layout="tight")
+    bins = np.minimum((confidence * _NUM_BINS).astype(int), _NUM_BINS - 1)
+    figure = Figure((4.6, 5.0), facecolor="white", layout="tight")
     axes = figure.subplots()
-    figures.style_axes(axes, *labels)
+    _label_axes(axes, *labels)
     axes.plot([0, 1], [0, 1], color=MUTED, lw=1, ls="--", label="calibrated: share equals confidence")
-    counts = np.bincount(bins, minlength=NUM_BINS)
+    counts = np.bincount(bins, minlength=_NUM_BINS)
     used = counts > 0
-    x, y = (np.bincount(bins, values, NUM_BINS)[used] / counts[used] for values in (confidence, right))
-    axes.plot(x, y, "o-", color=ACCENT, lw=1.4, ms=4, label="measured, with the number of pairs")
+    x, y = (np.bincount(bins, values, _NUM_BINS)[used] / counts[used] for values in (confidence, right))
+    axes.plot(x, y, "o-", color=PATH, lw=1.4, ms=4, label="measured, with the number of pairs")
     for count, left, up in zip(counts[used], x, y, strict=True):
         axes.annotate(str(count), (left, up), xytext=(5, -10), textcoords="offset points", fontsize=7, color=MUTED)
     brier = float(np.mean((confidence - right) ** 2)) if len(right) else float("nan")
-    figures.set_title(axes, f"{title}\n{len(right)} pairs, Brier score {brier:.3f} (0: perfect)")
-    figures.add_legend(axes, columns=1, loc="upper center", bbox_to_anchor=(0.5, -0.13))
+    axes.set_title(f"{title}\n{len(right)} pairs, Brier score {brier:.3f} (0: perfect)", fontsize=10, color=INK)
+    axes.legend(loc="upper left", frameon=False, fontsize=8, labelcolor=MUTED)
+    return figure
+
+
+def toy_figure(
+    curve: tuple[ArrayLike, ArrayLike], converted: tuple[ArrayLike, ArrayLike], *, visited: tuple[ArrayLike, ArrayLike],
+    direct_end: tuple[float, float], network_end_z: float,
+) -> Figure:  # fmt: skip
+    """Draws DeepMapping figure 14.
+
+    Args:
+        curve: (k,) values of x, and L there.
+        converted: (m,) inputs of the fitted network, and L of its output there.
+        visited: x and L of the descent of the network form; its last entry is the end.
+        direct_end: x and L where the direct form ends.
+        network_end_z: the input of the network where the network form ends.
+
+    Returns:
+        The figure.
+    """
+    x, loss = map(np.asarray, curve)
+    network_end = tuple(float(np.asarray(values)[-1]) for values in visited)
+    figure = Figure((8.0, 4.6), facecolor="white", layout="tight")
+    axes = figure.add_subplot()
+    ends: dict[str, Any] = {"mec": "white", "ls": "none", "zorder": 6}
+    axes.plot(x, loss, color=INK, lw=1.2, label="L(x)", zorder=2)
+    axes.plot(*map(np.asarray, converted), "--", color=_SOURCE, lw=1.4, label="L(f(z)), fitted f")
+    axes.plot(*map(np.asarray, visited), "*", color=_VISITED, ms=7, mew=0, alpha=0.5, label="x visited by the network")
+    axes.plot(*direct_end, marker="o", color=_DIRECT, ms=9, label="direct descent ends", **ends)
+    axes.plot(network_end_z, network_end[1], marker="P", color=WRONG, ms=10, label="z* of the network", **ends)
+    axes.plot(*network_end, marker="o", color=WRONG, ms=9, label="x* = f(z*)", **ends)
+    _label_axes(axes, "x, or z for the dashed line", "L")
+    axes.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
+    axes.set_xlim(float(x.min()), float(x.max()))
+    axes.set_ylim(top=1.5 * float(loss.max()))
     return figure

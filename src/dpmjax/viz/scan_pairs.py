@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.viz import figures
-from dpmjax.viz.figures import ACCENT, INK, Limits
+from dpmjax.viz.figures import INK, WRONG, Edges, Layer, Panel, Points, Track, figure
 
 # These colours and black differ in lightness too, so that they differ in grey.
 SOURCE, TARGET = "#3a86c0", "#f0a840"
-# Points farther out than this share of them are outside of the picture.
-SHOWN_SHARE = 0.99
-GAP_IN, ABOVE_IN, BELOW_IN = 0.2, 0.65, 0.55
-_APART_M, _LOW_IN = 5.0, 4.2
+_APART_M = 5.0
+# Points farther out than this share of them do not set the distance of two scans side by side.
+_SHOWN_SHARE = 0.995
 # Most lines of matches of one kind; hundreds would hide the scans.
 _MAX_LINES = 30
 
@@ -47,28 +42,17 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
     """Draws pairs of scans from above, the source under each of the motions; cells with points of both scans are black.
 
     Args:
-        pairs: one row each; at least one.
+        pairs: one row each, with the same number of motions; at least one.
 
     Returns:
         The figure; the panels of a row have the same limits.
     """
-    limits = [_limits_of(pair) for pair in pairs]
-    sizes = [figures.size_in(each) for each in limits]
-    widths_in = [len(pair.motions) * (size[0] + GAP_IN) for pair, size in zip(pairs, sizes, strict=True)]
-    figure = figures.new_figure(max(widths_in) + GAP_IN, sum(size[1] + ABOVE_IN + BELOW_IN for size in sizes))
-    bottom_in = figure.get_figheight()
-    for pair, each, (panel_in, height_in) in zip(pairs, limits, sizes, strict=True):
-        bottom_in -= ABOVE_IN + height_in
-        for column, (label, T) in enumerate(pair.motions.items()):
-            left_in = GAP_IN + column * (panel_in + GAP_IN)
-            axes = figures.add_axes(figure, (left_in, bottom_in, panel_in, height_in))
-            entries = _draw_overlap(axes, pair, T, each)
-            figures.set_title(axes, label, loc="left")
-            if not column:
-                figures.annotate_corner(axes, pair.title, (0, 22), fontsize=11, fontweight="bold", color=INK)
-                figures.add_legend(axes, handles=entries, columns=len(entries))
-        bottom_in -= BELOW_IN
-    return figure
+    panels = [
+        Panel(f"{pair.title}\n{label}" if not column else f"\n{label}", _layers(pair, T))
+        for pair in pairs
+        for column, (label, T) in enumerate(pair.motions.items())
+    ]
+    return figure(panels, num_columns=max(len(pair.motions) for pair in pairs), is_shared=True)
 
 
 def matches_figure(
@@ -91,66 +75,29 @@ def matches_figure(
         np.asarray(x, np.float64)[:, :2] for x in (pair.source, pair.target, source_matched, target_matched)
     )
     right, ((label, T),) = np.asarray(is_right, bool), pair.motions.items()
-    a_corners, b_corners = np.concatenate([_corners(a), starts]), np.concatenate([_corners(b), ends])
-    apart = np.array([a_corners[:, 0].max(initial=0) - b_corners[:, 0].min(initial=0) + _APART_M, 0.0])
-    both = figures.plane_limits(np.concatenate([a_corners, b_corners + apart]), 0.03), _limits_of(pair)
-    widths_in = [_LOW_IN * limits.width / limits.height for limits in both]
-    figure = figures.new_figure(sum(widths_in) + 3 * GAP_IN, _LOW_IN + ABOVE_IN + BELOW_IN)
-    side_by_side = figures.add_axes(figure, (GAP_IN, BELOW_IN, widths_in[0], _LOW_IN))
-    overlaid = figures.add_axes(figure, (widths_in[0] + 2 * GAP_IN, BELOW_IN, widths_in[1], _LOW_IN))
-    figures.show_clouds(side_by_side, [a, b + apart], [SOURCE, TARGET], both[0])
+    end_of_a, start_of_b = (np.quantile(each[:, 0], q) for each, q in ((a, _SHOWN_SHARE), (b, 1 - _SHOWN_SHARE)))
+    apart = np.array([end_of_a - start_of_b + _APART_M, 0.0])
     lines = np.stack([starts, ends + apart], axis=1)
-    _draw_matches(side_by_side, lines[right], "right", INK, "-")
-    _draw_matches(side_by_side, lines[~right], "wrong", ACCENT, "--")
-    figures.frame_map(side_by_side, both[0], "m")
-    source, target, *others = _draw_overlap(overlaid, pair, T, both[1])
-    figures.add_legend(side_by_side, handles=[source, target, *side_by_side.collections], columns=4)
-    figures.add_legend(overlaid, handles=others, columns=2)
-    figures.set_title(side_by_side, pair.title, loc="left")
-    figures.set_title(overlaid, label, loc="left")
-    return figure
+    layers: list[Layer] = [Points(a, SOURCE, pair.names[0]), Points(b + apart, TARGET, pair.names[1])]
+    layers += [_match_lines(lines[right], "right", INK, "-"), _match_lines(lines[~right], "wrong", WRONG, "--")]
+    return figure([Panel(pair.title, layers), Panel(label, _layers(pair, T))])
 
 
-def _draw_matches(axes: Axes, lines: NDArray[np.float64], kind: str, color: str, style: str) -> None:
+def _match_lines(lines: NDArray[np.float64], kind: str, color: str, style: str) -> Edges:
     label = f"{len(lines)} {kind} match" + "es" * (len(lines) != 1)
     if len(lines) > _MAX_LINES:
         label += f", {_MAX_LINES} drawn"
-    drawn = np.random.default_rng(0).permutation(lines)[:_MAX_LINES]
-    axes.add_collection(LineCollection(list(drawn), colors=color, linestyles=style, linewidths=0.9, label=label))
+    return Edges(np.random.default_rng(0).permutation(lines)[:_MAX_LINES], color, label, style)
 
 
-def _draw_overlap(
-    axes: Axes, pair: RegisteredPair, T_target_source: NDArray[np.float64], limits: Limits
-) -> list[Artist]:
-    """Draws both scans in the frame of the target, black where they meet, and both lidars.
-
-    Returns:
-        The entries of the legend: source, target, both, lidar of the source, lidar of the target.
-    """
+def _layers(pair: RegisteredPair, T_target_source: NDArray[np.float64]) -> list[Layer]:
+    """Returns both scans in the frame of the target, and both lidars."""
     moved = pair.source @ T_target_source[:3, :3].T + T_target_source[:3, 3]
-    side = figures.show_clouds(axes, [moved, pair.target], [SOURCE, TARGET], limits)
-    figures.frame_map(axes, limits, "m")
-    cells = [figures.cell_entry(color, name) for color, name in zip((SOURCE, TARGET), pair.names, strict=True)]
-    labels = [f"lidar of {name}" for name in pair.names]
-    style: dict[str, Any] = {"mec": "white", "mew": 0.8, "ls": "none", "zorder": 10}
-    x, y = T_target_source[:2, 3]
+    source, target = pair.names
     # Where both lidars are at one place, the triangle lies on the larger disc.
-    of_target = axes.plot([0.0], [0.0], "o", color=TARGET, ms=10, label=labels[1], **style)
-    of_source = axes.plot([x], [y], "^", color=SOURCE, ms=6.5, label=labels[0], **style)
-    return [*cells, figures.cell_entry(INK, f"both in one cell of {side:.2g} m"), *of_source, *of_target]
-
-
-def _limits_of(pair: RegisteredPair) -> Limits:
-    """Returns limits that show both lidars and nearly all points under every motion."""
-    moved = [pair.source @ T[:3, :3].T + T[:3, 3] for T in pair.motions.values()]
-    corners = [_corners(pair.target), *(_corners(points) for points in moved)]
-    lidars = [np.zeros(2), *(T[:2, 3] for T in pair.motions.values())]
-    return figures.plane_limits(np.concatenate([lidars, *corners]), 0.03)
-
-
-def _corners(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Returns two corners (x, y) of a box round nearly all points; far points would shrink the picture."""
-    if not len(points):
-        return np.zeros((0, 2))
-    shares = 0.5 - SHOWN_SHARE / 2, 0.5 + SHOWN_SHARE / 2
-    return np.asarray(np.quantile(points[:, :2], shares, axis=0), np.float64)
+    return [
+        Points(moved, SOURCE, source),
+        Points(pair.target, TARGET, target),
+        Track(np.zeros((1, 3)), TARGET, f"lidar of {target}", "o", 10),
+        Track(T_target_source[None, :3, 3], SOURCE, f"lidar of {source}", "^", 7),
+    ]
