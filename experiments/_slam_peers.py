@@ -8,9 +8,8 @@ either.
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -99,15 +98,13 @@ class KissSlam:
         self._slam.closer = self._closer = _RecordedCloser(self._slam.closer)
 
     def step(self, points: np.ndarray) -> None:
-        with _silence():
-            self._slam.process_scan(points, np.zeros(0))
+        self._slam.process_scan(points, np.zeros(0))
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        with _silence():
-            self._slam.generate_new_node()
-            graph = self._slam.local_map_graph
-            graph.erase_last_local_map()
-            poses, _ = self._slam.fine_grained_optimization()
+        self._slam.generate_new_node()
+        graph = self._slam.local_map_graph
+        graph.erase_last_local_map()
+        poses, _ = self._slam.fine_grained_optimization()
         # A local map begins with the last scan of the one before.
         lengths = [len(local_map.local_trajectory) for local_map in graph.local_maps()]
         first = np.concatenate([[0], np.cumsum(np.array(lengths) - 1)])
@@ -162,21 +159,6 @@ PEERS: dict[str, tuple[str, type[Peer]]] = {
     "KISS-SLAM": ("kiss_slam.slam", KissSlam),
     "small_gicp": ("small_gicp", SmallGicp),
 }
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Suppresses the output of a program, also of its compiled part."""
-    saved = [(number, os.dup(number)) for number in (1, 2)]
-    try:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            for number, _ in saved:
-                os.dup2(nowhere.fileno(), number)
-            yield
-    finally:
-        for number, copy in saved:
-            os.dup2(copy, number)
-            os.close(copy)
 
 
 class _RecordedCloser:
