@@ -74,24 +74,14 @@ def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
     alone = localize_alone(network, scan_all(grid, turned, sequence))
     mapped, names = is_mapped(truth, fitted, sequence), [f"{low} px or more from the scans" for low in (0, *BINS_PX)]
     places = np.where(mapped, np.array(names)[np.digitize(distance, BINS_PX)], "not mapped")
-    errors = {
-        "L-Net alone, known heading": errors_at(alone, turned, fitted, sequence),
-        "L-Net and M-Net": errors_at(found.pose, truth, fitted, sequence),
-    }
+    errors_px, _ = ours = errors_at(found.pose, truth, fitted, sequence)
+    errors = {"L-Net and M-Net": ours, "L-Net alone, known heading": errors_at(alone, turned, fitted, sequence)}
     rows = [
-        {
-            "method": method,
-            "place": place,
-            "error_px": px,
-            "turn_deg": deg,
-            "right": bool(px < RIGHT_PX),
-            "known": known,
-        }
+        dict(zip(("method", "place", *COLUMNS), (method, place, px, deg, bool(px < RIGHT_PX), known), strict=True))
         for method, of_method in errors.items()
         for place, known, px, deg in zip(places, found.is_known.tolist(), *of_method, strict=True)
     ]
     rows.sort(key=lambda row: (row["method"], [*names, "not mapped"].index(row["place"])))
-    errors_px = errors["L-Net and M-Net"][0]
     np.savez(run / "places.npz", truth=truth, errors_px=errors_px, is_known=found.is_known, is_mapped=mapped)
     numbers |= summarize_known(errors_px, found.is_known, mapped)
     return numbers | cli.write_summary(run, cli.summarize(rows, ("method", "place"), COLUMNS))

@@ -60,6 +60,10 @@ COLUMNS = (
     "loop_recall", "recall_same_way", "recall_opposite", "num_keyframes", "num_maps", "sent_mb", "map_mb",
     "map_int8_mb", "scan_s", "scan_s_first_tenth", "scan_s_last_tenth",
 )  # fmt: skip
+PLACE_COLUMNS = (
+    "num_scans", "num_inside", "num_right", "num_wrong", "num_outside_right", "num_outside_wrong", "median_error_m",
+    "map_mb", "scan_s",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,19 +118,26 @@ def main(options: SlamTableOptions, run: cli.Run) -> cli.Row:
         run, [{"drive": name, "method": method} for name in drives for method in options.methods], work
     )
     numbers = {"weights": options.weights} | cli.write_summary(run, cli.summarize(rows, ("drive", "method"), COLUMNS))
-    known = [name for name, drive in drives.items() if drive.T_world_lidar is not None]
-    if options.localize and known:
-        cases = [{"drive": name, "precision": precision} for name in known for precision in PRECISIONS]
-
-        def localize(drive: str, precision: Any) -> cli.Row | None:
-            folder = run / "drives" / drive.replace("/", "-") / WHOLE
-            return localize_scans(folder, drives[drive], model, precision, options)
-
-        places = cli.fill_table(run, cases, localize, "places.csv")
-        numbers |= cli.write_summary(
-            run, cli.summarize(places, ("drive", "precision"), list(places[0])[2:-1]), name="places"
-        )
+    if options.localize and not run.is_stopped:
+        numbers |= localize_all(options, run, drives, model)
     return numbers
+
+
+def localize_all(
+    options: SlamTableOptions, run: cli.Run, drives: dict[str, LidarSequence], model: Model
+) -> dict[str, Any]:
+    """Fills places.csv: scans of each drive with a reference that are looked for in the map of its first half."""
+
+    def work(drive: str, precision: Any) -> cli.Row:
+        return localize_scans(
+            run / "drives" / drive.replace("/", "-") / WHOLE, drives[drive], model, precision, options
+        )
+
+    with_map = {row["drive"] for row in run.read_table("rows.csv") if row["method"] == WHOLE and row["map_mb"]}
+    known = [name for name, drive in drives.items() if name in with_map and drive.T_world_lidar is not None]
+    places = [{"drive": name, "precision": precision} for name in known for precision in PRECISIONS]
+    rows = cli.fill_table(run, places, work, "places.csv")
+    return cli.write_summary(run, cli.summarize(rows, ("drive", "precision"), PLACE_COLUMNS), name="places")
 
 
 def open_drives(options: SlamTableOptions) -> list[LidarSequence]:
@@ -158,13 +169,14 @@ def map_by_setting(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods
     mapped, result = cli.map_drive(run, drive, methods)
     if len(mapped.reports) < len(drive):
         return None
-    sizes = {precision: save_map(run / f"map_{precision}.npz", result.map, precision) for precision in PRECISIONS}
+    files = [save_map(run / f"map_{one}.npz", result.map, one) for one in PRECISIONS] if len(result.map) else []
+    map_mb, map_int8_mb = [path.stat().st_size / 1e6 for path in files] or (None, None)
     before = cli.trajectory_errors(result.T_odometry_scan, drive.T_world_lidar)
     return measure_trajectory(run, drive, result.T_world_scan, found_loops(result.loops, result.keyframes)) | {
         "ate_before_loops_m": before.get("ate_m"),
         "num_keyframes": len(result.keyframes),
-        "map_mb": sizes["float32"].stat().st_size / 1e6,
-        "map_int8_mb": sizes["int8"].stat().st_size / 1e6,
+        "map_mb": map_mb,
+        "map_int8_mb": map_int8_mb,
         **mean_seconds(mapped.scan_s),
     }
 
@@ -275,13 +287,9 @@ def measure_trajectory(run: cli.Run, drive: LidarSequence, T_world_scan: np.ndar
 
 def are_right(loops: Sequence[FoundLoop], T_world_scan: np.ndarray) -> np.ndarray:
     """Returns True for the loops whose motion is that of the true poses, within 2 m and 5 degrees."""
-    newer, older = (
-        np.array([end[0] for end in ends], int) for ends in ([one.newer for one in loops], [one.older for one in loops])
-    )
+    newer, older = (T_world_scan[[getattr(loop, end)[0] for loop in loops]] for end in ("newer", "older"))
     found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
-    return np.asarray(
-        metrics.registration_recall(found, rigid.inverse(T_world_scan[older]) @ T_world_scan[newer]).is_right
-    )
+    return np.asarray(metrics.registration_recall(found, rigid.inverse(older) @ newer).is_right)
 
 
 def mean_seconds(scan_s: Sequence[float]) -> cli.Row:

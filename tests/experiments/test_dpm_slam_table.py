@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ from dpmjax.slam import SlamConfig, SlamMethods, init_slam, slam_preset, step_sl
 from experiments import _slam_peers, _slam_settings, dpm_slam_table
 from experiments._slam_peers import FoundLoop
 from experiments._slam_settings import NEAREST, NETWORK, NO_OFFSETS, PAPER, PAPER_WIDE, WHOLE, make_setting
-from experiments.dpm_slam_table import cut_drive, map_by_agents, map_by_peer, measure_trajectory
+from experiments.dpm_slam_table import cut_drive, map_by_agents, map_by_peer, map_by_setting, measure_trajectory
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
@@ -58,11 +59,13 @@ def model() -> dpmjax.Model:
     return dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
 
 
-def run_in(folder: Path) -> Run:
-    """An open run, whose parts are the folders of methods."""
-    opened = Run("test", DriveOptions(output=folder))
-    opened.open()
-    return opened
+@pytest.fixture
+def opened(tmp_path) -> Iterator[Run]:
+    """An open run in the folder of the test."""
+    run = Run("test", DriveOptions(output=tmp_path))
+    run.open()
+    yield run
+    run.close()
 
 
 def drive_along(T_world_lidar: np.ndarray) -> LidarSequence:
@@ -102,18 +105,18 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(model,
     assert read_rows(out) == list(rows.values())
 
 
-def test_agents_that_meet_share_one_frame(tmp_path, monkeypatch) -> None:
+def test_agents_that_meet_share_one_frame(opened, tmp_path, monkeypatch) -> None:
     truth = laps(1, side_m=40.0, step_m=2.0)
     methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.02), SlamConfig())
     monkeypatch.setattr(dpm_slam_table, "OVERLAP", 0.5)
-    row = map_by_agents(run_in(tmp_path), drive_along(truth), methods)
+    row = map_by_agents(opened, drive_along(truth), methods)
     assert row["num_maps"] == 1
     assert row["ate_m"] < 1.0
     assert row["num_loops"] >= 4
     assert row["num_wrong_loops"] == 0
     assert len(dpmjax.load_map(tmp_path / "map_1.npz")) == row["num_keyframes"]
     monkeypatch.setattr(dpm_slam_table, "OVERLAP", 0.0)
-    apart = map_by_agents(run_in(tmp_path / "apart"), drive_along(truth), methods)
+    apart = map_by_agents(opened.part("apart"), drive_along(truth), methods)
     assert apart["num_maps"] > 1
     assert apart["ate_m"] is None
 
@@ -132,16 +135,26 @@ def test_parts_overlap_and_hold_all_scans() -> None:
 
 
 @pytest.mark.usefixtures("with_peer")
-def test_a_scan_without_points_stays_where_the_last_one_was(tmp_path) -> None:
+def test_a_scan_without_points_stays_where_the_last_one_was(opened, tmp_path) -> None:
     whole = toy.drive(num_scans=5)
     read = lambda index: np.zeros((0, 3), np.float32) if index in (0, 2) else whole.read_scan(index)  # noqa: E731
-    row = map_by_peer(run_in(tmp_path), replace(whole, read_scan=read), PEER)
+    row = map_by_peer(opened, replace(whole, read_scan=read), PEER)
     assert row["num_scans"] == 5
     np.testing.assert_allclose(np.load(tmp_path / "trajectory.npy")[:, 0, 3], [0, 0, 0, STEP_M, 2 * STEP_M])
 
 
-def test_wrong_loops_are_counted_and_find_nothing(tmp_path) -> None:
-    truth, opened = laps(2, side_m=50.0), run_in(tmp_path)
+@pytest.mark.usefixtures("with_peer")
+def test_a_drive_that_a_signal_stops_has_no_row(opened) -> None:
+    truth = laps(1, side_m=20.0)
+    opened.on_signal(signal.SIGINT)
+    assert map_by_peer(opened, drive_along(truth), PEER) is None
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), SlamConfig())
+    assert map_by_setting(opened, drive_along(truth), methods) is None
+    assert map_by_agents(opened, drive_along(truth), methods) is None
+
+
+def test_wrong_loops_are_counted_and_find_nothing(opened) -> None:
+    truth = laps(2, side_m=50.0)
 
     def loop(newer: int, older: int, wrong_m: float = 0.0) -> FoundLoop:
         T = rigid.inverse(truth[older]) @ truth[newer] @ pose(wrong_m, 0.0, 0.0)

@@ -26,7 +26,7 @@ def fill_table(run: Run, cases: Iterable[Row], work: Callable[..., Row | None], 
 
     Args:
         run: the open run.
-        cases: entries that identify each row, the same names in each; at least one case.
+        cases: entries that identify each row, the same names in each.
         work: makes the remaining entries of a row, the same names in each, from those of its case as keywords; None
             where a signal has stopped it before its end.
         name: the file.
