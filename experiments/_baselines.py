@@ -1,10 +1,10 @@
 """Baselines of the DeepMapping paper that stand on other packages (extra `baselines`).
 
-L-BFGS by jaxopt on DeepMapping's loss without L-Net. Particle swarms of evosax, over all poses of a walk (the paper's
-baseline) or over the step between two scans. Multiway registration by Open3D, whose pairs are registered by iterated
-closest points. Neighbours in time are sure edges of a pose graph, and all further pairs uncertain ones. A line process
-removes wrong edges (Choi, Zhou and Koltun, Robust Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form
-is `fit_deepmapping` with the settings of `as_direct`.
+L-BFGS by jaxopt on DeepMapping's loss without L-Net. Particle swarms of evosax over all poses of a walk. Multiway
+registration by Open3D, whose pairs are registered by iterated closest points. Neighbours in time are sure edges of a
+pose graph, and all further pairs uncertain ones. A line process removes wrong edges (Choi, Zhou and Koltun, Robust
+Reconstruction of Indoor Scenes, CVPR 2015). By Adam the direct form is `fit_deepmapping` with the settings of
+`as_direct`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float
 from dpmjax import ScanSet
 from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem
 from dpmjax.geometry import rigid, se2, typical_range
-from dpmjax.losses import chamfer_distance
 
 
 def optimize_directly(scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array) -> np.ndarray:
@@ -53,70 +52,21 @@ def optimize_directly(scans: ScanSet, config: DeepMappingConfig, *, num_iteratio
     return np.asarray(solution[0], np.float64) * [unit, unit, 1.0]
 
 
-# Particles start within this: translation along each axis in typical ranges, and radians.
-_SPREAD = (0.15, 0.5)
-# Pairs that are worked on together.
-_PAIRS_AT_ONCE = 32
-
-
 class Swarms(NamedTuple):
     """Sizes of the swarms.
 
     Attributes:
         num_particles: relative poses that are tried at a time.
         num_iterations: number of iterations of a swarm.
-        num_rounds: swarms from fresh particles; the best round of each pair is kept.
         num_beams: beams of each scan that are compared.
     """
 
     num_particles: int = 32
     num_iterations: int = 60
-    num_rounds: int = 3
     num_beams: int = 86
 
 
 SWARMS = Swarms()
-
-
-def swarm_chain(scans: ScanSet, sizes: Swarms = SWARMS, *, key: jax.Array) -> np.ndarray:
-    """Returns poses of planar scans, each onto the one before by a swarm on their Chamfer distance (eq. 5).
-
-    Without evosax it ends in a ModuleNotFoundError.
-
-    Args:
-        scans: n scans in order of time.
-        sizes: of the swarms.
-        key: key of the swarms.
-
-    Returns:
-        (n, 3) T_world_scan, x, y, heading; the first one zero.
-    """
-    points, mask = jnp.asarray(scans.points), jnp.asarray(scans.mask)
-    stride = max(1, -(-mask.shape[1] // sizes.num_beams))
-    unit = typical_range(scans.points, scans.mask)
-    widths = jnp.array([_SPREAD[0] * unit, _SPREAD[0] * unit, _SPREAD[1]])
-    steps = _swarm_pairs(ScanSet(points[:, ::stride], mask[:, ::stride]), widths, key, sizes=sizes)
-    return se2.chain(np.asarray(steps, np.float64))
-
-
-@partial(jax.jit, static_argnames="sizes")
-def _swarm_pairs(scans: ScanSet, widths: Float[Array, " 3"], key: jax.Array, *, sizes: Swarms) -> Float[Array, "m 3"]:
-    """Returns T_before_scan of every scan but the first."""
-    points, mask = scans.points, scans.mask
-
-    def best_of_rounds(pair: tuple[jax.Array, ...]) -> Array:
-        before, before_mask, after, after_mask, pair_key = pair
-
-        def misfit(pose: Float[Array, " 3"]) -> Array:
-            return chamfer_distance(se2.transform_points(pose, after), before, after_mask, before_mask)
-
-        swarm = partial(_swarm, lambda x: jax.vmap(misfit)(x * widths), sizes=sizes, num_unknowns=3)
-        found, values = jax.lax.map(swarm, jax.random.split(pair_key, sizes.num_rounds))
-        return found[values.argmin()] * widths
-
-    keys = jax.random.split(key, len(mask) - 1)
-    pairs = (points[:-1], mask[:-1], points[1:], mask[1:], keys)
-    return jax.lax.map(best_of_rounds, pairs, batch_size=_PAIRS_AT_ONCE)
 
 
 def _swarm(
@@ -155,7 +105,7 @@ def swarm_poses(
     Args:
         scans: n scans in order of time.
         config: settings; its first cold phase gives the loss, here of the whole set, with `sizes.num_beams` beams.
-        sizes: of the swarms; `num_rounds` is not used.
+        sizes: of the swarms.
         cpu_s: process time of all rounds, without compilation; a round that has begun is finished.
         key: key of the swarms and of the pairs that are compared.
 

@@ -8,20 +8,15 @@ either.
 
 from __future__ import annotations
 
-import contextlib
-import importlib.metadata
 import os
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from dpmjax.cli import UNKNOWN
 from dpmjax.geometry import rigid
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
-# Where half of the points are nearer, the place is indoors.
-INDOORS_M = 5.0
 # Three coordinates; with the six numbers of a covariance.
 POINT_BYTES, GAUSSIAN_BYTES = 12, 36
 _UNLIMITED_M, _UNLIMITED_SCANS = 1e9, 10**9
@@ -41,63 +36,57 @@ class FoundLoop(NamedTuple):
     T_older_newer: np.ndarray
 
 
-class Peer:
-    """A program that takes scans in their order.
+class Peer(Protocol):
+    """A program that takes scans in their order."""
 
-    `step` takes a scan, (n, 3) float64, not empty. `map_bytes` returns the bytes of the map of the whole way so far,
-    with floats of 4 bytes.
+    def __init__(self, *, is_indoors: bool) -> None:
+        """Chooses the settings that fit the place."""
 
-    Attributes:
-        map_name: kind of the map, for the column of its bytes.
-    """
-
-    map_name: str
-    _poses: list[np.ndarray]
-
-    def grow_map(self, points: np.ndarray) -> None:
-        """Adds the last scan to a map of the whole way, where the program drops far points; not timed."""
+    def step(self, points: np.ndarray) -> None:
+        """Takes a scan, (n, 3) float64, not empty."""
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
         """Returns (n, 4, 4) poses of all scans, and the loops."""
-        return np.array(self._poses), []
+
+    def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
+        """Returns the bytes of the map of the whole way, with floats of 4 bytes, after `finish`.
+
+        Args:
+            scans: the scans again, for programs that drop far points on the way.
+        """
 
 
-class KissIcp(Peer):
+class KissIcp:
     """KISS-ICP (Vizzo et al. 2023), with a voxel map of the whole way: the program itself drops far points."""
-
-    map_name = "voxels"
 
     def __init__(self, *, is_indoors: bool) -> None:
         from kiss_icp.config import load_config
         from kiss_icp.kiss_icp import KissICP
-        from kiss_icp.mapping import VoxelHashMap
 
-        config = load_config(None)
-        _set_range(config.data, config.mapping, is_indoors)
-        mapping = config.mapping
-        self._odometry = KissICP(config)
-        self._whole = VoxelHashMap(mapping.voxel_size, _UNLIMITED_M, mapping.max_points_per_voxel)
-        self._poses = []
+        self._config = load_config(None)
+        _set_range(self._config.data, self._config.mapping, is_indoors)
+        self._odometry, self._poses = KissICP(self._config), list[np.ndarray]()
 
     def step(self, points: np.ndarray) -> None:
         self._odometry.register_frame(points, np.zeros(0))
         self._poses.append(self._odometry.last_pose)
 
-    def grow_map(self, points: np.ndarray) -> None:
-        """Adds the last scan to the voxel map of the whole way; see `Peer`."""
-        frame = self._odometry.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
-        thinned, T = self._odometry.voxelize(frame)[1], self._poses[-1]
-        self._whole.add_points(thinned @ T[:3, :3].T + T[:3, 3])
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        return np.array(self._poses), []
 
-    def map_bytes(self) -> int:
-        """Returns the bytes of its points; see `Peer`."""
-        return POINT_BYTES * len(self._whole.point_cloud())
+    def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
+        from kiss_icp.mapping import VoxelHashMap
+
+        mapping, odometry = self._config.mapping, self._odometry
+        whole = VoxelHashMap(mapping.voxel_size, _UNLIMITED_M, mapping.max_points_per_voxel)
+        for points, T in zip(scans, self._poses, strict=True):
+            frame = odometry.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
+            whole.add_points(odometry.voxelize(frame)[1] @ T[:3, :3].T + T[:3, 3])
+        return POINT_BYTES * len(whole.point_cloud())
 
 
-class KissSlam(Peer):
+class KissSlam:
     """KISS-SLAM (Guadagnino et al. 2025): the same odometry, local maps of 100 m, loops between them, a pose graph."""
-
-    map_name = "local_maps"
 
     def __init__(self, *, is_indoors: bool) -> None:
         from kiss_slam.config import load_config
@@ -109,21 +98,13 @@ class KissSlam(Peer):
         self._slam.closer = self._closer = _RecordedCloser(self._slam.closer)
 
     def step(self, points: np.ndarray) -> None:
-        with _silence():
-            self._slam.process_scan(points, np.zeros(0))
-
-    def map_bytes(self) -> int:
-        """Returns the bytes of the points of all local maps, without their normals; see `Peer`."""
-        clouds = [local_map.pcd for local_map in self._slam.local_map_graph.local_maps() if local_map.pcd is not None]
-        num_points = sum(len(cloud.point.positions) for cloud in clouds) + len(self._slam.voxel_grid.point_cloud())
-        return POINT_BYTES * num_points
+        self._slam.process_scan(points, np.zeros(0))
 
     def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        with _silence():
-            self._slam.generate_new_node()
-            graph = self._slam.local_map_graph
-            graph.erase_last_local_map()
-            poses, _ = self._slam.fine_grained_optimization()
+        self._slam.generate_new_node()
+        graph = self._slam.local_map_graph
+        graph.erase_last_local_map()
+        poses, _ = self._slam.fine_grained_optimization()
         # A local map begins with the last scan of the one before.
         lengths = [len(local_map.local_trajectory) for local_map in graph.local_maps()]
         first = np.concatenate([[0], np.cumsum(np.array(lengths) - 1)])
@@ -133,25 +114,23 @@ class KissSlam(Peer):
         ]
         return np.array(poses), loops
 
+    def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
+        clouds = [local_map.pcd for local_map in self._slam.local_map_graph.local_maps() if local_map.pcd is not None]
+        return POINT_BYTES * sum(len(cloud.point.positions) for cloud in clouds)
 
-class SmallGicp(Peer):
+
+class SmallGicp:
     """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
-
-    map_name = "gaussians"
 
     def __init__(self, *, is_indoors: bool) -> None:
         import small_gicp
 
         self._library, self._threads = small_gicp, os.cpu_count() or 1
-        self._point_m, voxel_m = (0.125, 0.5) if is_indoors else (0.25, 1.0)
-        self._map, self._whole = (small_gicp.GaussianVoxelMap(voxel_m) for _ in range(2))
-        self._whole.set_lru(horizon=_UNLIMITED_SCANS)
-        self._scan: Any = None
-        self._poses = []
+        self._point_m, self._voxel_m = (0.125, 0.5) if is_indoors else (0.25, 1.0)
+        self._map, self._poses = small_gicp.GaussianVoxelMap(self._voxel_m), list[np.ndarray]()
 
     def step(self, points: np.ndarray) -> None:
-        scan, _ = self._library.preprocess_points(points, self._point_m, num_threads=self._threads)
-        T = np.eye(4)
+        scan, T = self._thin(points), np.eye(4)
         if self._poses:
             before, last = (self._poses * 2)[-2:]
             # The transpose would treble the rounding errors of the rotations at each scan.
@@ -159,51 +138,27 @@ class SmallGicp(Peer):
             T = self._library.align(self._map, scan, start, num_threads=self._threads).T_target_source
         self._map.insert(scan, T)
         self._poses.append(T)
-        self._scan = scan
 
-    def grow_map(self, points: np.ndarray) -> None:
-        """Adds the last scan to the Gaussian voxel map of the whole way; see `Peer`."""
-        self._whole.insert(self._scan, self._poses[-1])
+    def _thin(self, points: np.ndarray) -> Any:
+        return self._library.preprocess_points(points, self._point_m, num_threads=self._threads)[0]
 
-    def map_bytes(self) -> int:
-        """Returns the bytes of the mean and the covariance of each voxel; see `Peer`."""
-        return GAUSSIAN_BYTES * int(self._whole.size())
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        return np.array(self._poses), []
+
+    def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
+        whole = self._library.GaussianVoxelMap(self._voxel_m)
+        whole.set_lru(horizon=_UNLIMITED_SCANS)
+        for points, T in zip(scans, self._poses, strict=True):
+            whole.insert(self._thin(points), T)
+        return GAUSSIAN_BYTES * int(whole.size())
 
 
 # The peers by name: the module that must be there, and the class.
-PEERS: dict[str, tuple[str, Callable[..., Any]]] = {
+PEERS: dict[str, tuple[str, type[Peer]]] = {
     "KISS-ICP": ("kiss_icp.kiss_icp", KissIcp),
     "KISS-SLAM": ("kiss_slam.slam", KissSlam),
     "small_gicp": ("small_gicp", SmallGicp),
 }
-
-
-def peer_version(name: str) -> str:
-    """Returns the version of a peer."""
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return UNKNOWN
-
-
-def is_indoors(points: np.ndarray) -> bool:
-    """Returns True for a scan of a room."""
-    return bool(len(points) and np.median(np.linalg.norm(points, axis=1)) < INDOORS_M)
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Suppresses the output of a program, also of its compiled part."""
-    saved = [(number, os.dup(number)) for number in (1, 2)]
-    try:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            for number, _ in saved:
-                os.dup2(nowhere.fileno(), number)
-            yield
-    finally:
-        for number, copy in saved:
-            os.dup2(copy, number)
-            os.close(copy)
 
 
 class _RecordedCloser:

@@ -8,9 +8,9 @@ As in the paper on short walks of a depth camera (here through simulated apartme
 trained together. The variants of the networks are lnet (CNN or PointNet) and mnet (MLP or ResMLP, or our grid). Those
 of their size are depth (4 to 7 layers of 64) and width (32 to 128 with 4 layers). Those of the loss are chamfer (with
 and without) and free (number of free samples a ray). All further settings are fixed. The basis is a small CNN and an
-MLP of 6 layers of 64: a run takes half a minute on a CPU. By default each variant has ten trajectories with three seeds
-of the networks each: 570 runs, five hours on two cores. Each run is written to rows/ when it is done. The table has 95
-% intervals: of the median by a bootstrap over the trajectories, of the success Wilson's of all runs.
+MLP of 6 layers of 64: a run takes half a minute on a CPU. By default each variant has ten walks with three seeds of the
+networks each: 570 runs, five hours on two cores. The file rows.csv has a row for each run, table.md one for each
+variant.
 """
 
 from __future__ import annotations
@@ -19,20 +19,17 @@ import time
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
-import numpy as np
+import jax
 from tyro.conf import arg
 
-from dpmjax import cli, metrics, nets, simulation
+from dpmjax import cli, nets, simulation
 from dpmjax import deepmapping as dm
 from dpmjax.registration_rgbd import as_depth_scans
 from experiments.deepmapping_rgbd import errors_of
 
 EXPERIMENT = "deepmapping_ablations"
-_SUCCESS_MM = 450.0
-# Images of a trajectory, and pixels of each in a step.
-_NUM_VIEWS, _NUM_PIXELS = 8, 200
-# Samples of the bootstrap.
-_NUM_DRAWS = 2000
+# Images of a walk, and pixels of each in a step.
+NUM_VIEWS, NUM_PIXELS = 8, 200
 VARIANTS: dict[str, tuple[str, ...]] = {
     "lnet": ("CNN", "PointNet"),
     "mnet": ("MLP", "ResMLP", "grid"),
@@ -44,15 +41,15 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class AblationOptions(cli.RunOptions):
     """Options of the ablations."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "seeds", "only"})
 
     limit: Annotated[int, arg(metavar="N")] = 10
-    """Trajectories a variant."""
+    """Walks a variant."""
     seeds: Annotated[int, arg(metavar="N")] = 3
-    """Seeds of the networks a trajectory."""
+    """Seeds of the networks a walk."""
     steps: Annotated[int, arg(metavar="N")] = 600
     """Steps of each fit."""
     only: tuple[str, ...] = tuple(VARIANTS)
@@ -64,21 +61,30 @@ class Config(cli.RunOptions):
         cli.check_names("--only", self.only, VARIANTS)
 
 
-def main(config: Config) -> list[cli.Row]:
-    """Runs the missing cases, trajectory by trajectory, then writes the table and the box plots."""
+def main(options: AblationOptions, run: cli.Run) -> cli.Row:
+    """Runs the missing cases, walk by walk, and writes the table."""
+    run.open()
+
+    def work(ablation: str, variant: str, walk: int, network_seed: int) -> cli.Row:
+        seed = 1000 * options.seed + walk
+        sequence = simulation.simulate_depth_sequence(seed % 15, NUM_VIEWS, seed=seed)
+        settings, begun = settings_of(ablation, variant, options.steps), time.perf_counter()
+        scans, key = as_depth_scans(sequence.points, sequence.mask), jax.random.key(1000 * options.seed + network_seed)
+        # The first run of a variant compiles.
+        fitted = dm.fit_deepmapping(scans, settings, key=key)
+        return {**errors_of(fitted.T_world_scan, sequence), "seconds": time.perf_counter() - begun}
+
     cases = [
-        {"ablation": ablation, "variant": variant, "trajectory": trajectory, "network_seed": network_seed}
-        for network_seed in range(config.seeds)
-        for trajectory in range(config.limit)
-        for ablation in config.only
+        {"ablation": ablation, "variant": variant, "walk": walk, "network_seed": network_seed}
+        for network_seed in range(options.seeds)
+        for walk in range(options.limit)
+        for ablation in options.only
         for variant in VARIANTS[ablation]
     ]
-
-    def work(_: cli.TableRun, ablation: str, variant: str, trajectory: int, network_seed: int) -> cli.Row:
-        seeds = 1000 * config.seed + trajectory, 1000 * config.seed + network_seed
-        return run_one(settings_of(ablation, variant, config.steps), *seeds)
-
-    return cli.run_table(config, EXPERIMENT, cases, work, report)
+    summary = cli.summarize(
+        cli.fill_table(run, cases, work), ("ablation", "variant"), ("success", "ate_m", "point_distance_m", "seconds")
+    )
+    return cli.write_summary(run, summary)
 
 
 def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingConfig:
@@ -90,7 +96,7 @@ def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingCo
         num_epochs=0,
         occupancy_weight=1.0 if variant == "without" else 0.5,
         final_learning_rate=0.1,
-        beams_per_step=_NUM_PIXELS,
+        beams_per_step=NUM_PIXELS,
         num_free=number if ablation == "free" else 4,
         is_as_published=False,
     )
@@ -106,57 +112,5 @@ def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingCo
     return replace(fast, cold_phases=(phase,), warm_phases=(phase,), **networks)
 
 
-def run_one(settings: dm.DeepMappingConfig, seed: int, network_seed: int) -> cli.Row:
-    """Returns the errors of one fit; the first of a variant compiles, and its `run_s` contains that."""
-    import jax
-
-    sequence = simulation.simulate_depth_sequence(seed % 15, _NUM_VIEWS, seed=seed)
-    begun = time.perf_counter()
-    scans = as_depth_scans(sequence.points, sequence.mask)
-    fitted = dm.fit_deepmapping(scans, settings, key=jax.random.key(network_seed))
-    return {**errors_of(fitted.T_world_scan, sequence), "run_s": time.perf_counter() - begun}
-
-
-def report(rows: list[cli.Row]) -> cli.Summary:
-    """Returns a line for each variant, with intervals of 95 %."""
-    table = []
-    for (ablation, variant), some in cli.group_rows(rows, "ablation", "variant").items():
-        ate = np.array([row["ate_mm"] for row in some])
-        share = metrics.wilson_interval(int((ate < _SUCCESS_MM).sum()), len(ate))
-        table.append(
-            {
-                "ablation": ablation,
-                "variant": variant,
-                "num_runs": len(some),
-                "median_ate_mm": float(np.median(ate)),
-                "median_interval_mm": interval_of_median(ate, [row["trajectory"] for row in some]),
-                "success": share.share,
-                "success_interval": [share.low, share.high],
-                "median_run_s": float(np.median([row["run_s"] for row in some])),
-                "quartiles_ate_mm": np.quantile(ate, [0.25, 0.75]).tolist(),
-            }
-        )
-
-    columns = ("ablation", "variant", "runs", "median ATE, mm (95 %)", "success (95 %)", "median s")
-    lines = [
-        [
-            *(row[name] for name in ("ablation", "variant", "num_runs")),
-            "{:.0f} ({:.0f} to {:.0f})".format(row["median_ate_mm"], *row["median_interval_mm"]),
-            "{:.2f} ({:.2f} to {:.2f})".format(row["success"], *row["success_interval"]),
-            f"{row['median_run_s']:.1f}",
-        ]
-        for row in table
-    ]
-    return cli.Summary({"variants": table}, cli.markdown(columns, lines))
-
-
-def interval_of_median(values: np.ndarray, trajectories: list[int]) -> list[float]:
-    """Returns the 95 % bootstrap interval of the median; whole trajectories are drawn, since their runs are related."""
-    rng, groups = np.random.default_rng(0), [values[np.equal(trajectories, t)] for t in sorted(set(trajectories))]
-    draws = rng.integers(len(groups), size=(_NUM_DRAWS, len(groups)))
-    medians = [np.median(np.concatenate([groups[k] for k in draw])) for draw in draws]
-    return np.quantile(medians, [0.025, 0.975]).tolist()
-
-
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))

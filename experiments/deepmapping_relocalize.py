@@ -1,139 +1,124 @@
-"""Draws how well a fit re-localises unseen scans, at every free pixel of a world (DeepMapping figure 7).
+"""Measures how well a fit re-localises unseen scans, at every free place of a world (DeepMapping figure 7).
 
-    dpmjax map2d --world 1 --init zero -o run
-    python -m experiments.deepmapping_relocalize run
+    python -m experiments.deepmapping_relocalize --world 1 --stride-px 24
+    python -m experiments.deepmapping_relocalize --init zero --preset paper
 
-RUN is a folder of `dpmjax map2d` on a built-in world. L-Net is trained on the poses that the fit has found; it proposes
-poses of each scan, and M-Net chooses. Headings are random and unknown. Beside it stands L-Net alone, as in the paper:
-the scans have the heading of the nearest scan of the fit, and the output of L-Net is the pose. That L-Net is the one of
-the fit where a single one moved all scans from zero poses, as with --preset paper; else it is trained on the poses of
-the fit. Written beside the results of RUN: relocalization.json, and relocalization.npz with the
-numbers of each scan.
+256 scans of a built-in world are fitted, and L-Net is trained on the poses of the fit. For each unseen scan L-Net
+proposes poses, and M-Net chooses. Headings are random and unknown. Beside it stands L-Net alone, as in the paper: the
+scans have the heading of the nearest scan of the fit, and the output of L-Net is the pose. That L-Net is the one of the
+fit where a single one moved all scans from zero poses, as with --preset paper; else it is trained on the poses of the
+fit. A pose is right within 20 px. The file table.md has the errors by the distance from the trajectory, places.npz
+those of each scan.
 """
 
 from __future__ import annotations
 
-import itertools
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal
 
+import jax
 import numpy as np
-from tyro.conf import Positional, arg
+from scipy.spatial import KDTree
+from tyro.conf import arg
 
-from dpmjax import ScanSet, cli, metrics, simulation
+from dpmjax import ScanSet, cli, metrics, registration2d, simulation
 from dpmjax import deepmapping as dm
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 
 EXPERIMENT = "deepmapping_relocalize"
+NUM_SCANS = 256
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
-_RIGHT_PX = 20.0
-# Scans of a batch.
-_CHUNK = 256
-# Training steps of L-Net on the poses of the run.
-_NUM_STEPS = 5000
-_BINS_PX = (0.0, 10.0, 20.0, 50.0, 100.0, 1500.0)
+RIGHT_PX = 20.0
+# Scans of a batch, and training steps of L-Net on the poses of the fit.
+CHUNK, NUM_STEPS = 256, 5000
+BINS_PX = (10, 20, 50, 100)
+COLUMNS = ("error_px", "turn_deg", "right", "known")
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the picture."""
+@dataclass(frozen=True, kw_only=True)
+class RelocalizeOptions(cli.RunOptions):
+    """Options of the experiment."""
 
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of a run of `dpmjax map2d` on a built-in world."""
+    world: Literal[0, 1, 2, "grove", "crowd"] = 0
+    """Which built-in world."""
+    init: Literal["icp-plane", "zero"] = "icp-plane"
+    """Where the poses of the fit start."""
+    preset: Literal["fast", "paper"] = "fast"
+    """Settings of the fit."""
     stride_px: Annotated[int, arg(metavar="PX")] = 6
     """A scan is taken at the centre of every free square of this side."""
-    seed: int = 0
-    """Seed of the training."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
         cli.check_least(self, stride_px=1)
 
 
-def main(config: Config) -> None:
-    """Loads the run, trains L-Net on its poses, re-localises scans everywhere, draws, writes."""
-    import jax
-
-    run = cli.read_map2d_run(config.run)
-    if run.world is None:
-        raise ValueError(f"{config.run} is a run on {run.sequence.name}, whose world is needed; use a built-in one")
-    sequence, fitted = run.sequence, run.fitted
-    grid = simulation.make_world(run.world).is_obstacle
-    truth = free_poses(grid, config)
-    begun = time.perf_counter()
+def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
+    """Fits, trains L-Net on the poses of the fit, re-localises scans everywhere, and writes the table."""
+    run.open()
+    sequence = simulation.simulate_sequence(options.world, NUM_SCANS, seed=options.seed)
+    grid, key = simulation.make_world(options.world).is_obstacle, jax.random.key(options.seed)
+    fitted, begun = fit(options, sequence), time.perf_counter()
     scans = ScanSet(sequence.points, sequence.mask)
-    trained = dm.train_localization(fitted, scans, num_steps=_NUM_STEPS, key=jax.random.key(config.seed))
-    jax.block_until_ready(trained.params)
+    trained = jax.block_until_ready(dm.train_localization(fitted, scans, num_steps=NUM_STEPS, key=key))
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
+    truth = free_poses(grid, options)
     found = dm.relocalize(trained, scan_all(grid, truth, sequence))
-    relocalization_s = time.perf_counter() - begun
-    errors, turns = errors_at(found.pose, truth, fitted, sequence)
-    queries = Queries(errors, turns, found.is_known, is_mapped(truth, fitted, sequence), found.nats)
-    has_one_net = can_localize_alone(fitted)
-    turned = turn_to_nearest(truth, sequence)
-    poses = localize_alone(fitted if has_one_net else trained, scan_all(grid, turned, sequence))
-    errors, turns = errors_at(poses, turned, fitted, sequence)
-    alone = queries._replace(errors=errors, turns=turns)
-    report = {
-        "world": sequence.name,
-        "num_scans": len(sequence),
-        "num_poses": len(truth),
-        **summarise(queries, truth, sequence),
-        "lnet_alone": {
-            "network": "of the fit" if has_one_net else "trained on the poses of the fit",
-            "groups": summarise(alone, truth, sequence)["groups"],
-        },
-        "training_s": training_s,
-        "relocalization_s": relocalization_s,
-        "seed": config.seed,
-        **cli.environment(),
+    numbers = {"training_s": training_s, "relocalization_s": time.perf_counter() - begun}
+    numbers["ate_of_fit_px"] = cli.planar_errors(sequence, fitted.poses)["ate_px"]
+    distance, nearest = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
+    turned = np.column_stack([truth[:, :2], sequence.reference_poses[nearest, 2]])
+    network = fitted if can_localize_alone(fitted) else trained
+    alone = localize_alone(network, scan_all(grid, turned, sequence))
+    mapped, names = is_mapped(truth, fitted, sequence), [f"{low} px or more from the scans" for low in (0, *BINS_PX)]
+    places = np.where(mapped, np.array(names)[np.digitize(distance, BINS_PX)], "not mapped")
+    errors_px, _ = ours = errors_at(found.pose, truth, fitted, sequence)
+    errors = {"L-Net and M-Net": ours, "L-Net alone, known heading": errors_at(alone, turned, fitted, sequence)}
+    rows = [
+        dict(zip(("method", "place", *COLUMNS), (method, place, px, deg, bool(px < RIGHT_PX), known), strict=True))
+        for method, of_method in errors.items()
+        for place, known, px, deg in zip(places, found.is_known.tolist(), *of_method, strict=True)
+    ]
+    rows.sort(key=lambda row: (row["method"], [*names, "not mapped"].index(row["place"])))
+    np.savez(run / "places.npz", truth=truth, errors_px=errors_px, is_known=found.is_known, is_mapped=mapped)
+    numbers |= summarize_known(errors_px, found.is_known, mapped)
+    return numbers | cli.write_summary(run, cli.summarize(rows, ("method", "place"), COLUMNS))
+
+
+def fit(options: RelocalizeOptions, sequence: ScanSequence) -> dm.Fitted:
+    """Fits the scans from incremental ICP, or from zero poses."""
+    start = None
+    if options.init == "icp-plane":
+        planar = registration2d.planar_scans(sequence.points, sequence.mask)
+        start = registration2d.incremental_icp(planar, "plane").poses
+    scans, key = ScanSet(sequence.points, sequence.mask), jax.random.key(options.seed)
+    return dm.fit_deepmapping(scans, dm.preset(options.preset), key=key, start=start)
+
+
+def summarize_known(errors_px: np.ndarray, is_known: np.ndarray, is_mapped: np.ndarray) -> cli.Row:
+    """Returns the median error of mapped places, and how right the answer is whether a scan is known."""
+    return {
+        "median_of_mapped_px": float(np.median(errors_px[is_mapped])),
+        "precision_of_known": float((errors_px[is_known] < RIGHT_PX).mean()) if is_known.any() else None,
+        "share_of_mapped_known": float(is_known[is_mapped].mean()),
+        "share_of_unmapped_known": float(is_known[~is_mapped].mean()),
     }
-    cli.write_json(config.run / "relocalization.json", report)
-    np.savez(config.run / "relocalization.npz", truth=truth, errors_alone=alone.errors, **queries._asdict())
-    print(lines_of(report), f"results in {config.run}", sep="\n")
 
 
-class Queries(NamedTuple):
-    """Results of the scans, (m,) each.
-
-    Attributes:
-        errors: distance to the truth, px.
-        turns: error of the heading, degrees.
-        is_known: True where the view is in the map, by the fit.
-        is_mapped: taken where some beam of the fit's scans has passed.
-        nats: cost of a beam by the map.
-    """
-
-    errors: np.ndarray
-    turns: np.ndarray
-    is_known: np.ndarray
-    is_mapped: np.ndarray
-    nats: np.ndarray
-
-
-def free_poses(grid: np.ndarray, config: Config) -> np.ndarray:
+def free_poses(grid: np.ndarray, options: RelocalizeOptions) -> np.ndarray:
     """Returns (m, 3) poses of random headings at the centres of the free squares."""
-    half = config.stride_px // 2
-    rows, columns = np.nonzero(~grid[half :: config.stride_px, half :: config.stride_px])
-    places = np.column_stack([columns, rows]) * config.stride_px + half + 0.5
-    headings = np.random.default_rng([config.seed, 7]).uniform(-np.pi, np.pi, len(places))
+    half = options.stride_px // 2
+    rows, columns = np.nonzero(~grid[half :: options.stride_px, half :: options.stride_px])
+    places = np.column_stack([columns, rows]) * options.stride_px + half + 0.5
+    headings = np.random.default_rng([options.seed, 7]).uniform(-np.pi, np.pi, len(places))
     return np.column_stack([places, headings])
 
 
 def scan_all(grid: np.ndarray, poses: np.ndarray, sequence: ScanSequence) -> ScanSet:
     """Returns the scans at poses, with the number of beams of the sequence."""
     return ScanSet(*simulation.scan_world(grid, poses, num_beams=sequence.points.shape[1]))
-
-
-def turn_to_nearest(truth: np.ndarray, sequence: ScanSequence) -> np.ndarray:
-    """Returns the poses with the heading of the nearest scan of the fit."""
-    from scipy.spatial import KDTree
-
-    _, nearest = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
-    return np.column_stack([truth[:, :2], sequence.reference_poses[nearest, 2]])
 
 
 def can_localize_alone(fitted: dm.Fitted) -> bool:
@@ -145,8 +130,8 @@ def can_localize_alone(fitted: dm.Fitted) -> bool:
 def localize_alone(fitted: dm.Fitted, scans: ScanSet) -> np.ndarray:
     """Returns the output of L-Net for each scan as its pose, in the world of the fit; no search, no M-Net."""
     parts = []
-    for k in range(0, len(scans.points), _CHUNK):
-        part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
+    for k in range(0, len(scans.points), CHUNK):
+        part = ScanSet(scans.points[k : k + CHUNK] / fitted.unit, scans.mask[k : k + CHUNK])
         found = dm.propose_poses(fitted.params.localization, part, num_turns=1, fit_config=fitted.config)
         parts.append(np.asarray(found[:, 0], np.float64))
     return np.concatenate(parts) * [fitted.unit, fitted.unit, 1.0]
@@ -175,49 +160,5 @@ def errors_at(
     return np.linalg.norm(moved - truth[:, :2], axis=1), np.degrees(np.abs(turn))
 
 
-def summarise(queries: Queries, truth: np.ndarray, sequence: ScanSequence) -> cli.Row:
-    """Returns the numbers of all mapped free space, of the known scans, and by the distance from the trajectory."""
-    from scipy.spatial import KDTree
-
-    distance, _ = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
-    known, mapped, is_right = queries.is_known, queries.is_mapped, queries.errors < _RIGHT_PX
-    groups = [("mapped", mapped), ("mapped and known", mapped & known), ("known", known), ("not mapped", ~mapped)]
-    groups += [
-        (f"mapped, {low:.0f} to {high:.0f} px from the trajectory", mapped & (distance >= low) & (distance < high))
-        for low, high in itertools.pairwise(_BINS_PX)
-    ]
-    return {
-        "groups": {name: _numbers(queries, rows) for name, rows in groups if rows.any()},
-        "precision_of_known": float(is_right[known].mean()) if known.any() else None,
-        "share_of_mapped_known": float(known[mapped].mean()),
-        "share_of_unmapped_known": float(known[~mapped].mean()),
-    }
-
-
-def _numbers(queries: Queries, rows: np.ndarray) -> cli.Row:
-    return {
-        "num_poses": int(rows.sum()),
-        "median_px": float(np.median(queries.errors[rows])),
-        "median_deg": float(np.median(queries.turns[rows])),
-        "share_below_20_px": float((queries.errors[rows] < _RIGHT_PX).mean()),
-        "share_known": float(queries.is_known[rows].mean()),
-    }
-
-
-def lines_of(report: cli.Row) -> str:
-    """Returns the numbers of each group of scans for the console."""
-
-    def line(name: str, row: cli.Row) -> str:
-        errors = f"median {row['median_px']:.1f} px, {row['median_deg']:.1f} degrees"
-        return f"{name}: {row['num_poses']} scans, {errors}, {row['share_below_20_px']:.0%} below {_RIGHT_PX:.0f} px"
-
-    lines = [f"{line(name, row)}, {row['share_known']:.0%} called known" for name, row in report["groups"].items()]
-    lines += [line(f"L-Net alone, {name}", row) for name, row in report["lnet_alone"]["groups"].items()]
-    precision = report["precision_of_known"]
-    answer = "none is called known" if precision is None else f"{precision:.1%} of those called known are right"
-    known = f"{answer}; {report['share_of_mapped_known']:.0%} of the mapped ones are called known"
-    return "\n".join([*lines, known])
-
-
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))

@@ -2,6 +2,8 @@
 
     python -m experiments.dpm_calibrate results/train/latest/model.safetensors
     python -m experiments.dpm_calibrate MODEL --data path/to/drive another/drive    on your drives, as dpmjax train does
+    python -m experiments.dpm_calibrate MODEL --check                               on places that no fit has seen
+    python -m experiments.dpm_calibrate --evidence                                  weights of register
 
 Pairs of scans of held-out towns, overlapping and not, are registered. A logistic regression then predicts whether the
 motion is right within 2 m and 5 degrees. Its few features include the consensus support, the share of points that meet
@@ -9,26 +11,34 @@ surfaces and the share of points in free space. Pairs whose walls hold one direc
 own, on two features, and so have matches of clouds of surface elements, without the scans. Ambiguous places add pairs:
 corridors, tunnels, halls, open fields and streets with queues of moving cars, by lidars of 16, 32 and 64 beams. Overlap
 is another regression, on the evidence of the match (similarities of descriptors, consensus support ...) of pairs of
-further towns, half of them less than 20 m apart. Results go to results/dpm_calibrate/<time>/: model.safetensors,
-metrics.json, reliability.png, reliability_clouds.png and reliability_overlap.png. The file model.safetensors is the
-model with all regressions. The file metrics.json has the Brier scores, the calibration errors, and the AUC of overlap,
-of places that were left out of the fits. With --data, pairs of your drives take the place of simulated ones; the fits
-leave the last tenth of each drive out, which the numbers are of. `python -m experiments.dpm_confidence` checks the
-confidence on other places.
+further towns, half of them less than 20 m apart. The file model.safetensors is the model with all regressions.
+metrics.json has the Brier scores, the calibration errors, and the AUC of overlap, of places that were left out of the
+fits; the reliability*.png show them. With --data, pairs of your drives take the place of simulated ones; the fits leave
+the last tenth of each drive out, which the numbers are of.
+
+With --check, the calibration of the model rates pairs of other ambiguous places. table.md has the shares of pairs that
+are right, sure (a confidence of 0.9 or more), and wrong though sure. With --evidence, all motions that `register` tries
+for pairs of simulated scenes are compared with the truth. A regression on `evidence_shares` predicts which are right;
+metrics.json has the weights for `dpmjax.deeppointmap.EvidenceWeights`, table.md the pairs whose right motion has the
+highest score, scene by scene, each by a fit without this scene.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from tyro.conf import Positional, arg
+from scipy.spatial.transform import Rotation
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, load_model, save_model, simulation, viz
+from dpmjax import cli, load_model, metrics, save_model, scans, simulation, viz
 from dpmjax import deeppointmap as dpm
+from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.weights import read_card
 
@@ -38,83 +48,81 @@ AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
 BEAMS = {16: simulation.VLP16, 32: simulation.HDL32E, 64: simulation.OS1_64}
 # Scans of each town, and of another town beside, that pairs are made of.
 NUM_SCANS, NUM_OTHER_SCANS = 36, 12
-OVERLAP_LABELS = ("overlap probability", "share of overlapping pairs")
-TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (60.0, np.inf))
-AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0), (60.0, np.inf))
-# Far from the seeds of the towns of training, also of its held-out one.
-FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
-TOWN_LENGTH_M = 400.0
+TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (cli.FAR_M, np.inf))
+AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0), (cli.FAR_M, np.inf))
+CHECKED_BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (cli.FAR_M, np.inf))
+# Far from the seeds of the towns of training, also of its held-out one, and apart from each other.
+FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_CHECKED, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_200_000, 3_500_000
+FIRST_SCENE = 6_500_000
+TOWN_LENGTH_M, SCENE_LENGTH_M = 400.0, 200.0
 # The kinds of town, of which there are nine, and of ambiguous place take turns, so that each counts the same.
-NUM_TOWNS, NUM_AMBIGUOUS, NUM_OVERLAP_TOWNS = 9, 30, 24
-# Pairs of each band of a place, and of each town of the overlap.
-NUM_PAIRS, NUM_OVERLAP_PAIRS = 30, 96
+NUM_TOWNS, NUM_AMBIGUOUS, NUM_CHECKED, NUM_OVERLAP_TOWNS = 9, 30, 15, 24
+# Pairs of each band of a place, of each town of the overlap, and of each band of a scene.
+NUM_PAIRS, NUM_CHECKED_PAIRS, NUM_OVERLAP_PAIRS, NUM_SCENE_PAIRS = 30, 8, 96, 20
+SURE, NEAR_M = 0.9, 5.0
+# Whole scans, and scans thinned to 1,400 points within 30 m.
+SCENES = {
+    False: "suburb HDL64E, campus OS1_64, canyon HDL64E, country HDL32E, wood OS1_64, car_park HDL32E, "
+    "office HDL64E, hall OS1_64, flat OS1_64, office OS1_64, hall HDL32E",
+    True: "suburb HDL64E, suburb HDL32E, campus HDL32E, canyon HDL64E, country HDL32E, hall OS1_64",
+}
+INDOORS, SCENE_BANDS_M, INDOOR_BANDS_M = (
+    ("office", "hall", "flat"),
+    ((2.0, 10.0), (10.0, 20.0)),
+    ((1.0, 5.0), (5.0, 12.0)),
+)
+NUM_THINNED, THINNED_RANGE_M, TILT_DEG = 1400, 30.0, 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.RunOptions):
+class CalibrateOptions(cli.RunOptions):
     """Options of the run."""
 
     model: Annotated[Positional[str], arg(metavar="NAME|FILE")] = "dpm_small"
     """The model: a .safetensors file, or the name of a shipped one."""
     data: Annotated[tuple[str, ...], arg(metavar="PATH")] = ()
     """Folders of scans with poses to calibrate on, instead of simulated places."""
+    check: FlagCreatePairsOff[bool] = False
+    """Rate the calibration that the model has, on places that no fit has seen."""
+    evidence: FlagCreatePairsOff[bool] = False
+    """Fit the weights by which `register` scores motions."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
         cli.check_least(self, seed=0)
+        if bool(self.data) + self.check + self.evidence > 1:
+            raise ValueError("--data, --check and --evidence: give one of them")
 
 
-def main(config: Config) -> list[cli.Row]:
-    """Registers and compares the pairs, fits, and writes the model."""
-    model = load_model(config.model)
-    if config.data:
-        return calibrate_on_drives(config, model)
-
-    def work(run: cli.TableRun, **case: int | str) -> cli.Row:
-        if "overlap_town" in case:
-            # The other town is that of the next row.
-            seeds = (case["overlap_town"], case["overlap_town"] + 1)
-            drives = [simulation.simulate_drive(seed, length_m=TOWN_LENGTH_M) for seed in seeds]
-            return measure_town(model, drives, config.seed)
-        drive, bands_m = open_place(**case)
-        pairs = cli.draw_calibration_pairs(drive, bands_m, NUM_PAIRS, config.seed)
-        return cli.measure_pairs(model, run.until_stopped(pairs))
-
-    cases = list_cases()
-    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, model, rows, len(cases)))
-
-
-def calibrate_on_drives(config: Config, model: dpm.Model) -> list[cli.Row]:
-    """Calibrates on the drives of the user."""
-    drives = [source() for source in cli.find_sources(config.data, [])]
-
-    def work(run: cli.TableRun) -> cli.Row:
-        return cli.measure_drives(model, drives, config.seed)._asdict()
-
-    def report(rows: list[cli.Row]) -> cli.Summary:
-        measured = cli.MeasuredDrives(*(rows[0][name] for name in cli.MeasuredDrives._fields))
-        calibrated, numbers = cli.calibrate(model, measured)
-        note = f"Confidence and overlap calibrated on {', '.join(config.data)}."
-
-        def write(folder: cli.RunFolder) -> None:
-            save_model(calibrated, folder / MODEL, card=f"{card_of(config.model)} {note}".strip())
-
-        text = ", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float))
-        return cli.Summary({"model": config.model, **numbers}, text, write, rows=())
-
-    return cli.run_table(config, EXPERIMENT, [{}], work, report)
-
-
-def measure_town(model: dpm.Model, drives: list[LidarSequence], seed: int) -> cli.Row:
-    """Returns evidence and labels of pairs of a few scans of a town, and of fewer ones of a second town."""
-    parts = [
-        drive.take(np.unique(np.linspace(0, len(drive) - 1, num).astype(int)))
-        for drive, num in zip(drives, (NUM_SCANS, NUM_OTHER_SCANS), strict=True)
-    ]
-    found = cli.measure_overlap(model, parts, NUM_OVERLAP_PAIRS, seed)
-    if found is None:
-        raise ValueError(f"{drives[0].name}: no pairs of scans with overlap, or none without")
-    return found
+def main(options: CalibrateOptions, run: cli.Run) -> cli.Row:
+    """Registers and compares the pairs, fits, and writes the model; or checks it."""
+    model = load_model(options.model)
+    if options.data:
+        return calibrate_on_drives(options, run, model)
+    if options.check:
+        return check_calibration(options, run, model)
+    run.open()
+    if options.evidence:
+        return fit_evidence(options, run, model)
+    kinds = itertools.cycle(kind for kind, _ in simulation.SceneMixture().kinds)
+    places = [{"place": FIRST_TOWN + number, "kind": next(kinds), "beams": 0} for number in range(NUM_TOWNS)]
+    places += list_ambiguous(FIRST_AMBIGUOUS, NUM_AMBIGUOUS)
+    pairs = measure_places(run, model, places, AMBIGUOUS_BANDS_M, NUM_PAIRS, options.seed)
+    matches = measure_towns(run, model, options.seed)
+    if run.is_stopped:
+        return {"verdict": f"stopped after {len(pairs)} registrations and {len(matches)} matches: nothing is fitted"}
+    calibration, numbers, held_out = cli.fit_confidence(pairs)
+    overlap, overlap_numbers, held_out["overlap"] = cli.fit_overlap(matches)
+    numbers |= overlap_numbers
+    note = f"Confidence calibrated on {NUM_TOWNS} towns and {NUM_AMBIGUOUS} ambiguous places, {len(pairs)} pairs; "
+    note += f"overlap fitted on {NUM_OVERLAP_TOWNS} towns, {len(matches)} pairs"
+    calibrated = model.replace(config=replace(model.config, calibration=calibration, overlap=overlap))
+    save_model(calibrated, run / MODEL, card=f"{card_of(options.model)} {note}.".strip())
+    for kind, name in (("of_scans", ""), ("of_elements", "_clouds"), ("overlap", "_overlap")):
+        labels = {"labels": ("overlap probability", "share of overlapping pairs")} if kind == "overlap" else {}
+        figure = viz.reliability_figure(*held_out[kind], title=f"{kind}, places left out of the fit", **labels)
+        viz.save_figure(figure, run / f"reliability{name}.png")
+    return {"model": options.model, **numbers, "verdict": note}
 
 
 def card_of(model: str) -> str:
@@ -122,64 +130,203 @@ def card_of(model: str) -> str:
     return read_card(Path(model)) if model.endswith(".safetensors") else model
 
 
-def list_cases() -> list[cli.Row]:
-    """Returns the places of the confidence, then the towns of the overlap."""
-    kinds = itertools.cycle(kind for kind, _ in simulation.SceneMixture().kinds)
-    towns = [{"town": FIRST_TOWN + number, "kind": next(kinds)} for number in range(NUM_TOWNS)]
-    places = [ambiguous_case(number, FIRST_AMBIGUOUS) for number in range(NUM_AMBIGUOUS)]
-    return towns + places + [{"overlap_town": FIRST_OVERLAP_TOWN + number} for number in range(NUM_OVERLAP_TOWNS)]
+def calibrate_on_drives(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> cli.Row:
+    """Calibrates on the drives of the user."""
+    drives = [source() for source in cli.find_sources(options.data, [])]
+    run.open()
+    calibrated, numbers = cli.calibrate(model, cli.measure_drives(model, drives, options.seed, on_pair=run.check_stop))
+    note = f"Confidence and overlap calibrated on {', '.join(options.data)}"
+    save_model(calibrated, run / MODEL, card=f"{card_of(options.model)} {note}.".strip())
+    return {"model": options.model, **numbers, "verdict": note}
 
 
-def open_place(
-    *, kind: str, town: int | None = None, place: int = 0, beams: int = 0
-) -> tuple[LidarSequence, cli.Bands]:
-    """Simulates a town or an ambiguous place; returns its drive, and the distances of its pairs, metres."""
-    if town is not None:
-        return simulation.simulate_drive(town, length_m=TOWN_LENGTH_M, kind=kind), TOWN_BANDS_M
-    return ambiguous_drive(place, kind, beams), AMBIGUOUS_BANDS_M
+def list_ambiguous(first: int, num: int) -> list[cli.Row]:
+    """Returns ambiguous places: their kinds take turns, then lidars do."""
+    lidars = list(BEAMS)
+    return [
+        {"place": first + k, "kind": AMBIGUOUS[k % len(AMBIGUOUS)], "beams": lidars[k // len(AMBIGUOUS) % len(BEAMS)]}
+        for k in range(num)
+    ]
 
 
-def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int) -> cli.Summary:
-    """Fits the regressions; the model and the reliability of places left out are written with the pictures."""
-    if len(rows) < num_cases:
-        return cli.Summary({"model": config.model}, f"{len(rows)} of {num_cases} places", rows=())
-    calibration, numbers, held_out = cli.fit_confidence([row for row in rows if "overlap_town" not in row])
-    overlap, overlap_numbers, overlap_held_out = cli.fit_overlap([row for row in rows if "overlap_town" in row])
-    numbers |= overlap_numbers
-    calibrated = replace(model.config, calibration=calibration, overlap=overlap)
-    note = f"Confidence calibrated on {NUM_TOWNS} towns and {NUM_AMBIGUOUS} ambiguous places, "
-    note += f"{numbers['num_pairs']} pairs"
-    note += f"; overlap fitted on {NUM_OVERLAP_TOWNS} towns, {numbers['num_overlap_pairs']} pairs"
-    title = "places left out of the fit"
-    figures = {
-        name: viz.reliability_figure(*held_out[kind], title=title)
-        for kind, name in (("of_scans", "reliability.png"), ("of_elements", "reliability_clouds.png"))
-    }
-    figures["reliability_overlap.png"] = viz.reliability_figure(
-        *overlap_held_out, title=f"overlap, {title}", labels=OVERLAP_LABELS
-    )
-
-    def write(folder: cli.RunFolder) -> None:
-        save_model(model.replace(config=calibrated), folder / MODEL, card=f"{card_of(config.model)} {note}.".strip())
-        for name, figure in figures.items():
-            viz.save_figure(figure, folder / name)
-
-    text = ", ".join(f"{name} {value:.3f}" for name, value in numbers.items() if isinstance(value, float))
-    return cli.Summary({"model": config.model, **numbers}, text, write, rows=())
-
-
-def ambiguous_case(number: int, first_seed: int) -> cli.Row:
-    """Returns the case of one of the ambiguous places: kinds of place take turns, then lidars do."""
-    beams = list(BEAMS)[number // len(AMBIGUOUS) % len(BEAMS)]
-    return {"place": first_seed + number, "kind": AMBIGUOUS[number % len(AMBIGUOUS)], "beams": beams}
-
-
-def ambiguous_drive(place: int, kind: str, beams: int) -> LidarSequence:
-    """Simulates an ambiguous place in its true size."""
+def open_place(place: int, kind: str, beams: int) -> LidarSequence:
+    """Simulates a town, or an ambiguous place in its true size."""
+    if kind not in AMBIGUOUS:
+        return simulation.simulate_drive(place, length_m=TOWN_LENGTH_M, kind=kind)
     true_size = simulation.SceneMixture(indoor_scale=(1.0, 1.0))
-    lidar, length_m = BEAMS[beams], TOWN_LENGTH_M
-    return simulation.simulate_drive(place, length_m=length_m, kind=kind, sensor=lidar, mixture=true_size)
+    return simulation.simulate_drive(place, length_m=TOWN_LENGTH_M, kind=kind, sensor=BEAMS[beams], mixture=true_size)
+
+
+def measure_places(
+    run: cli.Run, model: dpm.Model, places: Sequence[cli.Row], bands_m: cli.Bands, num_pairs: int, seed: int
+) -> list[cli.Row]:
+    """Registers pairs of each place and band of distances; a row for each pair, fewer where a place has fewer."""
+
+    @lru_cache(maxsize=1)
+    def read(place: int, kind: str, beams: int) -> list[dpm.ScanPair]:
+        bands = bands_m if kind in AMBIGUOUS else TOWN_BANDS_M
+        return list(cli.draw_calibration_pairs(open_place(place, kind, beams), bands, num_pairs, seed))
+
+    def work(place: int, kind: str, beams: int, pair: int) -> cli.Row:
+        pairs = read(place, kind, beams)
+        if pair >= len(pairs):
+            return {}
+        row = cli.measure_pair(model, pairs[pair])
+        return row | {"is_end": kind in AMBIGUOUS and row["distance_m"] >= cli.FAR_M}
+
+    cases = [{**place, "pair": number} for place in places for number in range(num_pairs * len(bands_m))]
+    return [row for row in cli.fill_table(run, cases, work, "pairs.csv") if row["is_right"] is not None]
+
+
+def measure_towns(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
+    """Matches pairs of a few scans of each town, and of fewer ones of the next town; a row for each pair."""
+
+    @lru_cache(maxsize=1)
+    def measure(place: int) -> cli.Row:
+        drives = []
+        for number, num in ((place, NUM_SCANS), (place + 1, NUM_OTHER_SCANS)):
+            drive = simulation.simulate_drive(number, length_m=TOWN_LENGTH_M)
+            drives.append(drive.take(np.unique(np.linspace(0, len(drive) - 1, num).astype(int))))
+        found = cli.measure_overlap(model, drives, NUM_OVERLAP_PAIRS, seed)
+        if found is None:
+            raise ValueError(f"{drives[0].name}: no pairs of scans with overlap, or none without")
+        return found
+
+    def work(place: int, pair: int) -> cli.Row:
+        found = measure(place)
+        features = dict(zip(dpm.OVERLAP_FEATURES, found["evidence"][pair], strict=True))
+        return {"is_overlap": found["is_overlap"][pair], **features}
+
+    towns = range(FIRST_OVERLAP_TOWN, FIRST_OVERLAP_TOWN + NUM_OVERLAP_TOWNS)
+    cases = [{"place": town, "pair": pair} for town in towns for pair in range(NUM_OVERLAP_PAIRS)]
+    return cli.fill_table(run, cases, work, "overlap.csv")
+
+
+def check_calibration(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> cli.Row:
+    """Registers pairs of ambiguous places that no fit has seen, and rates them by the calibration of the model."""
+    if model.config.calibration is None:
+        raise ValueError(f"{options.model}: expected a calibrated model; run experiments.dpm_calibrate")
+    run.open()
+    places = list_ambiguous(FIRST_CHECKED, NUM_CHECKED)
+    pairs = measure_places(run, model, places, CHECKED_BANDS_M, NUM_CHECKED_PAIRS, options.seed)
+    rated = rate_pairs(model.config.calibration, pairs)
+    summary = cli.summarize(
+        [row | {"kind": kind} for row in rated for kind in (row["kind"], "all")],
+        ("match", "kind"),
+        ("right", "sure", "wrong_if_sure", "sure_and_right_if_near"),
+    )
+    numbers: cli.Row = {"model": options.model}
+    for match in ("scans", "clouds"):
+        found = [np.array([row[name] for row in rated if row["match"] == match]) for name in ("confidence", "right")]
+        numbers |= {f"brier_of_{match}": metrics.brier_score(*found)}
+        numbers |= {f"calibration_error_of_{match}": metrics.expected_calibration_error(*found)}
+    return numbers | cli.write_summary(run, summary)
+
+
+def rate_pairs(calibration: dpm.Calibration, pairs: Sequence[cli.Row]) -> list[cli.Row]:
+    """Returns a row for each pair matched as scans and as clouds: whether it is right, sure, and wrong though sure."""
+    rated = []
+    for row, match in itertools.product(pairs, ("scans", "clouds")):
+        confidence = cli.rate_pair(calibration, row, of_clouds=match == "clouds")
+        right, sure = row["is_right" if match == "scans" else "is_right_of_clouds"], confidence >= SURE
+        answers = {"confidence": confidence, "right": right, "sure": sure, "wrong_if_sure": not right if sure else None}
+        near = sure and right if row["distance_m"] <= NEAR_M else None
+        rated.append({"match": match, "kind": row["kind"], **answers, "sure_and_right_if_near": near})
+    return rated
+
+
+def fit_evidence(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> cli.Row:
+    """Compares the motions of pairs of simulated scenes with the truth, and fits `EvidenceWeights`.
+
+    Args:
+        options: seed of the pairs.
+        run: gets scene_N.npz with the evidence of all motions of each scene, and the table.
+        model: encoder and decoder.
+
+    Returns:
+        The weights, and the table.
+    """
+    scenes = [(*scene.split(), thinned) for thinned, some in SCENES.items() for scene in some.split(", ")]
+
+    def work(scene: int, kind: str, sensor: str, thinned: bool) -> cli.Row | None:
+        drive = simulation.simulate_drive(
+            FIRST_SCENE + scene, length_m=SCENE_LENGTH_M, kind=kind, sensor=getattr(simulation, sensor)
+        )
+        found = []
+        for pair, rows in enumerate(draw_scene_pairs(drive, kind, options.seed)):
+            if run.is_stopped:
+                return None
+            shares, is_right = measure_motions(model, drive, rows, thinned, options.seed)
+            found.append((np.full(len(is_right), pair), shares, is_right))
+        pairs, shares, is_right = map(np.concatenate, zip(*found, strict=True))
+        np.savez(run / f"scene_{scene}.npz", pair=pairs, shares=shares, is_right=is_right)
+        return {"num_pairs": len(found), "num_motions": len(pairs)}
+
+    cases = [
+        {"scene": number, "kind": kind, "sensor": sensor, "thinned": thinned}
+        for number, (kind, sensor, thinned) in enumerate(scenes)
+    ]
+    done = cli.fill_table(run, cases, work)
+    if len(done) < len(cases):
+        return {"verdict": f"stopped after {len(done)} of {len(cases)} scenes: nothing is fitted"}
+    evidence = [np.load(run / f"scene_{case['scene']}.npz") for case in cases]
+    shares, is_right = (np.concatenate([one[name] for one in evidence]) for name in ("shares", "is_right"))
+    number = np.concatenate([np.full(len(one["pair"]), row) for row, one in enumerate(evidence)])
+    present, table = np.array(astuple(dpm.EvidenceWeights())[1:]), []
+    for row, (case, one) in enumerate(zip(cases, evidence, strict=True)):
+        without, _ = dpm.fit_weights(shares[number != row], is_right[number != row])
+        chosen = {"by_the_present_weights": present, "by_a_fit_on_the_others": without}
+        rights = {name: share_right(one, weights) for name, weights in chosen.items()}
+        table.append(case | rights | {"any_right": share_right(one, None)})
+    weights, bias = dpm.fit_weights(shares, is_right)
+    fitted = dpm.EvidenceWeights(round(bias, 2), *np.round(weights, 2).tolist())
+    return {"evidence": asdict(fitted), **cli.write_summary(run, table), "verdict": str(fitted)}
+
+
+def draw_scene_pairs(drive: LidarSequence, kind: str, seed: int) -> list[np.ndarray]:
+    """Returns the numbers of the scans of pairs, near ones and then far ones."""
+    distances, bands = dpm.scan_distances(drive), INDOOR_BANDS_M if kind in INDOORS else SCENE_BANDS_M
+    return [
+        rows
+        for number, limits_m in enumerate(bands)
+        for rows in dpm.draw_rows_apart(distances, *limits_m, NUM_SCENE_PAIRS, np.random.default_rng([seed, number]))
+    ]
+
+
+def measure_motions(
+    model: dpm.Model, drive: LidarSequence, rows: np.ndarray, thinned: bool, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (m, 6) evidence of all motions of a pair, aligned as by `register`, and whether each is right."""
+    clouds, poses = [], []
+    for row in rows:
+        rng, T_lidar_turned = np.random.default_rng([seed, row]), np.eye(4)
+        tilt = Rotation.from_euler("xy", rng.normal(0, TILT_DEG, 2), degrees=True)
+        T_lidar_turned[:3, :3] = (tilt * Rotation.from_euler("z", rng.uniform(0, 360), degrees=True)).as_matrix()
+        scan = drive.read_scan(int(row)) @ T_lidar_turned[:3, :3]
+        if thinned:
+            scan = scan[np.linalg.norm(scan, axis=1) < THINNED_RANGE_M]
+            scan = scan[rng.choice(len(scan), min(NUM_THINNED, len(scan)), replace=False)]
+        clouds.append(scan.astype(np.float32))
+        poses.append(drive.T_world_lidar[row] @ T_lidar_turned)
+    prepared = [dpm.prepare_scan(model, scan) for scan in clouds]
+    found = dpm.match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
+    measured = [scan.measured for scan in prepared]
+    surfaces, config = [scan.surface for scan in measured], model.config.verification
+    T = np.concatenate([dpm.distinct_motions(found), scans.correlate_views(*surfaces, config.views)])
+    for alignment in (dpm.COARSE, dpm.FINE):
+        T = scans.align_surfaces(*surfaces, T, alignment)
+    T_true = np.broadcast_to(rigid.inverse(poses[1]) @ poses[0], T.shape)
+    return dpm.evidence_shares(*measured, T, config), metrics.registration_recall(T, T_true).is_right
+
+
+def share_right(scene: Mapping[str, np.ndarray], weights: np.ndarray | None) -> float:
+    """Returns the share of pairs whose motion of the highest score is right; without weights, where any motion is."""
+    pairs = [scene["pair"] == pair for pair in np.unique(scene["pair"])]
+    if weights is None:
+        return float(np.mean([scene["is_right"][pair].any() for pair in pairs]))
+    scores = scene["shares"] @ weights
+    return float(np.mean([scene["is_right"][pair][np.argmax(scores[pair])] for pair in pairs]))
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))

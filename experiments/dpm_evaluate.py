@@ -1,161 +1,109 @@
-"""Measures how well a DeepPointMap model registers scans, and SLAM with it, beside other programs on the same scans.
+"""Measures how well a DeepPointMap model registers scans, beside other methods on the same pairs.
 
     python -m experiments.dpm_evaluate path/to/drive another/drive --weights model.safetensors
     python -m experiments.dpm_evaluate town                             towns that no training has seen
     python -m experiments.dpm_evaluate path/to/drive --clouds 256 1024
-    python -m experiments.dpm_evaluate --slam path/to/drive another/drive
-    python -m experiments.dpm_evaluate --slam town --num-towns 5 --town-length-m 1000 4000
-    python -m experiments.dpm_evaluate --slam path/to/drive kitti_00.txt kitti_07.txt      towns along real routes
     python -m experiments.dpm_evaluate --resume                         go on where the last run stopped
 
-A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m and 10
-to 20 m apart and turned by any yaw, are registered. A registration within 2 m and 5 degrees is right. Results go to
-results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
-more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
+A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). Random pairs of scans, 2 to 10 m (near)
+and 10 to 20 m (middle) apart and turned by any yaw, are registered. A registration within 2 m and 5 degrees is right.
+Two more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
-a scan; the scans themselves are not used again. Another table has the accuracy of the offset head at walls, as
-coefficient of determination and root mean square residual. Rows of all recorded drives together have confidence
-intervals and say which methods differ.
-
-With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
-`peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
-file of poses (TUM or KITTI) stands for a town that is simulated along it; scans are kept in results/simulated. The
-file table.md has ATE, KITTI's t_rel, loops, their recall, bytes of maps, localisations and seconds a scan. The seconds
-are of all scans, and of the first and the last tenth, which show whether they grow. trajectories.png
-shows the trajectories; drives/ holds the trajectories of every method and the files of our run.
-`_slam_evaluation.py` says how loops are counted.
+a scan; the scans themselves are not used again. rows.csv has every pair, overlap.csv the overlap probability of each
+drive, table.md the shares that are right (95 % intervals) and the median errors of right ones. pooled.md has all
+recorded drives together, and says which methods differ. reliability.png and failures.png are as by `dpmjax evaluate`.
 """
 
 from __future__ import annotations
 
-import itertools
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, encode, load_model, register, registration_recall, slam
+from dpmjax import cli, encode, load_model, register
 from dpmjax import deeppointmap as dpm
-from dpmjax.io import LidarSequence
-from dpmjax.metrics import mcnemar_p_value, wilson_interval
+from dpmjax.metrics import mcnemar_p_value
 
 EXPERIMENT = "dpm_evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
-Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
-NETWORK, VERIFIED = "network alone", "network, search and verification"
-SEARCH, KISS = "search and verification, no network", "KISS-Matcher"
-# Beginning of the names of matches of clouds, before the number of surface elements.
-CLOUDS = "clouds, elements "
-OFFSETS = "offsets"
-# The row and its entry that say which pairs a method has registered right.
-_ANSWERS = {
-    NETWORK: ("DeepPointMap", "is_right_descriptors"),
-    VERIFIED: ("DeepPointMap", "is_right"),
-    SEARCH: ("search", "is_right"),
-    KISS: ("KISS-Matcher", "is_right"),
-}
 # Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data.
 MONITORED = ("kitti_00_drive",)
 
+Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.DriveOptions):
+class PairOptions(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
-    slam: FlagCreatePairsOff[bool] = False
-    """Compare SLAM on whole drives instead of registrations of pairs."""
     pairs: Annotated[int, arg(metavar="N")] = 30
     """Pairs for each distance."""
     clouds: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
     """Also register descriptor clouds, refined by N surface elements a scan."""
     num_towns: Annotated[int, arg(metavar="N")] = 3
     """Number of towns, where town is among the paths."""
-    town_length_m: Annotated[tuple[float, ...], arg(metavar="M")] = (400.0,)
-    """Length of the towns' routes; two numbers with --slam: from that of the first town to that of the last."""
+    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
+    """Length of the route of a town."""
     no_kiss: FlagCreatePairsOff[bool] = False
     """Leave KISS-Matcher out."""
-    localize: Annotated[int, arg(metavar="N")] = 50
-    """With --slam: number of scans that are looked for in the map of the first half; 0 leaves it out."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
-        super().__post_init__()
-        cli.check_least(self, pairs=1, num_towns=1, localize=0, town_length_m=100)
+        cli.check_least(self, pairs=1, num_towns=1, town_length_m=100, seed=0)
         if not self.paths:
             raise ValueError("give at least one folder of scans, or town")
-        if not 1 <= len(self.town_length_m) <= (2 if self.slam else 1):
-            raise ValueError("--town-length-m: expected one length, or two with --slam")
-        if not self.slam and (self.n_scans is not None or self.jump != 1 or self.kitti_angle_correction):
-            raise ValueError("only with --slam: --n-scans, --jump, --kitti-angle-correction")
 
 
-def main(config: Config) -> list[cli.Row]:
-    """Compares SLAM, or registers pairs."""
-    return evaluate_slam(config) if config.slam else evaluate_pairs(config)
-
-
-def evaluate_slam(config: Config) -> list[cli.Row]:
-    """Makes the rows of drives and methods that are missing, and writes tables, numbers and pictures."""
-    from experiments import _slam_comparison as comparison
-
-    methods = slam.make_methods(load_model(config.weights), weights=config.weights)
-    lengths_m = np.linspace(config.town_length_m[0], config.town_length_m[-1], config.num_towns).tolist()
-    drives = comparison.open_drives(config.paths, config, lengths_m)
-    return comparison.compare(config, EXPERIMENT, methods, drives, config.localize)
-
-
-def evaluate_pairs(config: Config) -> list[cli.Row]:
-    """Registers the pairs that are missing, and writes table, numbers and pictures."""
-    model = load_model(config.weights)
+def main(options: PairOptions, run: cli.Run) -> cli.Row:
+    """Registers the pairs that are missing, and writes tables, numbers and pictures."""
+    model = load_model(options.weights)
     low, high = model.config.num_descriptors, model.config.pyramid.stages[0].num_points
-    if not all(low <= num <= high for num in config.clouds):
-        raise ValueError(f"--clouds: expected from {low} to {high} elements a scan, got {config.clouds}")
-    matchers = {"search": partial(search_alone, config=model.config.verification), "KISS-Matcher": kiss_matcher}
-    matchers |= {f"{CLOUDS}{num}": partial(match_clouds, model=model, num_elements=num) for num in config.clouds}
-    drives = cli.open_evaluation_drives(config.paths, cli.evaluation_towns(config.num_towns, config.town_length_m[0]))
-    by_name = {drive.name: drive for drive in drives}
-    no_kiss = cli.why_not_importable("kiss_matcher") if not config.no_kiss else "left out by --no-kiss"
-    methods = ["DeepPointMap", *(name for name in matchers if no_kiss is None or name != "KISS-Matcher")]
+    if not all(low <= num <= high for num in options.clouds):
+        raise ValueError(f"--clouds: expected from {low} to {high} elements a scan, got {options.clouds}")
+    towns = cli.evaluation_towns(options.num_towns, options.town_length_m)
+    drives = cli.open_evaluation_drives(options.paths, towns)
+    pairs = cli.EvaluationPairs(drives, options.pairs, options.seed)
+    no_kiss = "left out by --no-kiss" if options.no_kiss else cli.why_not_importable("kiss_matcher")
+    matchers: dict[str, Matcher] = {"search": partial(search_alone, config=model.config.verification)}
+    matchers |= {} if no_kiss else {"kiss": kiss_matcher}
+    matchers |= {f"clouds_{num}": partial(match_clouds, model=model, num_elements=num) for num in options.clouds}
+    run.open()
 
-    def work(run: cli.TableRun, method: str, sequence: str, band: str) -> cli.Row:
-        drive = by_name[sequence]
-        if method == "overlap":
-            num_pairs = OVERLAP_FACTOR * config.pairs
-            return cli.overlap_row(model, drive, num_pairs, seed=config.seed, on_scan=run.check_stop)
-        if method == "DeepPointMap":
-            return cli.registration_row(model, cli.read_pairs(run, drive, band, config), config.pairs)
-        pairs = cli.read_pairs(run, drive, band, config)
-        return offset_row(model, pairs) if method == OFFSETS else evaluate_matcher(matchers[method], pairs)
+    def work(drive: str, band: str, pair: int) -> cli.Row:
+        scans = pairs.read(drive, band, pair)
+        row = cli.registration_row(model, scans)
+        for name, matcher in matchers.items() if band != "far" else ():
+            begun = time.perf_counter()
+            T_target_source = matcher(scans.source, scans.target)
+            row |= {f"{name}_s": time.perf_counter() - begun, **cli.motion_errors(name, T_target_source, scans)}
+        return row
 
-    methods += [OFFSETS] if config.clouds else []
-    bands = [(method, band) for band in ("near", "middle") for method in methods]
-    cases = [
-        {"method": method, "sequence": name, "band": band}
-        for name in by_name
-        for method, band in (*bands, ("DeepPointMap", "far"), ("overlap", "all"))
-    ]
-    return cli.run_table(config, EXPERIMENT, cases, work, lambda rows: report(config, drives, rows, no_kiss))
-
-
-def report(config: Config, drives: Sequence[LidarSequence], rows: list[cli.Row], no_kiss: str | None) -> cli.Summary:
-    """Returns the numbers, the tables and the pictures of the pairs."""
+    rows = cli.fill_table(run, pairs.cases, work)
+    overlap = cli.fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
+    methods = ("network", "verified", "refined", *matchers)
+    shares = tuple(f"{name}_right" for name in methods)
+    others = (*(f"{name}_m" for name in methods), "pair_s", *(f"{name}_s" for name in matchers))
+    notes = () if no_kiss is None else (f"KISS-Matcher was not run: {no_kiss}.",)
+    summary = cli.summarize_pairs(rows, overlap, methods, (*shares, *others))
     recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
-    pooled = pooled_rows(rows, recorded or [drive.name for drive in drives])
-    numbers = {"weights": config.weights, "kiss_matcher": no_kiss or "run", **cli.calibration_numbers(rows)}
-    notes = [] if no_kiss is None else [f"KISS-Matcher was not run: {no_kiss}."]
-    text = "\n\n".join(filter(None, [table(rows), cloud_tables(rows), pooled_table(pooled), *notes]))
-    draw = partial(cli.draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
-    return cli.Summary({**numbers, "pooled": pooled}, text, draw)
+    pooled = pool_drives(rows, recorded or [drive.name for drive in drives])
+    numbers = {"weights": options.weights, "kiss_matcher": no_kiss or "run", **cli.rate_confidence(model, rows)}
+    numbers |= cli.write_summary(run, summary, *notes)
+    table = cli.summarize(pooled, ("drives", "band"), shares)
+    numbers |= cli.write_summary(run, table, *compare_methods(pooled, shares), name="pooled")
+    cli.draw_evaluation(run, model, pairs, rows, Path(options.weights).stem)
+    return numbers
 
 
 def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -184,127 +132,28 @@ def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, nu
     return np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
 
 
-def offset_row(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
-    """Returns the accuracy of the offset head on close descriptors: along the normal, along the wall, up."""
-    quality = dpm.offset_quality(
-        model,
-        [(*(encode(model, points) for points in (pair.source, pair.target)), pair.T_target_source) for pair in pairs],
-    )
-    return {"num_pairs": quality.num_pairs, "r2": quality.r2.tolist(), "rmse_m": quality.rmse_m.tolist()}
+def pool_drives(rows: Sequence[cli.Row], drives: Sequence[str]) -> list[cli.Row]:
+    """Returns the pairs of some drives, and again those of drives that were not watched during the training."""
+    near = [row for row in rows if row["drive"] in drives and row["band"] != "far"]
+    unseen = [row for row in near if row["drive"] not in MONITORED]
+    pooled = [row | {"drives": "all"} for row in near]
+    title = f"all but {', '.join(MONITORED)}, watched during the training"
+    return pooled + ([row | {"drives": title} for row in unseen] if len(unseen) < len(near) else [])
 
 
-def evaluate_matcher(matcher: Matcher, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
-    """Returns errors and seconds of another matcher on the same pairs."""
-    motions, seconds, true = [], [], []
-    for pair in pairs:
-        started = time.perf_counter()
-        motions.append(matcher(pair.source, pair.target))
-        seconds.append(time.perf_counter() - started)
-        true.append(pair.T_target_source)
-    errors = registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
-    row = cli.error_columns(errors, "_refined")
-    row["is_right"] = row.pop("is_right_refined")
-    return row | ({"pair_s": float(np.median(seconds))} if seconds else {})
-
-
-def table(rows: Sequence[cli.Row]) -> str:
-    """Returns the rows as a Markdown table: one line a sequence and distance."""
-    columns = (
-        "sequence", "distance", "pairs", f"recall: {NETWORK}", VERIFIED, "the same, refined", f"{SEARCH}, refined",
-        KISS, "median error: network alone", "refined", "s / pair", f"{KISS}, s", "overlap AUC",
-    )  # fmt: skip
-    by_case = {(row["method"], row["sequence"], row["band"]): row for row in rows}
-    lines = []
-    for (method, sequence, band), row in by_case.items():
-        if method != "DeepPointMap" or band not in cli.BAND_NAMES or not row["num_pairs"]:
-            continue
-        kiss, search = (by_case.get((other, sequence, band), {}) for other in ("KISS-Matcher", "search"))
-        auc = by_case.get(("overlap", sequence, "all"), {}).get("auc") if band == "near" else None
-        recalls = (row[f"recall_{stage}"] for stage in ("descriptors", "verified", "refined"))
-        others = (other.get("recall_refined") for other in (search, kiss))
-        errors = (cli.length_text(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
-        seconds = (row["pair_s"], kiss.get("pair_s"), cli.cell_text(auc, 3))
-        lines.append([sequence, cli.BAND_NAMES[band], row["num_pairs"], *recalls, *others, *errors, *seconds])
-    return cli.markdown(columns, lines)
-
-
-def cloud_tables(rows: Sequence[cli.Row]) -> str:
-    """Returns the registrations of descriptor clouds and the offsets as Markdown; without any, an empty string."""
-    lines, offsets = [], []
-    for row in (row for row in rows if row["method"].startswith((CLOUDS, OFFSETS)) and row["num_pairs"]):
-        case = (row["sequence"], cli.BAND_NAMES[row["band"]])
-        if row["method"] == OFFSETS:
-            axes = zip(row["r2"], row["rmse_m"], strict=True)
-            offsets.append([*case, *(f"{cli.cell_text(r2)} ({cli.cell_text(rmse_m)} m)" for r2, rmse_m in axes)])
-        else:
-            errors = (row["recall_refined"], cli.length_text(row["median_error_refined_m"]))
-            lines.append([*case, row["method"].removeprefix(CLOUDS), row["num_pairs"], *errors])
-    clouds = ("sequence", "distance", "surface elements of clouds", "pairs", "recall", "median error")
-    axes = ("sequence", "distance", "offsets along the normal: R2 (rmse)", "along the wall", "up")
-    tables = [cli.markdown(clouds, lines) if lines else "", cli.markdown(axes, offsets) if offsets else ""]
-    return "\n\n".join(filter(None, tables))
-
-
-def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> list[dict[str, Any]]:
-    """Pools the rows of pairs over drives, with and without those that were watched during the training.
-
-    Args:
-        rows: rows of `dpm_evaluate`.
-        drives: names of the drives to pool.
-
-    Returns:
-        One row for each set of drives, band and method that has registered all pairs of the set. `p_values` holds, by
-        the name of another method, the p-value of the difference.
-    """
-    sets = {"all drives": list(drives)}
-    unseen = [name for name in drives if name not in MONITORED]
-    if len(unseen) < len(drives):
-        sets[f"all drives but {', '.join(sorted(set(drives) - set(unseen)))}"] = unseen
-    pooled: list[dict[str, Any]] = []
-    for (title, names), band in itertools.product(sets.items(), cli.BAND_NAMES):
-        answers = {method: _answers(rows, method, names, band) for method in _ANSWERS}
-        known = {method: of_all for method, of_all in answers.items() if of_all is not None and len(of_all)}
-        for method, is_right in known.items():
-            share, low, high = wilson_interval(int(is_right.sum()), len(is_right))
-            others = {name: mcnemar_p_value(is_right, other) for name, other in known.items() if name != method}
-            numbers = {"num_pairs": len(is_right), "num_right": int(is_right.sum())}
-            interval = {"recall": share, "recall_low": low, "recall_high": high}
-            case = {"drives": title, "sequences": names, "band": band, "method": method}
-            pooled.append({**case, **numbers, **interval, "p_values": others})
-    return pooled
-
-
-def _answers(rows: Sequence[Mapping[str, Any]], method: str, drives: Sequence[str], band: str) -> np.ndarray | None:
-    """Returns which pairs of all drives are right; None where the method has not registered those of every drive."""
-    name, entry = _ANSWERS[method]
-    by_drive = {row["sequence"]: row for row in rows if row["method"] == name and row["band"] == band}
-    if any(entry not in by_drive.get(drive, {}) for drive in drives):
-        return None
-    return np.concatenate([np.zeros(0, bool), *(np.asarray(by_drive[drive][entry], bool) for drive in drives)])
-
-
-def pooled_table(pooled: Sequence[Mapping[str, Any]]) -> str:
-    """Returns the pooled rows as Markdown; without any, an empty string."""
-    if not pooled:
-        return ""
-    lines = []
-    for row in pooled:
-        p_values = "; ".join(f"{name} {_p_value(p)}" for name, p in row["p_values"].items())
-        recall = f"{row['recall']:.3f} ({row['recall_low']:.3f} to {row['recall_high']:.3f})"
-        numbers = (row["num_pairs"], row["method"], row["num_right"], recall)
-        lines.append([row["drives"], cli.BAND_NAMES[row["band"]], *numbers, p_values or "-"])
-    columns = ("pooled over", "distance", "pairs", "method", "right", "recall (95 % interval)")
-    text = cli.markdown((*columns, "p against the other methods"), lines)
-    notes = "Intervals: Wilson. p: McNemar's exact test, two-sided, on the same pairs."
-    notes += " All motions but those of the network alone and of KISS-Matcher are refined."
-    if watched := sorted({name for row in pooled for name in row["sequences"]} & set(MONITORED)):
-        notes += f" The recall on {', '.join(watched)} was watched during the training: it is no unseen drive."
-    return f"{text}\n\n{notes}"
-
-
-def _p_value(p: float) -> str:
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+def compare_methods(pooled: Sequence[cli.Row], shares: Sequence[str]) -> list[str]:
+    """Returns the p-values of the refined registrations against other methods on the same pairs (McNemar's test)."""
+    notes = []
+    for drives, band in dict.fromkeys((row["drives"], row["band"]) for row in pooled):
+        group = [row for row in pooled if (row["drives"], row["band"]) == (drives, band)]
+        answers = {name: np.array([row[name] for row in group]) for name in shares}
+        ours = answers.pop("refined_right")
+        p_values = (
+            f"{name.removesuffix('_right')} {mcnemar_p_value(ours, other):.2g}" for name, other in answers.items()
+        )
+        notes.append(f"{drives}, {band}: p of refined against {', '.join(p_values)} (McNemar's exact test, two-sided).")
+    return notes
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))

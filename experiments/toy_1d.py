@@ -3,20 +3,20 @@
     python -m experiments.toy_1d
     python -m experiments.toy_1d --seeds 100 -o out
 
-Writes toy.png (figure 14) and metrics.json. The metrics are the share of seeds
-that reach the global minimum, in the network form and in the direct form, from the same starts. The direct form is
-solved by plain descent and by three solvers of jaxopt. The metrics cover several initialisations and learning rates.
+Writes toy.png (figure 14), rows.csv and table.md. They have the share of seeds that reach the global minimum, in the
+network form and in the direct form, from the same starts, for several initialisations and learning rates. The file
+metrics.json also has these shares for three solvers of jaxopt on the direct form.
 """
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, get_args
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import arg
 
 from dpmjax import cli, viz
@@ -27,98 +27,86 @@ FORMS = ("network", "direct")
 # Solvers of jaxopt with a line search.
 SOLVERS = {"gradient-descent": "GradientDescent", "lbfgs": "LBFGS", "bfgs": "BFGS"}
 # Half the way to the next local minimum is 0.31; an end this close is in the right valley and at its bottom.
-_SAME_PLACE = 0.05
-# The pictures show -VIEW to VIEW.
+SAME_PLACE = 0.05
+# The picture shows -VIEW to VIEW.
 VIEW = 6.0
 # The paper's is 2e-4.
 LEARNING_RATES = (1e-4, 2e-4, 5e-4, 1e-3)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.OutputOptions):
+class ToyOptions(cli.RunOptions):
     """Options of the example."""
 
     seeds: Annotated[int, arg(metavar="N")] = 1000
     """Starts, all in one vmap."""
     steps: Annotated[int, arg(metavar="N")] = 1000
     """Steps of descent; the paper's number."""
-    seed: int = 0
-    """Seed of everything random."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
         cli.check_least(self, seeds=1, steps=1)
 
 
-def main(config: Config) -> None:
-    """Runs all seeds, then all variants, draws, measures, writes."""
+def main(options: ToyOptions, run: cli.Run) -> cli.Row:
+    """Runs all seeds and all variants, draws, and writes the table."""
     cli.require_importable("jaxopt", "the solvers of the direct form")
-    folder = cli.open_run_folder(config, EXPERIMENT)
-    with cli.recording(folder):
-        paper = dm.ToyConfig(num_steps=config.steps)
-        ends, figure = run_paper(paper, config)
-        variants = []
-        settings = list(itertools.product(get_args(dm.Initialization), LEARNING_RATES))
-        for initialization, rate in tqdm(settings, desc="initialisations and learning rates", dynamic_ncols=True):
-            runs = descend(replace(paper, initialization=initialization, learning_rate=rate), config)
-            shares = {form: share_at_minimum(run.poses) for form, run in runs.items()}
-            variants.append({"initialization": initialization, "learning_rate": rate, **shares})
-        x_best, loss_best = dm.global_minimum()
-        metrics = {
-            "x_global": x_best,
-            "loss_global": loss_best,
-            "seeds": config.seeds,
-            "steps": config.steps,
-            "share_at_global_minimum": {name: share_at_minimum(x) for name, x in ends.items()},
-            "variants": variants,
-        }
-        cli.write_metrics(folder, metrics, seed=config.seed)
-        x = np.linspace(-VIEW, VIEW, 2401)
-        loss = np.asarray(dm.toy_loss(x))
-        viz.save_figure(viz.toy_figure((x, loss), **figure), folder / "toy.png")
-        print(report(metrics), f"results in {folder.path}", sep="\n")
+    run.open()
+    paper = dm.ToyConfig(num_steps=options.steps)
+    fits = descend(paper, options)
+    draw(run, paper, fits)
+
+    def work(initialization: Any, learning_rate: float) -> cli.Row:
+        found = descend(replace(paper, initialization=initialization, learning_rate=learning_rate), options)
+        return {form: share_at_minimum(np.asarray(fit.poses)) for form, fit in found.items()}
+
+    shares = {f"{form} form, gradient descent": share_at_minimum(np.asarray(fit.poses)) for form, fit in fits.items()}
+    starts = jnp.asarray(path(fits["direct"])[:, 0])
+    for solver in SOLVERS:
+        solve = jax.jit(jax.vmap(partial(minimize, solver=solver, max_iterations=options.steps)))
+        shares[f"direct form, jaxopt {solver}"] = share_at_minimum(np.asarray(solve(starts)))
+    cases = [
+        {"initialization": one, "learning_rate": rate} for one in get_args(dm.Initialization) for rate in LEARNING_RATES
+    ]
+    summary = cli.summarize(cli.fill_table(run, cases, work), tuple(cases[0]), FORMS)
+    x_best, loss_best = dm.global_minimum()
+    notes = [f"{name}: {share:.1%} at x = {x_best:.3f}, L = {loss_best:.3f}" for name, share in shares.items()]
+    numbers = {"x_global": x_best, "loss_global": loss_best, "share_at_global_minimum": shares}
+    return numbers | cli.write_summary(run, summary, *notes)
 
 
-def descend(toy: dm.ToyConfig, config: Config) -> dict[str, dm.Fit]:
+def descend(toy: dm.ToyConfig, options: ToyOptions) -> dict[str, dm.Fit]:
     """Fits all seeds as starts of one fit in each form, from the same starts."""
-    import jax
-
     problems = {form: dm.toy_problem(replace(toy, form=form)) for form in FORMS}
-    starts = {"key": jax.random.key(config.seed), "num_starts": config.seeds}
+    starts = {"key": jax.random.key(options.seed), "num_starts": options.seeds}
     return {form: dm.fit(problem, None, **starts) for form, problem in problems.items()}
 
 
-def path(run: dm.Fit) -> np.ndarray:
+def path(fit: dm.Fit) -> np.ndarray:
     """Returns (seeds, steps + 1) x of every seed from the start to the end."""
-    x = np.atleast_2d(np.asarray(run.report.terms))
-    return np.concatenate([x, np.reshape(run.poses, (-1, 1))], axis=1)
+    x = np.atleast_2d(np.asarray(fit.report.terms))
+    return np.concatenate([x, np.reshape(fit.poses, (-1, 1))], axis=1)
 
 
-def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Returns the ends of all methods with the paper's settings, and the data of figure 14 of one seed."""
-    import jax
-    import jax.numpy as jnp
-
-    runs = descend(toy, config)
-    network, direct = map(path, runs.values())
-    ends = {f"{name} form, gradient descent": x[:, -1] for name, x in zip(FORMS, (network, direct), strict=True)}
-    for solver in SOLVERS:
-        solve = jax.jit(jax.vmap(partial(minimize, solver=solver, max_iterations=config.steps)))
-        ends[f"direct form, jaxopt {solver}"] = np.asarray(solve(jnp.asarray(direct[:, 0])))
+def draw(run: cli.Run, toy: dm.ToyConfig, fits: dict[str, dm.Fit]) -> None:
+    """Draws figure 14 of one seed."""
+    network, direct = map(path, fits.values())
     # Out of the same vmap as the shares: the descent is chaotic, and one seed compiled alone rounds its way elsewhere.
     chosen = choose_seed(network, direct)
-    z = jnp.linspace(-VIEW, VIEW, 1201)
-    params = runs["network"].state.params
-    if config.seeds > 1:
-        params = jax.tree.map(lambda x: x[chosen], params)
+    z, x = jnp.linspace(-VIEW, VIEW, 1201), np.linspace(-VIEW, VIEW, 2401)
+    params = fits["network"].state.params
+    if len(network) > 1:
+        params = jax.tree.map(lambda leaf: leaf[chosen], params)
     converted = dm.toy_loss(jax.vmap(lambda one: dm.network_value(toy, params.replace(z=one)))(z))
     x_direct, visited = float(direct[chosen, -1]), network[chosen]
-    return ends, {
-        "converted": (np.asarray(z), np.asarray(converted)),
-        "visited": (visited, np.asarray(dm.toy_loss(visited))),
-        "direct_end": (x_direct, float(dm.toy_loss(x_direct))),
-        "network_end_z": float(params.z),
-    }
+    figure = viz.toy_figure(
+        (x, np.asarray(dm.toy_loss(x))),
+        converted=(np.asarray(z), np.asarray(converted)),
+        visited=(visited, np.asarray(dm.toy_loss(visited))),
+        direct_end=(x_direct, float(dm.toy_loss(x_direct))),
+        network_end_z=float(params.z),
+    )
+    viz.save_figure(figure, run / "toy.png")
 
 
 def minimize(x0: Any, *, solver: str, max_iterations: int) -> Any:
@@ -144,7 +132,7 @@ def choose_seed(network_x: np.ndarray, direct_x: np.ndarray) -> int:
 
 def is_at_minimum(x: np.ndarray) -> np.ndarray:
     """Returns True for ends at the global minimum."""
-    return np.abs(np.asarray(x, np.float64) - dm.global_minimum()[0]) < _SAME_PLACE
+    return np.abs(np.asarray(x, np.float64) - dm.global_minimum()[0]) < SAME_PLACE
 
 
 def share_at_minimum(x: np.ndarray) -> float:
@@ -152,19 +140,5 @@ def share_at_minimum(x: np.ndarray) -> float:
     return float(is_at_minimum(x).mean())
 
 
-def report(metrics: dict[str, Any]) -> str:
-    """Returns the shares as lines."""
-    minimum = f"x = {metrics['x_global']:.3f}, L = {metrics['loss_global']:.3f}"
-    lines = [
-        f"{name:36} {100 * share:5.1f} % at {minimum}" for name, share in metrics["share_at_global_minimum"].items()
-    ]
-    lines += [
-        f"{row['initialization']:12} rate {row['learning_rate']:g}: "
-        f"network {100 * row['network']:5.1f} %, direct {100 * row['direct']:5.1f} %"
-        for row in metrics["variants"]
-    ]
-    return "\n".join(lines)
-
-
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, Config, name=EXPERIMENT, description=__doc__))
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))

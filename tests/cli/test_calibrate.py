@@ -7,30 +7,21 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli.calibrate import MeasuredDrives, calibrate, fit_confidence, measure_overlap
-from dpmjax.deeppointmap import CLOUD_FEATURES, ELEMENT_FEATURES, OVERLAP_FEATURES, SCAN_FEATURES
+from dpmjax.cli.calibrate import KINDS, MeasuredDrives, calibrate, column_of, fit_confidence, measure_overlap
+from dpmjax.deeppointmap import OVERLAP_FEATURES
 from tests.deeppointmap import toy
 
 
-def registrations(num: int, seed: int, *, is_right: bool | None = None) -> dict:
+def registrations(num: int, place: int, *, is_right: bool | None = None) -> list[dict]:
     """Registrations whose features say how probably they are right."""
-    rng = np.random.default_rng(seed)
-    right = rng.uniform(size=num) < 0.5 if is_right is None else np.full(num, is_right)
-
-    def features(names: tuple[str, ...]) -> list[list[float]]:
-        return (rng.normal(size=(num, len(names))) + right[:, None]).tolist()
-
-    return {
-        "of_clouds": features(CLOUD_FEATURES),
-        "of_elements": features(ELEMENT_FEATURES),
-        "of_scans": features(SCAN_FEATURES),
-        "of_weak_scans": [None] * num,
-        "lookalike_gap_of_elements": [None] * num,
-        "lookalike_gap_of_scans": [None] * num,
-        "is_right_of_clouds": right.tolist(),
-        "is_right": right.tolist(),
-        "distance_m": [5.0] * num,
-    }
+    rng, rows = np.random.default_rng(place), []
+    for _ in range(num):
+        right = rng.uniform() < 0.5 if is_right is None else is_right
+        row = {"place": place, "is_right": right, "is_right_of_clouds": right, "distance_m": 5.0}
+        for kind, names in KINDS.items():
+            row |= {column_of(kind, name): rng.normal() + right if kind != "of_weak_scans" else None for name in names}
+        rows.append(row)
+    return rows
 
 
 def matches(num: int, seed: int) -> dict:
@@ -49,7 +40,7 @@ def model() -> dpmjax.Model:
 
 
 def test_fits_are_measured_on_held_out_places(model) -> None:
-    of_places = [registrations(60, seed) for seed in (0, 1)], [registrations(60, 2)]
+    of_places = [*registrations(60, 0), *registrations(60, 1)], registrations(60, 2)
     measured = MeasuredDrives(*of_places, matches(200, 3), matches(100, 4))
     calibrated, numbers = calibrate(model, measured)
     assert calibrated.config.calibration is not None
@@ -62,14 +53,14 @@ def test_fits_are_measured_on_held_out_places(model) -> None:
 
 
 def test_what_the_pairs_cannot_fix_is_left_out(model) -> None:
-    measured = MeasuredDrives([registrations(20, 0, is_right=True)], [], None, None)
+    measured = MeasuredDrives(registrations(20, 0, is_right=True), [], None, None)
     calibrated, numbers = calibrate(model, measured)
     assert (calibrated.config.calibration, calibrated.config.overlap) == (None, None)
     assert numbers == {"num_pairs": 20}
 
 
 def test_without_other_places_each_one_is_left_out_in_turn() -> None:
-    calibration, numbers, held_out = fit_confidence([registrations(60, seed) for seed in range(3)])
+    calibration, numbers, held_out = fit_confidence([row for place in range(3) for row in registrations(60, place)])
     assert calibration is not None
     assert len(held_out["of_scans"][0]) == 180
     assert numbers["brier_of_scans"] < 0.25

@@ -13,12 +13,12 @@ import pytest
 import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli import drives
-from dpmjax.cli.evaluate import table
 from dpmjax.cli.program import main
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
-from dpmjax.deeppointmap import SamplingConfig, scan_evaluation
+from dpmjax.deeppointmap import SamplingConfig
 from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
+from tests.experiments.running import read_rows
 
 
 def run(arguments: list[str]) -> int:
@@ -37,58 +37,54 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     out = tmp_path / "out"
     assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == EXIT_OK
-    printed = capsys.readouterr().out
-    assert "| toy 5000000 | 2-10 m | 2 |" in printed
-    assert "| toy 5000000 | 10-20 m | 2 |" in printed
-    assert "Brier score of the confidence" in printed
-    assert "(0 is best; these weights are not calibrated)" in printed
-    metrics = load_json(out / "metrics.json")
-    assert [row["band"] for row in metrics["rows"]] == ["near", "middle", "far", "overlap"]
+    printed, metrics, rows = capsys.readouterr().out, load_json(out / "metrics.json"), read_rows(out)
+    assert "| toy 5000000 | near | 2 |" in printed
+    assert "| toy 5000000 | middle | 2 |" in printed
+    assert metrics["verdict"] in printed
+    assert metrics["verdict"].endswith("(0 is best; these weights are not calibrated)")
+    assert [row["band"] for row in rows] == [band for band in ("near", "middle", "far") for _ in range(2)]
     assert metrics["is_calibrated"] is False
-    near = metrics["rows"][0]
-    assert len(near["translation_errors_refined_m"]) == len(near["confidence"]) == 2
-    assert near["pair_s"] > 0
-    assert 0 <= metrics["rows"][3]["auc"] <= 1
+    right = np.array([row["refined_right"] == "True" for row in rows])
+    confidence = np.array([float(row["confidence"]) for row in rows])
+    assert metrics["brier"] == pytest.approx(np.mean((confidence - right) ** 2))
+    assert 0 <= float(read_rows(out, "overlap.csv")[0]["auc"]) <= 1
     for name in ("table.md", "reliability.png", "config.json", "log.txt"):
         assert (out / name).exists()
-    monkeypatch.setattr(deeppointmap, "evaluate_scan_pairs", None)
+    monkeypatch.setattr(deeppointmap, "evaluate_overlap", None)
     assert run(["--resume", "-o", str(out)]) == EXIT_OK
-    assert load_json(out / "metrics.json")["rows"] == metrics["rows"]
+    assert read_rows(out) == rows
+    assert load_json(out / "metrics.json")["table"] == metrics["table"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_registered", [1, 4])
-def test_ctrl_c_within_a_band_keeps_the_rows_before_it(weights, tmp_path, monkeypatch, num_registered: int) -> None:
+def test_ctrl_c_keeps_the_pairs_before_it(weights, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
-    out, register, count = tmp_path / "out", scan_evaluation.register_in_stages, itertools.count(1)
+    out, register, count = tmp_path / "out", deeppointmap.register_in_stages, itertools.count(1)
 
     def interrupting(*arguments):
-        if next(count) == num_registered:
+        if next(count) == 3:
             os.kill(os.getpid(), signal.SIGINT)
         return register(*arguments)
 
-    # The first pair of a band is registered twice.
-    monkeypatch.setattr(scan_evaluation, "register_in_stages", interrupting)
+    monkeypatch.setattr(deeppointmap, "register_in_stages", interrupting)
     assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == 130
-    stopped = load_json(out / "metrics.json")
-    assert stopped["status"] == "interrupted"
-    assert [row["band"] for row in stopped["rows"]] == ["near"][: num_registered // 4]
-    assert next(count) <= num_registered + 3
+    stopped = read_rows(out)
+    assert load_json(out / "metrics.json")["status"] == "interrupted"
+    assert [row["band"] for row in stopped] == ["near", "near", "middle"]
     assert run(["--resume", "-o", str(out)]) == EXIT_OK
-    whole = load_json(out / "metrics.json")
-    assert whole["status"] == "done"
-    assert [row["band"] for row in whole["rows"]] == ["near", "middle", "far", "overlap"]
-    assert whole["rows"][: len(stopped["rows"])] == stopped["rows"]
+    assert load_json(out / "metrics.json")["status"] == "done"
+    assert read_rows(out)[:3] == stopped
+    assert len(read_rows(out)) == 6
 
 
 def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) -> None:
     write_kitti_sequence(tmp_path / "kitti", "00", toy.drive(num_scans=6))
     arguments = [str(tmp_path / "kitti"), "--weights", str(weights), "--pairs", "1", "-o", str(tmp_path / "out")]
     assert run(arguments) == EXIT_OK
-    assert "| 2-10 m | 1 |" in capsys.readouterr().out
-    # No two scans are so far apart: those rows are empty.
-    by_band = {row["band"]: row for row in load_json(tmp_path / "out" / "metrics.json")["rows"]}
-    assert (by_band["far"]["num_pairs"], by_band["overlap"]["auc"]) == (0, None)
+    assert "| near | 1 |" in capsys.readouterr().out
+    # No two scans are far apart.
+    assert [row["band"] for row in read_rows(tmp_path / "out")] == ["near", "middle"]
+    assert read_rows(tmp_path / "out", "overlap.csv")[0]["auc"] in ("", "nan")
 
 
 def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> None:
@@ -97,13 +93,6 @@ def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> N
     near = SamplingConfig(max_distance_m=3.0)
     with pytest.raises(ValueError, match=r"no two of them 0\.25 to 3\.0 m apart"):
         drives.find_sources([str(tmp_path / "kitti")], [], near)
-
-
-def test_a_table_of_no_right_registration_has_no_median() -> None:
-    row = {"sequence": "a", "band": "near", "num_pairs": 1, "pair_s": 0.5, "is_right": [False]}
-    for stage in ("descriptors", "verified", "refined"):
-        row |= {f"recall_{stage}": 0.0, f"median_error_{stage}_m": np.nan}
-    assert table([row]).splitlines()[-1] == "| a | 2-10 m | 1 | 0.00 | 0.00 | 0.00 (0.00 to 0.79) | - | - | 0.50 | - |"
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def test_tests_of_a_broken_package_are_skipped_with_the_reason(packages: Path) -
     [
         (deepmapping_rgbd, ["--methods", "multiway"], "open3d", "--methods multiway"),
         (deepmapping_suite, ["--methods", "icp-plane", "multiway"], "open3d", "--methods multiway"),
-        (deepmapping_suite, ["--methods", "particle-swarm"], "evosax", "--methods particle-swarm"),
+        (deepmapping_suite, ["--methods", "swarm-poses"], "evosax", "--methods swarm-poses"),
         (slam, ["-v"], "rerun", "-v"),
         (toy_1d, [], "jaxopt", "the solvers of the direct form"),
     ],

@@ -48,9 +48,7 @@ def test_help_of_a_subcommand_has_examples_and_loads_nothing_slow(name) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("module", "name"), [("deepmapping_2d", "map2d"), ("dpm_train", "train"), ("dpm_slam", "slam")]
-)
+@pytest.mark.parametrize(("module", "name"), [("deepmapping_2d", "map2d"), ("dpm_train", "train")])
 def test_an_experiment_of_another_name_is_the_subcommand(module: str, name: str) -> None:
     command = [sys.executable, "-m", f"experiments.{module}", "--help"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)

@@ -455,8 +455,9 @@ COMMAND_SEEDS = range(8)
 @pytest.mark.parametrize("name", SCANS)
 def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, monkeypatch):
     """Every refusal has exit code 2 and one line; work begins only with scans that were read."""
-    from dpmjax.cli import map2d as command
     from dpmjax.cli.command import run_command
+
+    from dpmjax.cli import map2d as command
 
     class BegunError(Exception):
         pass
@@ -492,8 +493,9 @@ def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, mo
     ],
 )
 def test_the_command_refuses_what_cannot_be_registered(tmp_path, capsys, points, found):
-    from dpmjax.cli import map2d as command
     from dpmjax.cli.command import run_command
+
+    from dpmjax.cli import map2d as command
 
     np.save(tmp_path / "a.npy", points)
     arguments = [str(tmp_path / "a.npy"), "-o", str(tmp_path / "out")]

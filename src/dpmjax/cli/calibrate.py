@@ -6,7 +6,7 @@ simulated places, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -23,14 +23,19 @@ Bands = tuple[tuple[float, float], ...]
 # Probabilities of examples by fits without their place, and the labels of these examples.
 HeldOut = tuple[np.ndarray, np.ndarray]
 
-KINDS = ("of_clouds", "of_elements", "of_scans", "of_weak_scans")
+# Features of each kind of evidence; a row of a pair has a column for each, named `column_of(kind, feature)`.
+KINDS = {
+    "of_clouds": dpm.CLOUD_FEATURES,
+    "of_elements": dpm.ELEMENT_FEATURES,
+    "of_scans": dpm.SCAN_FEATURES,
+    "of_weak_scans": dpm.WEAK_FEATURES,
+}
 OF_CLOUDS = ("of_clouds", "of_elements")
 HAVE_LOOKALIKES = ("of_elements", "of_scans")
 # Elements of a scan in the map of SLAM, and in `register(..., refine=True)` with a cloud.
 NUM_ELEMENTS = 1024
 PAIR_STREAM, OVERLAP_STREAM = 4141, 4134
-# The two ends of a corridor may look alike. Only `register` of clouds has to know: SLAM proposes neighbours, and scans
-# tell the ends apart.
+# Scans that are farther apart have no overlap.
 FAR_M = 60.0
 DRIVE_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (FAR_M, np.inf))
 # Pairs of all drives of a user together: two minutes of two cores at rest.
@@ -73,39 +78,50 @@ def draw_calibration_pairs(
         yield from dpm.read_scan_pairs(drive, drawn, seed=seed)
 
 
-def measure_pairs(model: dpm.Model, pairs: Iterable[dpm.ScanPair], on_pair: Callable[[], object] = lambda: None) -> Row:
-    """Registers pairs as scans, and as clouds of surface elements.
+def measure_pair(model: dpm.Model, pair: dpm.ScanPair) -> Row:
+    """Registers a pair as scans, and as clouds of surface elements.
 
     Args:
         model: encoder and decoder.
-        pairs: the pairs.
-        on_pair: called before each registration.
+        pair: the pair.
 
     Returns:
-        Lists with an entry for each pair: the evidence of each kind, whether both registrations are right, and the
-        true distance, metres.
+        The evidence of each kind, `is_right` and `is_right_of_clouds`, the leads over places that look alike, None
+        where none does, and the true distance, metres.
     """
-    gaps = [f"lookalike_gap_{kind}" for kind in HAVE_LOOKALIKES]
-    found: Row = {name: [] for name in (*KINDS, *gaps, "is_right_of_clouds", "is_right", "distance_m")}
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
-    for pair in pairs:
-        on_pair()
-        result = dpm.register_in_stages(model, pair)
-        clouds = [dpm.encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
-        T_of_clouds, evidence_of_clouds = dpm.register_clouds(model, *clouds)
-        motions = np.stack([T_of_clouds, result.verified])
-        is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
-        for name in KINDS:
-            # At run time clouds have the features of their own best motion, whatever the scans say.
-            features = getattr(evidence_of_clouds if name in OF_CLOUDS else result.evidence, name)
-            found[name].append(None if features is None else features.tolist())
-        for name, evidence in zip(gaps, (evidence_of_clouds, result.evidence), strict=True):
-            gap = float(evidence.lookalike_gap)
-            found[name].append(gap if np.isfinite(gap) else None)
-        found["is_right_of_clouds"].append(bool(is_right[0]))
-        found["is_right"].append(bool(is_right[1]))
-        found["distance_m"].append(float(np.linalg.norm(pair.T_target_source[:3, 3])))
-    return found
+    result = dpm.register_in_stages(model, pair)
+    clouds = [dpm.encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
+    T_of_clouds, of_clouds = dpm.register_clouds(model, *clouds)
+    motions = np.stack([T_of_clouds, result.verified])
+    is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
+    row: Row = {
+        "is_right_of_clouds": bool(is_right[0]),
+        "is_right": bool(is_right[1]),
+        "distance_m": float(np.linalg.norm(pair.T_target_source[:3, 3])),
+    }
+    for kind, names in KINDS.items():
+        # At run time clouds have the features of their own best motion, whatever the scans say.
+        evidence = of_clouds if kind in OF_CLOUDS else result.evidence
+        features = getattr(evidence, kind)
+        values = [None] * len(names) if features is None else np.asarray(features).tolist()
+        row |= {column_of(kind, name): value for name, value in zip(names, values, strict=True)}
+        if kind in HAVE_LOOKALIKES:
+            row[f"lookalike_gap_{kind}"] = (
+                float(evidence.lookalike_gap) if np.isfinite(evidence.lookalike_gap) else None
+            )
+    return row
+
+
+def column_of(kind: str, feature: str) -> str:
+    """Returns the name of the column of a feature."""
+    return f"{kind} {feature}"
+
+
+def features_of(row: Row, kind: str) -> list[float] | None:
+    """Returns the features of a kind of evidence; None where a pair has none."""
+    values = [row[column_of(kind, name)] for name in KINDS[kind]]
+    return None if values[0] is None else values
 
 
 def measure_overlap(
@@ -159,7 +175,7 @@ class MeasuredDrives(NamedTuple):
     """Measured pairs of the drives of a user.
 
     Attributes:
-        confidence: registrations of each drive, of places that are trained on.
+        confidence: a row for each registration, with the number of its drive as `place`, of places that are trained on.
         tested_confidence: those of held-out places.
         overlap: matches of the drives; None without pairs of both labels.
         tested_overlap: those of held-out places.
@@ -197,14 +213,18 @@ def measure_drives(
     def numbers(num_pairs: int) -> int:
         return max(2, -(-num_pairs // (len(drives) * len(DRIVE_BANDS_M))))
 
-    def measure(drive: LidarSequence, num: int, anchors: Int[np.ndarray, " a"] | None = None) -> Row:
-        return measure_pairs(model, draw_calibration_pairs(drive, DRIVE_BANDS_M, num, seed, anchors=anchors), on_pair)
+    def measure(parts: Sequence[LidarSequence], num: int, anchors: Sequence[Any]) -> list[Row]:
+        rows = []
+        for place, (drive, anchor) in enumerate(zip(parts, anchors, strict=True)):
+            for pair in draw_calibration_pairs(drive, DRIVE_BANDS_M, num, seed, anchors=anchor):
+                on_pair()
+                rows.append({"place": place, **measure_pair(model, pair)})
+        return rows
 
-    num, num_tested = numbers(NUM_CONFIDENCE_PAIRS), numbers(NUM_TESTED_CONFIDENCE_PAIRS)
     held_out = [split.held_out for split in splits]
     return MeasuredDrives(
-        [measure(drive, num) for drive in of_training],
-        [measure(drive, num_tested, rows) for drive, rows in zip(drives, held_out, strict=True)],
+        measure(of_training, numbers(NUM_CONFIDENCE_PAIRS), [None] * len(drives)),
+        measure(drives, numbers(NUM_TESTED_CONFIDENCE_PAIRS), held_out),
         measure_overlap(model, of_training, NUM_OVERLAP_PAIRS, seed),
         measure_overlap(model, drives, NUM_TESTED_OVERLAP_PAIRS, seed + 1, anchors=held_out),
     )
@@ -261,22 +281,22 @@ def fit_confidence(
     Each regression is fitted on the pairs that it rates: scans on those whose walls hold all directions.
 
     Args:
-        rows: measured pairs of each place.
+        rows: measured pairs, each with the number of its `place`; where `is_end` is set, scans and clouds of the pair
+            are left out, because the two ends of an ambiguous place may look alike.
         tested: pairs of other places, that the numbers are of; None takes each place by a fit without it.
 
     Returns:
         The calibration, its numbers, and the confidence and the labels of the tested pairs. No calibration if all
         registrations of scans or clouds are right, or all are wrong.
     """
-    numbers: Row = {"num_pairs": sum(len(row["is_right"]) for row in rows)}
+    numbers: Row = {"num_pairs": len(rows)}
     models: dict[str, dpm.LogisticModel] = {}
     held_out: dict[str, HeldOut] = {}
-    features_of = dpm.CLOUD_FEATURES, dpm.ELEMENT_FEATURES, dpm.SCAN_FEATURES, dpm.WEAK_FEATURES
-    for kind, names in zip(KINDS, features_of, strict=True):
-        examples = _examples(rows, kind, len(names))
+    for kind, names in KINDS.items():
+        examples = _examples(rows, kind)
         if len(np.unique(examples.is_right)) < 2:
             continue
-        others = None if tested is None else _examples(tested, kind, len(names))
+        others = None if tested is None else _examples(tested, kind)
         models[kind], found = fit_held_out(names, examples, others)
         numbers |= {f"num_pairs_{kind}": len(examples.is_right), f"share_right_{kind}": float(examples.is_right.mean())}
         if len(found[1]):
@@ -290,49 +310,50 @@ def fit_confidence(
     return dpm.Calibration(**models) if is_whole else None, numbers, held_out
 
 
-def _examples(rows: Sequence[Row], kind: str, num_features: int) -> Examples:
-    pairs = [
-        (
-            place,
-            row[kind][number],
-            row["is_right_of_clouds" if kind in OF_CLOUDS else "is_right"][number],
-            lookalike_gap(row, number, kind),
-        )
-        for place, row in enumerate(rows)
-        for number, weak in enumerate(row["of_weak_scans"])
-        if row[kind][number] is not None
-        and (kind != "of_scans" or weak is None)
-        and (kind == "of_elements" or not is_end(row, number))
+def _examples(rows: Sequence[Row], kind: str) -> Examples:
+    """Returns the registrations that a kind of evidence rates: scans those whose walls hold all directions."""
+    chosen = [
+        row
+        for row in rows
+        if features_of(row, kind) is not None
+        and (kind != "of_scans" or features_of(row, "of_weak_scans") is None)
+        and (kind == "of_elements" or not row.get("is_end"))
     ]
-    columns = zip(*pairs, strict=True) if pairs else ([], [], [], [])
-    place, features, is_right, gaps = (np.asarray(column) for column in columns)
-    shares = np.asarray(dpm.lookalike_share(gaps.astype(float)))
-    return Examples(place.astype(int), features.astype(float).reshape(-1, num_features), is_right.astype(bool), shares)
+    features = np.array([features_of(row, kind) for row in chosen], float).reshape(-1, len(KINDS[kind]))
+    gaps = np.array([lookalike_gap(row, kind) for row in chosen], float)
+    label = "is_right_of_clouds" if kind in OF_CLOUDS else "is_right"
+    is_right = np.array([row[label] for row in chosen], bool)
+    place = np.array([row["place"] for row in chosen], int)
+    return Examples(place, features, is_right, np.asarray(dpm.lookalike_share(gaps)))
 
 
-def is_end(row: Row, number: int) -> bool:
-    """Returns True for a pair without overlap in an ambiguous place, whose ends may look alike."""
-    return "place" in row and bool(row["distance_m"][number] >= FAR_M)
+def lookalike_gap(row: Row, kind: str) -> float:
+    """Returns the lead of a pair over other places that look alike, infinite where none does."""
+    gap = row.get(f"lookalike_gap_{kind}")
+    return np.inf if gap is None else gap
 
 
-def lookalike_gap(row: Row, number: int, kind: str) -> float:
-    """Returns the lead of a pair over other places that look alike; files hold None for infinity."""
-    gap = row["lookalike_gap_" + kind][number] if kind in HAVE_LOOKALIKES else None
-    return np.inf if gap is None else float(gap)
+def rate_pair(calibration: dpm.Calibration, row: Row, *, of_clouds: bool) -> float:
+    """Returns the calibrated confidence of a pair, matched as clouds of surface elements or as scans."""
+    kinds = ("of_elements",) if of_clouds else ("of_scans", "of_weak_scans")
+    features = {kind: features_of(row, kind) for kind in kinds}
+    known = {kind: np.asarray(values) for kind, values in features.items() if values is not None}
+    evidence = dpm.MatchEvidence(np.asarray(features_of(row, "of_clouds")), None)
+    evidence = evidence._replace(**known, lookalike_gap=lookalike_gap(row, kinds[0]))
+    return float(dpm.calibrated_probability(calibration, evidence))
 
 
 def fit_overlap(rows: Sequence[Row]) -> tuple[dpm.LogisticModel, Row, HeldOut]:
     """Fits the regression of overlap.
 
     Args:
-        rows: pairs of each place, from `measure_overlap`.
+        rows: pairs, each with its `place`, `is_overlap` and `dpm.OVERLAP_FEATURES`.
 
     Returns:
         The regression, its numbers, and the probability of the pairs of each place by a fit without it.
     """
-    places = np.concatenate([np.full(len(row["is_overlap"]), number) for number, row in enumerate(rows)])
-    features = np.concatenate([np.asarray(row["evidence"], float) for row in rows])
-    is_overlap = np.concatenate([np.asarray(row["is_overlap"], bool) for row in rows])
+    features = np.array([[row[name] for name in dpm.OVERLAP_FEATURES] for row in rows], float)
+    places, is_overlap = (np.array([row[name] for row in rows]) for name in ("place", "is_overlap"))
     examples = Examples(places, features, is_overlap, np.ones(len(places)))
     fitted, found = fit_held_out(dpm.OVERLAP_FEATURES, examples)
     numbers: Row = {

@@ -5,21 +5,22 @@
     dpmjax evaluate path/to/drive --weights model.safetensors --pairs 100
     dpmjax evaluate --resume                       continue the latest run
 
-Random pairs of scans, 2 to 10 m and 10 to 20 m apart, are registered, each scan turned by any yaw. A registration
-within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (latest links to the newest). table.md has the
-recall of the network alone, after the verification by the scans, and after the final alignment. metrics.json has every
-pair. reliability.png shows the share of right registrations for each confidence, pairs more than 60 m apart included.
-failures.png shows wrong registrations from above. The AUC of overlap compares pairs less than 20 m apart (revisits
-where the drive has some) with pairs more than 40 m apart; metrics.json has that of the overlap head on the same pairs.
+Random pairs of scans, 2 to 10 m (near) and 10 to 20 m (middle) apart, are registered, each scan turned by any yaw. A
+registration within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (latest links to the newest).
+table.md has the shares that are right by the network alone, after the verification by the scans, and after the final
+alignment, with 95 % intervals, and the median errors of right ones. rows.csv has every pair. reliability.png shows the
+share of right registrations for each confidence, pairs more than 60 m apart (far) included. failures.png shows wrong
+registrations from above. The AUC of overlap compares pairs less than 20 m apart (revisits where the drive has some)
+with pairs more than 40 m apart; overlap.csv has that of the overlap head on the same pairs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -34,16 +35,13 @@ FIRST_TOWN = 5_000_000
 """Seed of the first town; no training, selection or calibration uses these towns."""
 
 NUM_SHOWN, TOWN_LENGTH_M = 4, 400.0
-STAGES = ("descriptors", "verified", "refined")
-BAND_NAMES = {"near": "2-10 m", "middle": "10-20 m"}
-COLUMNS = (
-    "drive", "distance", "pairs", "recall, network alone", "recall, verified", "recall, refined (95 % interval)",
-    "median error, network alone", "median error, refined", "s / pair", "overlap AUC",
-)  # fmt: skip
+BANDS = ("near", "middle", "far")
+STAGES = ("network", "verified", "refined")
+COLUMNS = (*(f"{stage}_right" for stage in STAGES), "network_m", "refined_m", "pair_s")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(cli.ModelOptions, cli.RunOptions):
+class EvaluateOptions(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
@@ -60,29 +58,23 @@ class Config(cli.ModelOptions, cli.RunOptions):
             raise ValueError("give at least one folder of scans, or town")
 
 
-def main(config: Config) -> list[cli.Row]:
+def main(options: EvaluateOptions, run: cli.Run) -> cli.Row:
     """Computes the missing rows, and writes table, numbers and pictures."""
-    model = weights.load_model(config.weights)
+    model = weights.load_model(options.weights)
     kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
-    drives = open_evaluation_drives(config.data, evaluation_towns(config.num_towns, TOWN_LENGTH_M, kinds))
-    by_name = {drive.name: drive for drive in drives}
+    drives = open_evaluation_drives(options.data, evaluation_towns(options.num_towns, TOWN_LENGTH_M, kinds))
+    pairs = EvaluationPairs(drives, options.pairs, options.seed)
+    run.open()
 
-    def work(run: cli.TableRun, sequence: str, band: str) -> cli.Row:
-        drive = by_name[sequence]
-        if band == "overlap":
-            return overlap_row(model, drive, OVERLAP_FACTOR * config.pairs, seed=config.seed, on_scan=run.check_stop)
-        return registration_row(model, read_pairs(run, drive, band, config), config.pairs)
+    def work(drive: str, band: str, pair: int) -> cli.Row:
+        return registration_row(model, pairs.read(drive, band, pair))
 
-    def report(rows: list[cli.Row]) -> cli.Summary:
-        numbers, text = calibration_numbers(rows), table(rows)
-        if numbers:
-            note = "" if numbers["is_calibrated"] else "; these weights are not calibrated"
-            text += f"\n\nBrier score of the confidence, all pairs: {numbers['brier']:.3f} (0 is best{note})."
-        draw = partial(draw_evaluation, drives=drives, rows=rows, weights=config.weights, seed=config.seed)
-        return cli.Summary({"weights": config.weights, **numbers}, text, draw)
-
-    cases = [{"sequence": name, "band": band} for name in by_name for band in ("near", "middle", "far", "overlap")]
-    return cli.run_table(config, NAME, cases, work, report)
+    rows = cli.fill_table(run, pairs.cases, work)
+    overlap = fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
+    summary = summarize_pairs(rows, overlap, STAGES, COLUMNS)
+    numbers = {"weights": options.weights, **rate_confidence(model, rows), **cli.write_summary(run, summary)}
+    draw_evaluation(run, model, pairs, rows, Path(options.weights).stem)
+    return numbers
 
 
 def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[cli.Source]:
@@ -113,126 +105,123 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> 
     return drives
 
 
-def read_pairs(run: cli.TableRun, drive: LidarSequence, band: str, config: Any) -> Iterator[deeppointmap.ScanPair]:
-    """Yields random pairs of scans of a band of distances; `config` has their number, `pairs`, and the seed."""
-    drawn = deeppointmap.draw_scan_pairs(drive, band, config.pairs, seed=config.seed)
-    return run.until_stopped(deeppointmap.read_scan_pairs(drive, drawn, seed=config.seed))
+class EvaluationPairs:
+    """Random pairs of scans of some drives, by the name of the drive, the band of distances and a number.
+
+    Attributes:
+        drawn: numbers of the two scans of each pair, by drive and band.
+        cases: drive, band and number of all pairs.
+    """
+
+    def __init__(self, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> None:
+        """Draws up to `num_pairs` pairs of each drive and band."""
+        draw = partial(deeppointmap.draw_scan_pairs, num_pairs=num_pairs, seed=seed)
+        self.drawn = {(drive.name, band): draw(drive, band) for drive in drives for band in BANDS}
+        self.cases = [
+            {"drive": drive, "band": band, "pair": number}
+            for (drive, band), rows in self.drawn.items()
+            for number in range(len(rows))
+        ]
+        by_name = {drive.name: drive for drive in drives}
+
+        def read_band(drive: str, band: str) -> list[deeppointmap.ScanPair]:
+            return list(deeppointmap.read_scan_pairs(by_name[drive], self.drawn[drive, band], seed=seed))
+
+        # The yaws of the pairs of a band come from one stream.
+        self._read_band = lru_cache(maxsize=1)(read_band)
+
+    def read(self, drive: str, band: str, pair: int) -> deeppointmap.ScanPair:
+        """Reads a pair, each scan turned by a random yaw."""
+        return self._read_band(drive, band)[pair]
 
 
-def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.ScanPair], num_asked: int) -> cli.Row:
-    """Returns errors by stage, confidence and seconds of the registrations of a band of distances."""
-    found = deeppointmap.evaluate_scan_pairs(model, pairs)
-    row: cli.Row = {
-        "is_calibrated": model.config.calibration is not None,
-        "num_asked": num_asked,
-        "confidence": found.confidence.tolist(),
-    }
-    for stage in STAGES:
-        row |= error_columns(getattr(found, stage), f"_{stage}")
-    row["is_right"] = row.pop("is_right_refined").tolist()
-    row["motions"] = found.T_target_source.reshape(-1, 16).tolist()
-    if len(found.confidence):
-        row |= {f"{stage}_s": float(np.median(seconds)) for stage, seconds in found.seconds._asdict().items()}
-        row["pair_s"] = float(np.median(found.seconds.total))
-    return row
+def registration_row(model: deeppointmap.Model, pair: deeppointmap.ScanPair) -> cli.Row:
+    """Returns errors after each stage, confidence and seconds of the registration of a pair."""
+    found, calibration = deeppointmap.register_in_stages(model, pair), model.config.calibration
+    motions = found.descriptors, found.verified, found.refined
+    row: cli.Row = {"confidence": float(found.evidence.of_clouds[1])}
+    if calibration is not None:
+        row["confidence"] = float(deeppointmap.calibrated_probability(calibration, found.evidence))
+    for stage, T_target_source in zip(STAGES, motions, strict=True):
+        row |= motion_errors(stage, T_target_source, pair)
+    return row | {"pair_s": found.seconds.total}
 
 
-def overlap_row(
-    model: deeppointmap.Model, drive: LidarSequence, num_pairs: int, *, seed: int, on_scan: Callable[[], object]
-) -> cli.Row:
-    """Returns AUC and Brier score of the overlap probability; AUC None where the drive lacks pairs."""
-    found = deeppointmap.evaluate_overlap(model, drive, num_pairs, seed=seed, on_scan=on_scan)
-    row: cli.Row = {"auc": None, "has_revisits": found.has_revisits, "num_pairs": len(found.is_overlap)}
-    if len(found.is_overlap):
-        row |= {"auc": found.area_under_curve, "brier": found.brier_score}
-        row |= {"probability": found.probability.tolist(), "is_overlap": found.is_overlap.tolist()}
-        if found.by_head is not None:
-            of_head = found._replace(probability=found.by_head)
-            row |= {"auc_head": of_head.area_under_curve, "brier_head": of_head.brier_score}
-            row["probability_head"] = found.by_head.tolist()
-    return row
-
-
-def error_columns(errors: metrics.RegistrationRecall, suffix: str) -> cli.Row:
-    """Returns the recall, all errors, and the median errors of right registrations."""
-    is_right = errors.is_right
-    of_right = np.column_stack([errors.translation_errors_m, errors.rotation_errors_deg])[is_right]
-    metres, degrees = np.median(of_right, axis=0) if len(of_right) else (np.nan, np.nan)
+def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.ScanPair) -> cli.Row:
+    """Returns the errors of a motion in metres and degrees, and whether it is within 2 m and 5 degrees."""
+    found = metrics.registration_recall(T_target_source[None], pair.T_target_source[None])
     return {
-        "num_pairs": len(is_right),
-        f"recall{suffix}": errors.recall if len(is_right) else None,
-        f"median_error{suffix}_m": float(metres),
-        f"median_error{suffix}_deg": float(degrees),
-        f"translation_errors{suffix}_m": errors.translation_errors_m,
-        f"rotation_errors{suffix}_deg": errors.rotation_errors_deg,
-        f"is_right{suffix}": is_right,
+        f"{name}_right": bool(found.is_right[0]),
+        f"{name}_m": float(found.translation_errors_m[0]),
+        f"{name}_deg": float(found.rotation_errors_deg[0]),
     }
 
 
-def calibration_numbers(rows: Sequence[cli.Row]) -> cli.Row:
-    """Returns the Brier score of the confidence, over all pairs and those of each band, and `is_calibrated`."""
-    known = [row for row in rows if "confidence" in row and row["num_pairs"]]
+def fill_overlap(
+    run: cli.Run, model: deeppointmap.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int
+) -> list[cli.Row]:
+    """Fills overlap.csv: AUC and Brier score of the overlap probability of each drive; None where it lacks pairs."""
+    by_name = {drive.name: drive for drive in drives}
+
+    def work(drive: str) -> cli.Row:
+        found = deeppointmap.evaluate_overlap(model, by_name[drive], num_pairs, seed=seed)
+        head = None if found.by_head is None else found._replace(probability=found.by_head)
+        return {
+            "num_pairs": len(found.is_overlap),
+            "has_revisits": found.has_revisits,
+            "auc": found.area_under_curve,
+            "brier": found.brier_score,
+            "auc_head": None if head is None else head.area_under_curve,
+            "brier_head": None if head is None else head.brier_score,
+        }
+
+    return cli.fill_table(run, [{"drive": name} for name in by_name], work, "overlap.csv")
+
+
+def summarize_pairs(
+    rows: Sequence[cli.Row], overlap: Sequence[cli.Row], methods: Sequence[str], columns: Sequence[str]
+) -> list[cli.Row]:
+    """Returns the shares that are right and the median errors of right motions, by drive and band, and the AUC."""
+    auc = {row["drive"]: row["auc"] for row in overlap}
+    errors = {f"{name}_m": f"{name}_right" for name in methods}
+    of_right = [
+        row | {name: row.get(name) if row.get(right) else None for name, right in errors.items()} for row in rows
+    ]
+    near = [row for row in of_right if row["band"] != "far"]
+    return [row | {"overlap_auc": auc.get(row["drive"])} for row in cli.summarize(near, ("drive", "band"), columns)]
+
+
+def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.Row:
+    """Returns the Brier score of the confidence, over all pairs and those of each band, and a verdict."""
 
     def brier(some: Sequence[cli.Row]) -> float:
-        confidence, is_right = (np.concatenate([row[name] for row in some]) for name in ("confidence", "is_right"))
-        return metrics.brier_score(confidence, is_right.astype(bool))
+        confidence, is_right = (np.array([row[name] for row in some]) for name in ("confidence", "refined_right"))
+        return metrics.brier_score(confidence, is_right)
 
-    numbers = {f"brier_{band}": brier(some) for (band,), some in cli.group_rows(known, "band").items()}
-    is_calibrated = all(row["is_calibrated"] for row in known)
-    return {"brier": brier(known), **numbers, "is_calibrated": is_calibrated} if known else {}
+    if not rows:
+        return {"verdict": "no pair is registered"}
+    near, is_calibrated = [row for row in rows if row["band"] != "far"], model.config.calibration is not None
+    bands = {f"brier_{band}": brier(some) for band in BANDS if (some := [row for row in rows if row["band"] == band])}
+    right = sum(row["refined_right"] for row in near)
+    verdict = f"{right} of {len(near)} pairs are registered right; Brier score of the confidence {brier(rows):.3f}"
+    verdict += " (0 is best)" if is_calibrated else " (0 is best; these weights are not calibrated)"
+    return {"brier": brier(rows), **bands, "is_calibrated": is_calibrated, "verdict": verdict}
 
 
 def draw_evaluation(
-    folder: cli.RunFolder, *, drives: Sequence[LidarSequence], rows: Sequence[cli.Row], weights: str, seed: int
+    run: cli.Run, model: deeppointmap.Model, pairs: EvaluationPairs, rows: Sequence[cli.Row], title: str
 ) -> None:
-    """Draws reliability.png, and failures.png where a registration of an overlapping pair is wrong."""
-    known = [row for row in rows if "confidence" in row]
-    confidence, is_right = (np.concatenate([[], *(row[name] for row in known)]) for name in ("confidence", "is_right"))
-    title = f"{Path(weights).stem}, all pairs"
-    viz.save_figure(viz.reliability_figure(confidence, is_right, title=title), folder / "reliability.png")
-    if worst := worst_failures(drives, known, seed):
-        viz.save_figure(viz.registered_pairs_figure(worst), folder / "failures.png")
-
-
-def worst_failures(drives: Sequence[LidarSequence], rows: Sequence[cli.Row], seed: int) -> list[viz.RegisteredPair]:
-    """Returns the wrong registrations of overlapping pairs that have the highest confidence."""
-    names = {drive.name: drive for drive in drives}
-    wrong = [
-        (row["confidence"][number], row, number)
-        for row in rows
-        if row["band"] != "far"
-        for number in np.flatnonzero(~np.asarray(row["is_right"], bool))
-    ]
+    """Draws reliability.png, and failures.png: wrong registrations of overlapping pairs of the highest confidence."""
+    confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))
+    viz.save_figure(viz.reliability_figure(confidence, is_right, title=f"{title}, all pairs"), run / "reliability.png")
+    wrong = [row for row in rows if row["band"] != "far" and not row["refined_right"]]
     shown = []
-    for confidence, row, number in sorted(wrong, key=lambda failure: -failure[0])[:NUM_SHOWN]:
-        drive = names[row["sequence"]]
-        drawn = deeppointmap.draw_scan_pairs(drive, row["band"], row["num_asked"], seed=seed)
-        *_, pair = deeppointmap.read_scan_pairs(drive, drawn[: number + 1], seed=seed)
-        a, b = drawn[number]
-        title = f"{drive.name}: scan {a} onto {b}, confidence {confidence:.2f}"
-        motions = {"estimated motion": np.reshape(row["motions"][number], (4, 4)), "true motion": pair.T_target_source}
+    for row in sorted(wrong, key=lambda row: -row["confidence"])[:NUM_SHOWN]:
+        pair = pairs.read(row["drive"], row["band"], row["pair"])
+        a, b = pairs.drawn[row["drive"], row["band"]][row["pair"]]
+        title = f"{row['drive']}: scan {a} onto {b}, confidence {row['confidence']:.2f}"
+        refined = deeppointmap.register_in_stages(model, pair).refined
+        motions = {"estimated motion": refined, "true motion": pair.T_target_source}
         shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions, (f"scan {a}", f"scan {b}")))
-    return shown
-
-
-def table(rows: Sequence[cli.Row]) -> str:
-    """Returns the table as Markdown: a row for each drive and distance."""
-    by_case = {(row["sequence"], row["band"]): row for row in rows}
-    lines = []
-    for (sequence, band), row in by_case.items():
-        if band not in BAND_NAMES or not row["num_pairs"]:
-            continue
-        auc = by_case.get((sequence, "overlap"), {}).get("auc") if band == "near" else None
-        refined = metrics.wilson_interval(int(np.sum(row["is_right"])), row["num_pairs"])
-        interval = f"{refined.share:.2f} ({refined.low:.2f} to {refined.high:.2f})"
-        recalls = (row[f"recall_{stage}"] for stage in ("descriptors", "verified"))
-        errors = (length_text(row[f"median_error_{stage}_m"]) for stage in ("descriptors", "refined"))
-        case = (sequence, BAND_NAMES[band], row["num_pairs"])
-        lines.append([*case, *recalls, interval, *errors, row["pair_s"], cli.cell_text(auc, 3)])
-    return cli.markdown(COLUMNS, lines)
-
-
-def length_text(metres: float | None) -> str:
-    """Returns a median error for a table; a dash where no registration was right."""
-    # NaN becomes null in the file of a row.
-    return "-" if metres is None or np.isnan(metres) else f"{metres:.3f} m"
+    if shown:
+        viz.save_figure(viz.registered_pairs_figure(shown), run / "failures.png")

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -30,7 +30,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, registration2d, simulation
 from dpmjax.cli import map2d_results as results
-from dpmjax.cli.run import CHECKPOINTS, Numbers, Run, RunOptions, ScanOptions, find_run, load_options
+from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
 from dpmjax.sequences import FloatArray, ScanSequence
 
 # Computes numbers, by name, of the poses of all scans.
@@ -247,60 +247,3 @@ def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.D
     if sequence.unit == "m":
         settings = replace(settings, unit=None)
     return settings if options.steps is None else deepmapping.with_steps(settings, options.steps)
-
-
-class Map2dRun(NamedTuple):
-    """A finished run.
-
-    Attributes:
-        sequence: the scans.
-        fitted: the fit, with the poses of the map.
-        world: the built-in world; None where the scans were read from files.
-    """
-
-    sequence: ScanSequence
-    fitted: deepmapping.Fitted
-    world: int | str | None
-
-
-def read_map2d_run(path: Path) -> Map2dRun:
-    """Reads a run of all scans in their order.
-
-    Args:
-        path: the folder.
-
-    Returns:
-        Map2dRun.
-
-    Raises:
-        ValueError: the folder holds no options, no trajectory or no checkpoint that can be read; or its fit has other
-            scans than the sequence, or another order of them.
-    """
-    import jax
-
-    from dpmjax.checkpoints import Checkpoints
-
-    options, trajectory = load_options(find_run("map2d", path), Map2dOptions), path / "trajectory.npy"
-    if not trajectory.is_file():
-        raise ValueError(f"{path} holds no trajectory.npy: let the run end, or resume it")
-    if not options.ordered:
-        raise ValueError(
-            f"{path} is a run with --no-ordered, whose fit has another order of the scans; use an ordered one"
-        )
-    sequence = read_scans(options)
-    if sequence.unit == "m":
-        raise ValueError(f"{path} is a run on {sequence.name}, in metres: give a run on a built-in world (--world)")
-    settings = fit_settings(options, sequence)
-    data, unit = deepmapping.mapping_data(
-        results.scan_set_of(sequence),
-        None if options.init == "zero" else np.load(trajectory),
-        unit=settings.unit,
-    )
-    problem = deepmapping.mapping_problem(settings, data)
-    like = deepmapping.init(problem, data, key=jax.random.key(0))
-    state = Checkpoints((path / CHECKPOINTS).resolve()).restore_latest(like, fallback=None)
-    if state is None:
-        raise ValueError(f"{path} holds no checkpoint that can be read")
-    poses = np.asarray(problem.poses(settings, problem.phases[int(state.phase)], state.params, data), np.float64)
-    fitted = deepmapping.Fitted(poses * [unit, unit, 1.0], state.params, None, unit, settings, int(state.step))
-    return Map2dRun(sequence, fitted, options.world if options.data is None else None)

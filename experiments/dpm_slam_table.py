@@ -1,0 +1,339 @@
+"""Compares SLAM on drives: our settings, several agents, and other programs on the same scans.
+
+    python -m experiments.dpm_slam_table path/to/drive another/drive --methods whole KISS-ICP KISS-SLAM small_gicp
+    python -m experiments.dpm_slam_table town --num-towns 5 --town-length-m 1000 4000
+    python -m experiments.dpm_slam_table path/to/drive kitti_00.txt kitti_07.txt       towns along real routes
+    python -m experiments.dpm_slam_table path/to/drive --methods whole paper "paper, errors up to 2.5 m"
+    python -m experiments.dpm_slam_table path/to/drive --methods agents
+    python -m experiments.dpm_slam_table path/to/drive --localize 50
+    python -m experiments.dpm_slam_table --resume                       go on where the last run stopped
+
+A path is any folder of scans with poses, or a file of poses (TUM, KITTI), along which a town is simulated; scans are
+kept in results/simulated. Methods are our settings ("whole", "paper" and parts left out, DeepPointMap Table 2), other
+programs (extra `peers`), and "agents": the drive is cut into three parts, and three agents map one each and join their
+maps (section 5.3). With --localize, random scans are looked for in the map of each drive's first half, as saved.
+
+rows.csv has ATE, KITTI's t_rel, loops, bytes of the map and mean seconds a scan without compilation, also those of the
+first and the last tenth, which show whether they grow. A loop is wrong beyond 2 m or 5 degrees. A scan comes back where
+it is within 5 m (indoors 2 m) of an earlier one after 50 m (15 m) of way. The recall of loops is the share of these
+scans that have a right loop whose newer end is within 10 m (3 m) along the path. KISS-SLAM joins local maps of 100 m,
+and each of its loops counts for all scans of the newer one. drives/ has the trajectory of every method.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from dpmjax import Model, cli, io, load_map, load_model, metrics, save_map, simulation, slam
+from dpmjax.geometry import rigid
+from dpmjax.io import LidarSequence
+from experiments._slam_peers import PEERS, FoundLoop
+from experiments._slam_settings import NETWORK, SETTINGS, WHOLE, make_setting
+
+EXPERIMENT = "dpm_slam_table"
+AGENTS = "agents"
+# Parts of a drive that is cut, and the share of its length by which a part is longer at each end.
+NUM_AGENTS, OVERLAP = 3, 0.05
+PRECISIONS = ("float32", "int8")
+# Where half of the points of the first scan are nearer, the place is indoors.
+INDOORS_M = 5.0
+TOWN = "town"
+# Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
+TOWNS = (
+    ("suburb", "there_and_back", simulation.HDL64E),
+    ("canyon", "wander", simulation.OS1_64),
+    ("campus", "there_and_back", simulation.OS1_64),
+    ("suburb", "wander", simulation.HDL64E),
+    ("car_park", "wander", simulation.OS1_64),
+)
+COLUMNS = (
+    "num_scans", "path_m", "ate_m", "ate_before_loops_m", "t_rel_percent", "num_loops", "num_wrong_loops",
+    "loop_recall", "recall_same_way", "recall_opposite", "num_keyframes", "num_maps", "sent_mb", "map_mb",
+    "map_int8_mb", "scan_s", "scan_s_first_tenth", "scan_s_last_tenth",
+)  # fmt: skip
+PLACE_COLUMNS = (
+    "num_scans", "num_inside", "num_right", "num_wrong", "num_outside_right", "num_outside_wrong", "median_error_m",
+    "map_mb", "scan_s",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlamTableOptions(cli.DriveOptions):
+    """Options of the table."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"methods", "localize"})
+
+    paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = (TOWN,)
+    """Folders of scans, files of poses along which a town is simulated, or towns of the seeds."""
+    methods: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = (WHOLE, NETWORK, "small_gicp")
+    """Methods to compare: settings, agents, and KISS-ICP, KISS-SLAM, small_gicp."""
+    num_towns: Annotated[int, arg(metavar="N")] = 3
+    """Number of towns, where town is among the paths."""
+    town_length_m: Annotated[tuple[float, ...], arg(metavar="M")] = (400.0,)
+    """Length of the towns' routes; two numbers: from that of the first town to that of the last."""
+    localize: Annotated[int, arg(metavar="N")] = 0
+    """Number of scans that are looked for in the map of the first half; needs the method whole."""
+
+    def __post_init__(self) -> None:
+        """Checks names and ranges."""
+        super().__post_init__()
+        cli.check_names("--methods", self.methods, (*SETTINGS, AGENTS, *PEERS))
+        cli.check_least(self, num_towns=1, localize=0, town_length_m=100)
+        if not self.paths:
+            raise ValueError("give at least one folder of scans, or town")
+        if not 1 <= len(self.town_length_m) <= 2:
+            raise ValueError("--town-length-m: expected one or two lengths")
+        if self.localize and WHOLE not in self.methods:
+            raise ValueError(f"--localize looks for scans in the map of {WHOLE}: name it among the methods")
+
+
+def main(options: SlamTableOptions, run: cli.Run) -> cli.Row:
+    """Makes the rows of drives and methods that are missing, and writes the tables."""
+    model = load_model(options.weights)
+    for name in set(options.methods) & set(PEERS):
+        cli.require_importable(PEERS[name][0], f"--methods {name}")
+    drives = {drive.name: drive for drive in open_drives(options)}
+    run.open()
+
+    def work(drive: str, method: str) -> cli.Row | None:
+        part, sequence = run.part("drives", drive.replace("/", "-"), method.replace(",", "")), drives[drive]
+        if method in PEERS:
+            row = map_by_peer(part, sequence, method)
+        elif method == AGENTS:
+            row = map_by_agents(part, sequence, slam.make_methods(model))
+        else:
+            row = map_by_setting(part, sequence, make_setting(model, method))
+        return None if row is None else dict.fromkeys((*COLUMNS, "version")) | row
+
+    rows = cli.fill_table(
+        run, [{"drive": name, "method": method} for name in drives for method in options.methods], work
+    )
+    numbers = {"weights": options.weights} | cli.write_summary(run, cli.summarize(rows, ("drive", "method"), COLUMNS))
+    if options.localize and not run.is_stopped:
+        numbers |= localize_all(options, run, drives, model)
+    return numbers
+
+
+def localize_all(
+    options: SlamTableOptions, run: cli.Run, drives: dict[str, LidarSequence], model: Model
+) -> dict[str, Any]:
+    """Fills places.csv: scans of each drive with a reference that are looked for in the map of its first half."""
+
+    def work(drive: str, precision: Any) -> cli.Row:
+        return localize_scans(
+            run / "drives" / drive.replace("/", "-") / WHOLE, drives[drive], model, precision, options
+        )
+
+    with_map = {row["drive"] for row in run.read_table("rows.csv") if row["method"] == WHOLE and row["map_mb"]}
+    known = [name for name, drive in drives.items() if name in with_map and drive.T_world_lidar is not None]
+    places = [{"drive": name, "precision": precision} for name in known for precision in PRECISIONS]
+    rows = cli.fill_table(run, places, work, "places.csv")
+    return cli.write_summary(run, cli.summarize(rows, ("drive", "precision"), PLACE_COLUMNS), name="places")
+
+
+def open_drives(options: SlamTableOptions) -> list[LidarSequence]:
+    """Opens the drives that are compared; bad input is a `ValueError`."""
+    drives: list[LidarSequence] = []
+    lengths_m = np.linspace(options.town_length_m[0], options.town_length_m[-1], options.num_towns)
+    for entry in options.paths:
+        if entry == TOWN and not Path(entry).exists():
+            simulated = (simulate_town(number, length_m) for number, length_m in enumerate(lengths_m.tolist()))
+            drives += [cli.keep_scans(drive).take(options.selection) for drive in simulated]
+        else:
+            names: list[str | None] = io.list_lidar_sequences(entry) or [None]
+            drives += [cli.with_reference_only(cli.open_drive(Path(entry), options, name)) for name in names]
+    cli.check_names_differ(drives)
+    return drives
+
+
+def simulate_town(number: int, length_m: float) -> LidarSequence:
+    """Returns the drive through a town, once along its route; scans are cast when they are read."""
+    kind, route, sensor = TOWNS[number % len(TOWNS)]
+    # A car turns by at most 6 degrees from scan to scan, so that methods that expect a steady motion are not lost.
+    driving = simulation.DriveConfig(rate_hz=5.0, sensor_height_m=sensor.height_m, max_turn_deg_s=30.0)
+    town = simulation.TownConfig(kind, route, length_m, 90.0)
+    return simulation.simulate_scene(simulation.Scene(cli.FIRST_TOWN + number, town, driving, sensor))
+
+
+def map_by_setting(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods) -> cli.Row | None:
+    """Maps a drive, or goes on from the state in the folder; None where a signal stops it."""
+    mapped, result = cli.map_drive(run, drive, methods)
+    if len(mapped.reports) < len(drive):
+        return None
+    files = [save_map(run / f"map_{one}.npz", result.map, one) for one in PRECISIONS] if len(result.map) else []
+    map_mb, map_int8_mb = [path.stat().st_size / 1e6 for path in files] or (None, None)
+    before = cli.trajectory_errors(result.T_odometry_scan, drive.T_world_lidar)
+    return measure_trajectory(run, drive, result.T_world_scan, found_loops(result.loops, result.keyframes)) | {
+        "ate_before_loops_m": before.get("ate_m"),
+        "num_keyframes": len(result.keyframes),
+        "map_mb": map_mb,
+        "map_int8_mb": map_int8_mb,
+        **mean_seconds(mapped.scan_s),
+    }
+
+
+def map_by_agents(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods) -> cli.Row | None:
+    """Lets agents map the parts of a drive, and joins their maps; the ATE is that in their one frame, if they met."""
+    parts, agents, scan_s = cut_drive(drive, NUM_AGENTS, OVERLAP), list[slam.SlamResult](), list[float]()
+    for number, part in enumerate(parts, start=1):
+        mapped, result = cli.map_drive(run.part(f"agent_{number}"), part, methods)
+        if len(mapped.reports) < len(part):
+            return None
+        agents.append(result)
+        scan_s += mapped.scan_s
+    found, starts = slam.join_agents(methods, agents), np.cumsum([0, *map(len, parts)])
+    T_world_scan, num_maps = np.concatenate(found.T_world_scan), max(found.component) + 1
+    for component in range(num_maps):
+        save_map(run / f"map_{component + 1}.npz", slam.take_component(found.joined, component))
+    cli.write_trajectory(run.path, T_world_scan, None)
+    scans = np.concatenate([start + agent.keyframes for start, agent in zip(starts, agents, strict=False)])
+    loops = found_loops(found.joined.loops, scans)
+    row: cli.Row = {"num_scans": len(T_world_scan), "num_loops": len(loops), "num_keyframes": len(scans)}
+    if drive.T_world_lidar is not None:
+        reference = np.concatenate([part.T_world_lidar for part in parts])
+        errors = cli.trajectory_errors(T_world_scan, reference) if num_maps == 1 else {}
+        row |= {"ate_m": errors.get("ate_m"), "num_wrong_loops": int((~are_right(loops, reference)).sum())}
+    sent_mb = sum(traffic.keyframe_bytes for traffic in found.traffic) / 1e6
+    return row | {"num_maps": num_maps, "sent_mb": sent_mb, **mean_seconds(scan_s)}
+
+
+def cut_drive(drive: LidarSequence, num_agents: int, overlap: float) -> list[LidarSequence]:
+    """Cuts a drive into parts of one length, each longer by a share of it at both ends (DeepPointMap section 5.3).
+
+    Raises:
+        ValueError: fewer scans than agents.
+    """
+    if (num := len(drive)) < num_agents:
+        raise ValueError(f"{drive.name}: {num} scans are too few for {num_agents} agents")
+    length, longer = num / num_agents, overlap * num / num_agents
+    starts = [max(round(agent * length - longer), 0) for agent in range(num_agents)]
+    ends = [min(round((agent + 1) * length + longer), num) for agent in range(num_agents)]
+    return [drive.take(slice(start, end)) for start, end in zip(starts, ends, strict=True)]
+
+
+def map_by_peer(run: cli.Run, drive: LidarSequence, name: str) -> cli.Row | None:
+    """Runs another program; reading is not timed. A scan without points stays where the last one was."""
+    peer = PEERS[name][1](is_indoors=is_indoors(drive))
+    taken, scan_s = list[int](), list[float]()
+    for number in tqdm(range(len(drive)), desc=f"{drive.name}, {name}", unit=" scans", dynamic_ncols=True):
+        if run.is_stopped:
+            return None
+        points, begun = drive.read_points(number).astype(np.float64), time.perf_counter()
+        if len(points):
+            peer.step(points)
+            taken.append(number)
+        scan_s.append(time.perf_counter() - begun)
+    begun = time.perf_counter()
+    T_taken, found = peer.finish()
+    scan_s[-1] += time.perf_counter() - begun
+    rows = np.maximum(np.searchsorted(taken, np.arange(len(drive)), side="right") - 1, 0)
+    numbers = np.array(taken)
+    loops = [
+        FoundLoop(tuple(numbers[list(one.newer)]), tuple(numbers[list(one.older)]), one.T_older_newer) for one in found
+    ]
+    return measure_trajectory(run, drive, T_taken[rows], loops) | {
+        "map_mb": peer.map_bytes(drive.read_points(number).astype(np.float64) for number in taken) / 1e6,
+        **mean_seconds(scan_s),
+        "version": importlib.metadata.version(name),
+    }
+
+
+def is_indoors(drive: LidarSequence) -> bool:
+    """Returns True for a drive whose first scan is one of a room."""
+    points = drive.read_points(0)
+    return bool(len(points) and np.median(np.linalg.norm(points, axis=1)) < INDOORS_M)
+
+
+def found_loops(loops: Sequence[slam.Loop], scans: np.ndarray) -> list[FoundLoop]:
+    """Returns the accepted loops between keyframes, by the numbers of their scans."""
+    return [
+        FoundLoop((scans[loop.source],) * 2, (scans[loop.target],) * 2, loop.T_target_source)
+        for loop in loops
+        if loop.status == "accepted" and loop.T_target_source is not None
+    ]
+
+
+def measure_trajectory(run: cli.Run, drive: LidarSequence, T_world_scan: np.ndarray, loops: list[FoundLoop]) -> cli.Row:
+    """Writes a trajectory; returns its errors, how many loops are wrong, and the recall of the right ones."""
+    cli.write_trajectory(run.path, T_world_scan, drive.times)
+    reference, row = drive.T_world_lidar, {"num_scans": len(T_world_scan), "num_loops": len(loops)}
+    if reference is None:
+        return row | {"path_m": float(metrics.path_lengths(T_world_scan)[-1])}
+    distance_m, min_path_m, reach_m = (2.0, 15.0, 3.0) if is_indoors(drive) else (5.0, 50.0, 10.0)
+    is_right = are_right(loops, reference)
+    newer = np.reshape([loop.newer for loop in loops], (-1, 2)).astype(int)
+    revisits = metrics.find_revisits(reference, distance_m=distance_m, min_path_m=min_path_m)
+    recall = metrics.loop_recall(reference, newer[is_right], revisits, reach_m=reach_m)
+    errors = cli.trajectory_errors(T_world_scan, reference)
+    return row | {
+        "path_m": float(metrics.path_lengths(reference)[-1]),
+        "ate_m": errors.get("ate_m"),
+        "t_rel_percent": errors.get("t_rel_percent"),
+        "num_wrong_loops": int((~is_right).sum()),
+        "loop_recall": recall.recall,
+        "recall_same_way": recall.same_way,
+        "recall_opposite": recall.opposite,
+    }
+
+
+def are_right(loops: Sequence[FoundLoop], T_world_scan: np.ndarray) -> np.ndarray:
+    """Returns True for the loops whose motion is that of the true poses, within 2 m and 5 degrees."""
+    newer, older = (T_world_scan[[getattr(loop, end)[0] for loop in loops]] for end in ("newer", "older"))
+    found = np.reshape([loop.T_older_newer for loop in loops], (-1, 4, 4))
+    return np.asarray(metrics.registration_recall(found, rigid.inverse(older) @ newer).is_right)
+
+
+def mean_seconds(scan_s: Sequence[float]) -> cli.Row:
+    """Returns the mean seconds of a scan: of all, of the first tenth and of the last; none without scans."""
+    tenths = [float(part.mean()) for part in np.array_split(np.asarray(scan_s), 10) if len(part)]
+    if not tenths:
+        return {}
+    return {"scan_s": float(np.mean(scan_s)), "scan_s_first_tenth": tenths[0], "scan_s_last_tenth": tenths[-1]}
+
+
+def localize_scans(
+    folder: Path, drive: LidarSequence, model: Model, precision: Any, options: SlamTableOptions
+) -> cli.Row:
+    """Looks for random scans of the drive in the map of its first half, saved and loaded at a precision.
+
+    No scan is one of its keyframes. A scan is in the map where a keyframe of the first half is near; elsewhere the
+    right answer is that it is not.
+    """
+    whole, methods = load_map(folder / "map_float32.npz"), slam.make_methods(model)
+    num_early = sum(keyframe.scan < len(drive) / 2 for keyframe in whole.keyframes)
+    half = slam.take_keyframes(whole, range(max(num_early, 1)))
+    path = save_map(folder / f"first_half_{precision}.npz", half, precision)
+    slam_map, taken = load_map(path), [keyframe.scan for keyframe in half.keyframes]
+    others = np.setdiff1d(np.arange(len(drive)), taken)
+    rng = np.random.default_rng(options.seed)
+    chosen = np.sort(rng.choice(others, min(options.localize, len(others)), replace=False))
+    bar, begun = tqdm(chosen, desc=f"{drive.name}, {precision}", unit=" scans"), time.perf_counter()
+    found = list(slam.localize_each(methods, slam_map, (drive.read_points(int(number)) for number in bar)))
+    seconds, reference = time.perf_counter() - begun, drive.T_world_lidar
+    errors = cli.localization_errors(found, slam_map, reference[taken], reference[chosen])
+    is_wrong = errors.is_found & ~errors.is_right
+    is_inside = errors.keyframe_distance_m <= (3.0 if is_indoors(drive) else 10.0)
+    return {
+        "num_scans": len(found),
+        "num_inside": int(is_inside.sum()),
+        "num_right": int((is_inside & errors.is_right).sum()),
+        "num_wrong": int((is_inside & is_wrong).sum()),
+        "num_outside_right": int((~is_inside & errors.is_right).sum()),
+        "num_outside_wrong": int((~is_inside & is_wrong).sum()),
+        "median_error_m": float(np.median(errors.translation_m[errors.is_right])) if errors.is_right.any() else None,
+        "map_mb": path.stat().st_size / 1e6,
+        "scan_s": seconds / max(len(found), 1),
+    }
+
+
+if __name__ == "__main__":
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))

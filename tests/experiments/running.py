@@ -1,0 +1,20 @@
+"""Runs an experiment as its command does, and reads its rows."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from types import ModuleType
+
+from dpmjax.cli.run import run_command
+
+
+def run(module: ModuleType, *options: object) -> int:
+    """Returns the exit code."""
+    name, description = module.EXPERIMENT, module.__doc__
+    return run_command(module.main, name=name, description=description, args=list(map(str, options)))
+
+
+def read_rows(folder: Path, name: str = "rows.csv") -> list[dict[str, str]]:
+    """Returns the rows as they are in the file."""
+    return list(csv.DictReader((folder / name).read_text(encoding="utf-8").splitlines()))

@@ -1,0 +1,258 @@
+"""The table of SLAM: settings on a network that compiles in seconds, agents that know the truth, a peer that does."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+import dpmjax
+from dpmjax.cli import why_not_importable
+from dpmjax.cli.drives import DriveOptions
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, Run, load_json
+from dpmjax.geometry import rigid
+from dpmjax.io import LidarSequence
+from dpmjax.slam import SlamConfig, SlamMethods, init_slam, slam_preset, step_slam
+from experiments import _slam_peers, _slam_settings, dpm_slam_table
+from experiments._slam_peers import FoundLoop
+from experiments._slam_settings import NEAREST, NETWORK, NO_OFFSETS, PAPER, PAPER_WIDE, WHOLE, make_setting
+from experiments.dpm_slam_table import cut_drive, map_by_agents, map_by_peer, map_by_setting, measure_trajectory
+from tests.deeppointmap import toy
+from tests.experiments.running import read_rows, run
+from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
+
+PEER = "jax"
+STEP_M, NUM_SCANS = 1.9, 6
+
+
+class SteadyPeer:
+    """Goes ahead by the same step at each scan."""
+
+    def __init__(self, *, is_indoors: bool) -> None:
+        self.num = 0
+
+    def step(self, points: np.ndarray) -> None:
+        assert points.dtype == np.float64
+        assert len(points)
+        self.num += 1
+
+    def finish(self):
+        T = np.tile(np.eye(4), (self.num, 1, 1))
+        T[:, 0, 3] = STEP_M * np.arange(self.num)
+        return T, []
+
+    def map_bytes(self, scans) -> int:
+        return sum(map(len, scans))
+
+
+@pytest.fixture
+def with_peer(monkeypatch) -> None:
+    monkeypatch.setitem(_slam_peers.PEERS, PEER, ("json", SteadyPeer))
+
+
+@pytest.fixture(scope="module")
+def model() -> dpmjax.Model:
+    return dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
+
+
+@pytest.fixture
+def opened(tmp_path) -> Iterator[Run]:
+    """An open run in the folder of the test."""
+    run = Run("test", DriveOptions(output=tmp_path))
+    run.open()
+    yield run
+    run.close()
+
+
+def drive_along(T_world_lidar: np.ndarray) -> LidarSequence:
+    """A drive of which only the poses matter: a scan is one point, whose x is the number of its pose."""
+    sources = tuple(f"scan {number}" for number in range(len(T_world_lidar)))
+    return LidarSequence("by hand", sources, lambda index: np.float32([[index, 1, 0]]), T_world_lidar)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("with_peer")
+def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(model, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    town = toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
+    monkeypatch.setattr(dpm_slam_table, "simulate_town", lambda *_: town)
+    dpmjax.save_model(model, tmp_path / "model.safetensors")
+    out, methods = tmp_path / "out", (PEER, WHOLE, NETWORK, PAPER, "64 elements", "agents")
+    options = ("--weights", "model.safetensors", "--num-towns", 1, "--localize", 3, "-o", out)
+    assert run(dpm_slam_table, "town", "--methods", *methods, *options) == EXIT_OK
+    rows = {row["method"]: row for row in read_rows(out)}
+    assert tuple(rows) == methods
+    assert float(rows[PEER]["ate_m"]) == pytest.approx(0.0, abs=1e-6)
+    num_points = sum(len(town.read_scan(number)) for number in range(NUM_SCANS))
+    assert float(rows[PEER]["map_mb"]) == pytest.approx(num_points / 1e6)
+    for method in methods[:-1]:
+        assert int(rows[method]["num_scans"]) == NUM_SCANS
+        assert rows[method]["num_loops"] == rows[method]["num_wrong_loops"] == "0"
+        assert float(rows[method]["scan_s_last_tenth"]) > 0
+    path = out / "drives" / town.name / WHOLE / "map_int8.npz"
+    assert float(rows[WHOLE]["map_int8_mb"]) == path.stat().st_size / 1e6
+    assert len(dpmjax.load_map(path)) == int(rows[WHOLE]["num_keyframes"])
+    places = read_rows(out, "places.csv")
+    assert [(row["precision"], row["num_scans"]) for row in places] == [("float32", "3"), ("int8", "3")]
+    assert len(load_json(out / "metrics.json")["table"]) == len(methods)
+    monkeypatch.setattr("dpmjax.cli.map_drive", None)
+    monkeypatch.setattr(SteadyPeer, "step", None)
+    assert run(dpm_slam_table, "--resume", "-o", out) == EXIT_OK
+    assert read_rows(out) == list(rows.values())
+
+
+def test_agents_that_meet_share_one_frame(opened, tmp_path, monkeypatch) -> None:
+    truth = laps(1, side_m=40.0, step_m=2.0)
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth, sigma_m=0.02), SlamConfig())
+    monkeypatch.setattr(dpm_slam_table, "OVERLAP", 0.5)
+    row = map_by_agents(opened, drive_along(truth), methods)
+    assert row["num_maps"] == 1
+    assert row["ate_m"] < 1.0
+    assert row["num_loops"] >= 4
+    assert row["num_wrong_loops"] == 0
+    assert len(dpmjax.load_map(tmp_path / "map_1.npz")) == row["num_keyframes"]
+    monkeypatch.setattr(dpm_slam_table, "OVERLAP", 0.0)
+    apart = map_by_agents(opened.part("apart"), drive_along(truth), methods)
+    assert apart["num_maps"] > 1
+    assert apart["ate_m"] is None
+
+
+def test_parts_overlap_and_hold_all_scans() -> None:
+    drive = toy.drive(num_scans=25)
+    for num_agents, overlap in ((1, 0.05), (3, 0.0), (3, 0.05), (4, 0.5)):
+        parts = cut_drive(drive, num_agents, overlap)
+        numbers = [[int(source) for source in part.sources] for part in parts]
+        assert sorted({number for part in numbers for number in part}) == list(range(25))
+        assert all(part == list(range(part[0], part[-1] + 1)) for part in numbers)
+        num_shared = sum(map(len, numbers)) - 25
+        assert abs(num_shared - 2 * (num_agents - 1) * overlap * 25 / num_agents) <= 2 * num_agents
+    with pytest.raises(ValueError, match="25 scans are too few"):
+        cut_drive(drive, 26, 0.05)
+
+
+@pytest.mark.usefixtures("with_peer")
+def test_a_scan_without_points_stays_where_the_last_one_was(opened, tmp_path) -> None:
+    whole = toy.drive(num_scans=5)
+    read = lambda index: np.zeros((0, 3), np.float32) if index in (0, 2) else whole.read_scan(index)  # noqa: E731
+    row = map_by_peer(opened, replace(whole, read_scan=read), PEER)
+    assert row["num_scans"] == 5
+    np.testing.assert_allclose(np.load(tmp_path / "trajectory.npy")[:, 0, 3], [0, 0, 0, STEP_M, 2 * STEP_M])
+
+
+@pytest.mark.usefixtures("with_peer")
+def test_a_drive_that_a_signal_stops_has_no_row(opened) -> None:
+    truth = laps(1, side_m=20.0)
+    opened.on_signal(signal.SIGINT)
+    assert map_by_peer(opened, drive_along(truth), PEER) is None
+    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), SlamConfig())
+    assert map_by_setting(opened, drive_along(truth), methods) is None
+    assert map_by_agents(opened, drive_along(truth), methods) is None
+
+
+def test_wrong_loops_are_counted_and_find_nothing(opened) -> None:
+    truth = laps(2, side_m=50.0)
+
+    def loop(newer: int, older: int, wrong_m: float = 0.0) -> FoundLoop:
+        T = rigid.inverse(truth[older]) @ truth[newer] @ pose(wrong_m, 0.0, 0.0)
+        return FoundLoop((newer, newer), (older, older), T)
+
+    def measure(*loops: FoundLoop) -> dict:
+        drive = replace(drive_along(truth), read_scan=lambda _: np.float32([[20, 0, 0]]))
+        return measure_trajectory(opened, drive, truth, list(loops))
+
+    assert (measure()["num_wrong_loops"], measure()["loop_recall"]) == (0, 0.0)
+    wrong = measure(loop(300, 100, wrong_m=2.5))
+    assert (wrong["num_wrong_loops"], wrong["loop_recall"]) == (1, 0.0)
+    both = measure(loop(300, 100, wrong_m=2.5), loop(250, 50, wrong_m=1.0))
+    assert both["num_wrong_loops"] == 1
+    assert 0.0 < both["loop_recall"] < 0.2
+    # A loop between local maps counts for all scans of the newer one.
+    assert measure(loop(200, 0)._replace(newer=(200, 399), older=(0, 199)))["loop_recall"] == 1.0
+
+
+def test_scans_without_a_reference_are_left_out(tmp_path, monkeypatch) -> None:
+    whole = toy.drive(num_scans=5)
+    poses = whole.T_world_lidar.copy()
+    poses[3] = np.nan
+    monkeypatch.setattr("dpmjax.cli.open_drive", lambda *_: replace(whole, T_world_lidar=poses))
+    (drive,) = dpm_slam_table.open_drives(dpm_slam_table.SlamTableOptions(paths=(str(tmp_path),)))
+    np.testing.assert_array_equal(drive.T_world_lidar, poses[[0, 1, 2, 4]])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere"),
+        (["town", "--weights", "no_such_model"], "no_such_model"),
+        (["town", "--town-length-m", 400, 500, 600], "--town-length-m"),
+        (["town", "--localize", 3, "--methods", "paper"], "--localize"),
+        (["town", "--methods", "nonsense"], "--methods"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, capsys, arguments, message: str) -> None:
+    assert run(dpm_slam_table, *arguments, "-o", tmp_path / "out") == EXIT_BAD_INPUT
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", list(_slam_peers.PEERS))
+def test_a_peer_follows_a_straight_drive(name: str) -> None:
+    reason = why_not_importable(_slam_peers.PEERS[name][0])
+    if reason is not None:
+        pytest.skip(reason)
+    drive = toy.drive(num_scans=12, step_m=1.0)
+    scans = [drive.read_scan(number).astype(np.float64) for number in range(len(drive))]
+    peer = _slam_peers.PEERS[name][1](is_indoors=False)
+    for points in scans:
+        peer.step(points)
+    T, loops = peer.finish()
+    assert loops == []
+    assert peer.map_bytes(scans) > 1000
+    assert dpmjax.absolute_trajectory_error(T[:, :3, 3], drive.T_world_lidar[:, :3, 3]) < 0.3
+
+
+@pytest.mark.parametrize("num_elements", [16, 24])
+def test_a_map_of_fewer_elements_holds_the_first_ones(model, num_elements: int) -> None:
+    drive = toy.drive(1, num_scans=1)
+    maps = [
+        step_slam(make_setting(model, setting), init_slam(), drive[0])[0].slam_map
+        for setting in (WHOLE, f"{num_elements} elements")
+    ]
+    whole, fewer = (slam_map.keyframes[0].compact for slam_map in maps)
+    np.testing.assert_array_equal(fewer.elements.positions, whole.elements.positions[:num_elements])
+    np.testing.assert_array_equal(fewer.features, whole.features[:num_elements])
+    assert len(fewer.cloud.described.mask) == min(num_elements, len(whole.features))
+
+
+def test_the_first_elements_of_a_scan_keep_their_normals(model) -> None:
+    points = toy.drive(1, num_scans=1)[0]
+    whole, few = (make_setting(model, s).geometry.thin(points).measured.surface for s in (WHOLE, "16 elements"))
+    for name in ("points", "normals", "flatness"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(whole, name)[:16])
+    np.testing.assert_array_equal(few.samples, [row for row in whole.samples if row < 16])
+
+
+def test_a_setting_changes_one_thing(model) -> None:
+    whole, network, nearest, paper, wide = (
+        make_setting(model, setting).config for setting in (WHOLE, NETWORK, NEAREST, PAPER, PAPER_WIDE)
+    )
+    assert network == replace(whole, odometry=replace(whole.odometry, proposer="network")) != whole
+    assert nearest == replace(whole, front_end=replace(whole.front_end, num_submap=1)) != whole
+    assert paper == slam_preset("paper")
+    assert replace(wide, descriptors=paper.descriptors) == paper
+    assert wide.descriptors.max_rmse_m == _slam_settings.WIDE_M
+
+
+def test_the_offset_head_is_off_only_where_a_setting_says_so(model) -> None:
+    drive, motions = toy.drive(1, num_scans=2), []
+    for setting in (NETWORK, NETWORK + NO_OFFSETS):
+        methods = make_setting(model, setting)
+        source, target = (methods.matcher.encode(methods.geometry.thin(scan)) for scan in drive)
+        motions.append(methods.matcher.propose(source, target, 1).T_target_source)
+    assert np.abs(motions[1] - motions[0]).max() > 1e-6
