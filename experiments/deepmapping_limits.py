@@ -6,8 +6,7 @@
 Trajectories of 256 poses in the built-in worlds are thinned to every 1st, 2nd, 4th, 8th and 16th scan. Range noise is
 0, 1, 3 and 10 px; the scans are taken in order and shuffled. The hard cells come first. With --worlds grove crowd they
 lead through worlds without straight walls, and through offices in which people walk. Results: metrics.json, table.md
-(every candidate, and how often the best one was kept or one within 0.1 px), and a picture for each world and order
-(rooms_ordered.png).
+(every candidate, and how often the best one was kept or one within 0.1 px).
 """
 
 from __future__ import annotations

@@ -160,18 +160,17 @@ def _read_clouds(
         depths.append(float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0)
         with refusing(image, "{error}", "give images of the camera's size, not smaller than a cloud", (ValueError,)):
             clouds.append(back_project(depth_m, camera, height=shape[0], width=shape[1], max_depth_m=max_depth_m))
-    points, mask = zip(*clouds, strict=True)
-    found = f"the median depth is {np.median(depths):.3g} m, deeper pixels than {max_depth_m:g} m are left out"
+    points, mask = (np.stack(arrays) for arrays in zip(*clouds, strict=True))
+    median, blank = float(np.median(depths)), np.flatnonzero(~mask.any(axis=(1, 2)))
+    found = f"the median depth is {median:.3g} m, deeper pixels than {max_depth_m:g} m are left out"
     advice = "give millimetres, 0 for nothing; TUM's images have 5000 a metre"
-    blank = [image for image, one in zip(images, mask, strict=True) if not one.any()]
     # Where most pixels are too deep, the unit is wrong, not an image.
-    is_deep = float(np.median(depths)) > max_depth_m
-    require(len(blank) < (1 if is_deep else len(images)), images[0].parent, found, advice)
-    if is_deep:
+    require(len(blank) < (1 if median > max_depth_m else len(images)), images[0].parent, found, advice)
+    if median > max_depth_m:
         _log.warning("%s: %s; %s", images[0].parent, found, advice)
     which = f"leave out such images, {len(blank)} of {len(images)}"
-    require(not blank, next(iter(blank), ""), f"no pixel measures up to {max_depth_m:g} m", which)
-    return np.stack(points), np.stack(mask)
+    require(not len(blank), images[blank[0] if len(blank) else 0], f"no pixel measures up to {max_depth_m:g} m", which)
+    return points, mask
 
 
 def _read_matrix(path: Path, size: int) -> FloatArray:

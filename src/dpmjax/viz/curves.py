@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.viz.figures import FRAME, INK, MUTED, PATH, WRONG
@@ -55,6 +56,9 @@ def curves_figure(
             axes.plot(at[is_known], _smoothed(known), color=PATH, lw=1.6)
         if len(known) and known.min() > 0.0 and known.max() > _LEAST_RATIO_OF_LOG_AXIS * known.min():
             axes.set_yscale("log")
+            is_short = known.max() < _LEAST_RATIO_OF_LOG_AXIS**2 * known.min()
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,)))
+            axes.yaxis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
         _label_axes(axes, x_label if axes is rows[-1] else "", name)
         _shade_phases(axes, at, phases or [], is_named=axes is rows[0])
     return figure

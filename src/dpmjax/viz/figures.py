@@ -284,7 +284,7 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Any]:
     square: Any = {"marker": "s", "ms": 5, "ls": "none"}
     for panel in panels:
         if panel.reference is not None:
-            entries["reference"] = Line2D([], [], color=REFERENCE, lw=4)
+            entries["reference"] = Line2D([], [], color=REFERENCE, lw=6)
         clouds = [layer for layer in panel.layers if isinstance(layer, Points)]
         for layer in panel.layers:
             if layer.label and isinstance(layer, Points) and isinstance(layer.color, str):
@@ -314,7 +314,7 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, num_columns: int) -> N
         num_columns = min(num_columns, max(_LEAST_CELLS, round(2 * num_points**0.5)))
         show_raster(axes, _cells(clouds, limits, num_columns), limits)
     if panel.reference is not None:
-        axes.plot(*panel.reference[:, :2].T, color=REFERENCE, lw=4, solid_capstyle="round", zorder=3)
+        axes.plot(*panel.reference[:, :2].T, color=REFERENCE, lw=6, solid_capstyle="round", zorder=3)
     for layer in panel.layers:
         if isinstance(layer, Track) and len(layer.positions):
             outline = [withStroke(linewidth=layer.width + 1.6, foreground="white", alpha=0.7)]

@@ -39,7 +39,10 @@ def trajectory_figure(
         The figure.
     """
     ends = np.zeros((0, 2, 3)) if loops is None else loops
-    return figure([Panel("", [*tracks, Edges(ends, LOOP, counted(len(ends), "loop"))], reference)], title=title)
+    # Wider than the result, so that they are seen where all agree.
+    others = [track._replace(width=4.0) for track in tracks[:-1]]
+    layers = [*others, *tracks[-1:], Edges(ends, LOOP, counted(len(ends), "loop"))]
+    return figure([Panel("", layers, reference)], title=title)
 
 
 def height_map_figure(
