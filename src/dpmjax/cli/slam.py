@@ -17,7 +17,6 @@ and writes all files too.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,7 +37,7 @@ NAME = "slam"
 class Config(cli.DriveOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans", "refine"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"n_scans"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
@@ -56,8 +55,6 @@ class Config(cli.DriveOptions):
     exact offsets; 2.5 suits dpm_small."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
-    refine: FlagCreatePairsOff[bool] = False
-    """Refine the keyframes by DeepMapping afterwards; takes a minute for each window of 32."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
@@ -100,8 +97,6 @@ def main(config: Config) -> None:
         result = slam.finish_slam(run.state, run.reports, methods.config)
         drive = MappedDrive(sequence.take(slice(0, len(result.reports))), start, result)
         metrics = write_results(folder, config, drive, run)
-        if config.refine and run.failure is None and not stop.is_requested:
-            metrics |= refine_trajectory(folder, config, drive, lambda: stop.is_requested)
         is_interrupted = stop.is_requested or run.failure is not None
         metrics |= {
             **notes,
@@ -168,18 +163,3 @@ def write_results(folder: cli.RunFolder, config: Config, drive: MappedDrive, run
     io.write_ply(folder / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
     files.draw_pictures(folder.path, sequence, result, cloud, len(drive.start.slam_map))
     return metrics | {"map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
-
-
-def refine_trajectory(
-    folder: cli.RunFolder, config: Config, drive: MappedDrive, is_stopped: Callable[[], bool]
-) -> dict[str, Any]:
-    """Refines the trajectory by DeepMapping, writes it as refined_*.txt, and returns its numbers."""
-    import jax
-
-    result, key = drive.result, jax.random.key(config.seed)
-    with cli.progress_bar("refine", " windows of keyframes") as on_window:
-        refined = slam.refine_keyframes(result.map, drive.read_keyframe, key=key, on_window=on_window, stop=is_stopped)
-    T = slam.place_scans(refined.slam_map.T_world_keyframe, result.reports)
-    files.write_trajectory(folder.path, T, drive.sequence.times, "refined")
-    windows = {"refine_windows": refined.num_windows, "refine_windows_improved": refined.num_improved}
-    return {**windows, **numbers.trajectory_errors(T, drive.sequence.T_world_lidar, "_refined")}

@@ -250,7 +250,7 @@ def summary(numbers: Mapping[str, Any]) -> str:
         lines.append(f"warning: {numbers['reference_doubt']}")
     if "ate_m" in numbers:
         lines.append("errors against the reference poses (ATE of the whole drive, RPE from scan to scan):")
-    for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM"), ("_refined", "refined")):
+    for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM")):
         if f"ate{suffix}_m" in numbers:
             line = f"  {name:14}  ATE {numbers[f'ate{suffix}_m']:.3f} m, RPE {numbers[f'rpe{suffix}_m']:.3f} m"
             t_rel, r_rel = numbers.get(f"t_rel{suffix}_percent"), numbers.get(f"r_rel{suffix}_deg_per_100m")

@@ -78,9 +78,8 @@ class Config(ProcessOptions):
     """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
-    frame: Literal["lidar", "bearing", "local"] | None = None
-    """Frame of the encoder's features: of the lidar, of the ray to each point, or of the wall at it; without it, the
-    preset decides."""
+    frame: Literal["lidar", "local"] | None = None
+    """Frame of the encoder's features: of the lidar, or of the wall at each point; without it, the preset decides."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
     epochs: Annotated[float | None, arg(metavar="N")] = None

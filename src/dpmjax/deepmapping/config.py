@@ -1,4 +1,4 @@
-"""Settings of DeepMapping, and presets of planar scans, of depth images and of lidar clouds.
+"""Settings of DeepMapping, and presets of planar scans and of depth images.
 
 Settings are the phases of a fit, the comparisons of scans, and the networks.
 """
@@ -36,18 +36,7 @@ class ProjectiveComparison:
     tolerance: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class PlaneComparison:
-    """Comparison of pairs of lidar clouds by the distances of points to planes, revisits in space among the pairs.
-
-    Attributes:
-        width: width of the robust kernel, at the start and at the end of the phase.
-    """
-
-    width: tuple[float, float]
-
-
-Comparison = ChamferComparison | ProjectiveComparison | PlaneComparison
+Comparison = ChamferComparison | ProjectiveComparison
 CHAMFER = ChamferComparison()
 
 
@@ -76,8 +65,7 @@ class PhaseConfig:
             the samples of each beam are random, and all points have the same weight.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
-        comparison: method that compares pairs of scans. Only depth images can be compared by projection, and only
-            clouds by planes.
+        comparison: method that compares pairs of scans; only depth images can be compared by projection.
         scans_per_window: for planar scans, number of neighbours in time in a window. Each window has its own L-Net (or
             free poses), and windows are joined at the scans that they share. A step has all windows. None: one L-Net
             for the whole set.
@@ -142,7 +130,7 @@ REFINE = PhaseConfig(
 
 @dataclass(frozen=True)
 class DeepMappingConfig:
-    """Settings of a fit, by default of planar scans; `preset` has those of depth images and clouds.
+    """Settings of a fit, by default of planar scans; `preset` has those of depth images.
 
     Attributes:
         cold_phases: phases of a fit from zero poses.
@@ -152,7 +140,7 @@ class DeepMappingConfig:
         unit: unit of length of networks and losses, in the unit of the points; None: the typical range of the scans.
         steps_per_call: the largest number of steps that are compiled into one call.
         map_margin: side of the map as a multiple of the extent of the scans at the start of a phase.
-        motion: degrees of freedom of a depth camera; "full" for clouds.
+        motion: degrees of freedom of a depth camera.
     """
 
     cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE, REFINE)
@@ -216,9 +204,6 @@ def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
     return replace(config, cold_phases=cold, warm_phases=warm, steps_per_call=min(config.steps_per_call, num_steps))
 
 
-# M-Net of the fast presets in space.
-_SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
-
 # Phase of the paper (section 4.1). With gamma = 1 / (1 + lambda), both losses have the ratio of eq. 6 with lambda = 10,
 # and Adam's steps do not depend on the common factor. The paper does not give the number of neighbours of eq. 7; the
 # published program has 3.
@@ -268,46 +253,15 @@ REFINE_DEPTH = replace(
 # in the published program, each image is compared to the next one.
 JOINT_DEPTH = replace(JOINT, occupancy_weight=1.0 / 1.1, scans_per_step=8, num_offsets=1, max_offset=1, num_free=35)
 
-# Cold start of clouds.
-LOCALIZE_CLOUDS = replace(LOCALIZE_DEPTH, num_steps=300, beams_per_step=256)
-
-# Free poses of clouds, as `UNROLL_DEPTH`.
-UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)
-
-# Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
-# scans; the distance to the plane between the rings does not.
-REFINE_CLOUDS = replace(
-    REFINE_DEPTH,
-    name="free poses, planes and map",
-    num_steps=300,
-    final_learning_rate=0.01,
-    scans_per_step=64,
-    beams_per_step=128,
-    max_offset=8,
-    comparison=PlaneComparison(width=(0.04, 0.002)),
-)
-
-# Losses and sampling of the paper, for clouds, which it does not have.
-JOINT_CLOUDS = replace(JOINT, scans_per_step=64, beams_per_step=2048)
-
-
 _FAST: dict[str, DeepMappingConfig] = {
     "planar": DeepMappingConfig(),
     "depth": DeepMappingConfig(
         cold_phases=(LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH),
         warm_phases=(REFINE_DEPTH,),
         localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), dilation=3, hidden=(128, 64)),
-        occupancy=_SPATIAL_GRID,
+        occupancy=OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64)),
         steps_per_call=50,
         map_margin=1.2,
-    ),
-    "clouds": DeepMappingConfig(
-        cold_phases=(LOCALIZE_CLOUDS, UNROLL_CLOUDS, REFINE_CLOUDS),
-        warm_phases=(REFINE_CLOUDS,),
-        localization=LocalizationNetConfig(kind="point", features=(32, 64, 128), hidden=(128, 64)),
-        occupancy=_SPATIAL_GRID,
-        map_margin=1.05,
-        motion="full",
     ),
 }
 # Phase, L-Net and unit of the paper for each sensor. Its worlds have a side of 1024 px, two units of the published
@@ -315,13 +269,12 @@ _FAST: dict[str, DeepMappingConfig] = {
 _PAPER = {
     "planar": (JOINT, LocalizationNetConfig(), 512.0),
     "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4), 2.0),
-    "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point"), None),
 }
 
 
 def preset(
     name: Literal["fast", "paper"],
-    sensor: Literal["planar", "depth", "clouds"] = "planar",
+    sensor: Literal["planar", "depth"] = "planar",
     *,
     motion: Motion = "planar",
     is_organised: bool = True,
@@ -332,7 +285,7 @@ def preset(
         name: "fast" (seconds to a minute on two cores) or "paper" (its networks, losses, sampling, epochs and unit).
             The unit of planar scans is that of the paper's worlds, 512 px; for scans in metres use
             `dataclasses.replace(preset("paper"), unit=None)`, or half of the side of the area.
-        sensor: "planar" scans, "depth" images or lidar "clouds".
+        sensor: "planar" scans or "depth" images.
         motion: degrees of freedom of a depth camera.
         is_organised: False for planar scans whose beams have no order; L-Net is a PointNet then.
 

@@ -166,7 +166,7 @@ class Terms(NamedTuple):
     Attributes:
         occupancy: eq. 4, in nats.
         chamfer: eq. 7 divided by the number of pairs, in units of the fit; for images compared by projection, 1 less
-            the projective consistency; for clouds compared by planes, the misfit.
+            the projective consistency.
     """
 
     occupancy: Float[Array, ""]
