@@ -160,7 +160,7 @@ def report(config: Config, model: dpm.Model, rows: list[cli.Row], num_cases: int
     )
 
     def write(folder: cli.RunFolder) -> None:
-        save_model(model.replace(config=calibrated), folder / MODEL, card=f"{card_of(config.model)} {note}.".strip())
+        save_model(replace(model, config=calibrated), folder / MODEL, card=f"{card_of(config.model)} {note}.".strip())
         for name, figure in figures.items():
             viz.save_figure(figure, folder / name)
 

@@ -13,9 +13,8 @@ to 20 m apart and turned by any yaw, are registered. A registration within 2 m a
 results/dpm_evaluate/<time>/: table.md, metrics.json, reliability.png, failures.png (the worst pairs from above). Two
 more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
-a scan; the scans themselves are not used again. Another table has the accuracy of the offset head at walls, as
-coefficient of determination and root mean square residual. Rows of all recorded drives together have confidence
-intervals and say which methods differ.
+a scan; the scans themselves are not used again. Rows of all recorded drives together have confidence intervals and say
+which methods differ.
 
 With --slam, the whole system and its odometry run beside KISS-ICP, KISS-SLAM and odometry by small_gicp (extra
 `peers`). Then random scans are localised in the map of each drive's first half. Poses are needed for the errors only. A
@@ -54,7 +53,6 @@ NETWORK, VERIFIED = "network alone", "network, search and verification"
 SEARCH, KISS = "search and verification, no network", "KISS-Matcher"
 # Beginning of the names of matches of clouds, before the number of surface elements.
 CLOUDS = "clouds, elements "
-OFFSETS = "offsets"
 # The row and its entry that say which pairs a method has registered right.
 _ANSWERS = {
     NETWORK: ("DeepPointMap", "is_right_descriptors"),
@@ -135,9 +133,8 @@ def evaluate_pairs(config: Config) -> list[cli.Row]:
         if method == "DeepPointMap":
             return cli.registration_row(model, cli.read_pairs(run, drive, band, config), config.pairs)
         pairs = cli.read_pairs(run, drive, band, config)
-        return offset_row(model, pairs) if method == OFFSETS else evaluate_matcher(matchers[method], pairs)
+        return evaluate_matcher(matchers[method], pairs)
 
-    methods += [OFFSETS] if config.clouds else []
     bands = [(method, band) for band in ("near", "middle") for method in methods]
     cases = [
         {"method": method, "sequence": name, "band": band}
@@ -184,15 +181,6 @@ def match_clouds(source: np.ndarray, target: np.ndarray, *, model: dpm.Model, nu
     return np.asarray(register(model, *clouds, refine=True).T_target_source, np.float64)
 
 
-def offset_row(model: dpm.Model, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
-    """Returns the accuracy of the offset head on close descriptors: along the normal, along the wall, up."""
-    quality = dpm.offset_quality(
-        model,
-        [(*(encode(model, points) for points in (pair.source, pair.target)), pair.T_target_source) for pair in pairs],
-    )
-    return {"num_pairs": quality.num_pairs, "r2": quality.r2.tolist(), "rmse_m": quality.rmse_m.tolist()}
-
-
 def evaluate_matcher(matcher: Matcher, pairs: Iterable[dpm.ScanPair]) -> cli.Row:
     """Returns errors and seconds of another matcher on the same pairs."""
     motions, seconds, true = [], [], []
@@ -229,20 +217,14 @@ def table(rows: Sequence[cli.Row]) -> str:
 
 
 def cloud_tables(rows: Sequence[cli.Row]) -> str:
-    """Returns the registrations of descriptor clouds and the offsets as Markdown; without any, an empty string."""
-    lines, offsets = [], []
-    for row in (row for row in rows if row["method"].startswith((CLOUDS, OFFSETS)) and row["num_pairs"]):
+    """Returns the registrations of descriptor clouds as Markdown; without any, an empty string."""
+    lines = []
+    for row in (row for row in rows if row["method"].startswith(CLOUDS) and row["num_pairs"]):
+        errors = (row["recall_refined"], cli.length_text(row["median_error_refined_m"]))
         case = (row["sequence"], cli.BAND_NAMES[row["band"]])
-        if row["method"] == OFFSETS:
-            axes = zip(row["r2"], row["rmse_m"], strict=True)
-            offsets.append([*case, *(f"{cli.cell_text(r2)} ({cli.cell_text(rmse_m)} m)" for r2, rmse_m in axes)])
-        else:
-            errors = (row["recall_refined"], cli.length_text(row["median_error_refined_m"]))
-            lines.append([*case, row["method"].removeprefix(CLOUDS), row["num_pairs"], *errors])
+        lines.append([*case, row["method"].removeprefix(CLOUDS), row["num_pairs"], *errors])
     clouds = ("sequence", "distance", "surface elements of clouds", "pairs", "recall", "median error")
-    axes = ("sequence", "distance", "offsets along the normal: R2 (rmse)", "along the wall", "up")
-    tables = [cli.markdown(clouds, lines) if lines else "", cli.markdown(axes, offsets) if offsets else ""]
-    return "\n\n".join(filter(None, tables))
+    return cli.markdown(clouds, lines) if lines else ""
 
 
 def pooled_rows(rows: Sequence[Mapping[str, Any]], drives: Sequence[str]) -> list[dict[str, Any]]:

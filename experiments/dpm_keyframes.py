@@ -13,7 +13,7 @@ results/dpm_keyframes/<time>/: table.md, metrics.json.
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import jax
@@ -108,7 +108,7 @@ def merged(clouds: DescriptorCloud, rows: np.ndarray, poses: np.ndarray, capacit
     """Returns the thinned union of some keyframes in the frame of the first; the size is a power of two."""
     padded = np.concatenate([rows, np.full(capacity - len(rows), rows[0])])
     some = jax.tree.map(lambda leaf: leaf[padded], clouds)
-    some = some.replace(mask=some.mask & (np.arange(capacity) < len(rows))[:, None])
+    some = replace(some, mask=some.mask & (np.arange(capacity) < len(rows))[:, None])
     T_map_scan = np.linalg.inv(poses[rows[0]]) @ poses[padded]
     union = dpm.thin_merged(dpm.merge_clouds(some, jnp.asarray(T_map_scan, jnp.float32)), some.mask.shape[1])
     # Valid rows stand in front: attention over masked ones costs several times as much.

@@ -113,7 +113,7 @@ def run_paper(toy: dm.ToyConfig, config: Config) -> tuple[dict[str, np.ndarray],
     params = runs["network"].state.params
     if config.seeds > 1:
         params = jax.tree.map(lambda x: x[chosen], params)
-    converted = dm.toy_loss(jax.vmap(lambda one: dm.network_value(toy, params.replace(z=one)))(z))
+    converted = dm.toy_loss(jax.vmap(lambda one: dm.network_value(toy, replace(params, z=one)))(z))
     x_direct, visited = float(direct[chosen, -1]), network[chosen]
     return ends, {
         "converted": (np.asarray(z), np.asarray(converted)),

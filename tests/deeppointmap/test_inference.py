@@ -89,6 +89,12 @@ def test_what_is_no_model_or_no_scale_is_named(as_user, model, scans, name, scal
         dpmjax.register("dpm_small" if name else model, *scans[:2], scale=scale)
 
 
+def test_a_model_and_a_cloud_print_one_line(model, scans) -> None:
+    for value in (model, dpmjax.encode(model, scans[0])):
+        assert len(repr(value)) < 120
+        assert "\n" not in repr(value)
+
+
 def test_an_empty_scan_is_a_failure_as_data(model, scans) -> None:
     empty = np.zeros((0, 3), np.float32)
     assert not dpmjax.encode(model, empty).mask.any()

@@ -22,7 +22,7 @@ from dpmjax.deeppointmap import (
     LogisticModel,
     MatchEvidence,
 )
-from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
+from dpmjax.deeppointmap.scan_evaluation import StagedRegistration
 from experiments import dpm_calibrate, dpm_confidence, dpm_evaluate
 from tests.deeppointmap import toy
 
@@ -102,7 +102,7 @@ def test_calibration_is_stored_in_a_copy_of_the_model(weights, tmp_path, monkeyp
         )
         of_elements = np.concatenate([of_clouds, rng.normal(size=len(ELEMENT_FEATURES) - 4) + is_right])
         evidence_of_clouds = MatchEvidence(of_clouds, None, of_elements=of_elements)
-        return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5)), evidence_of_clouds
+        return StagedRegistration(T, T, T, evidence, 0.0), evidence_of_clouds
 
     motions = []
 

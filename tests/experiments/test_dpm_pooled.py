@@ -13,7 +13,6 @@ from experiments.dpm_evaluate import (
     KISS,
     MONITORED,
     NETWORK,
-    OFFSETS,
     SEARCH,
     VERIFIED,
     cloud_tables,
@@ -87,9 +86,3 @@ def test_clouds_have_a_row_for_each_number_of_elements() -> None:
     lines = cloud_tables([*rows_of("street"), row, row | {"num_pairs": 0}]).splitlines()
     assert lines[2:] == ["| street | 2-10 m | 512 | 20 | 0.00 | - |"]
     assert cloud_tables(rows_of("street")) == ""
-
-
-def test_offsets_have_their_accuracy_by_axis() -> None:
-    row = {"method": OFFSETS, "sequence": "street", "band": "near", "num_pairs": 9}
-    row |= {"r2": [0.01, None, 0.9], "rmse_m": [0.8, 0.7, 0.1]}
-    assert cloud_tables([row]).splitlines()[2:] == ["| street | 2-10 m | 0.01 (0.80 m) | - (0.70 m) | 0.90 (0.10 m) |"]

@@ -132,8 +132,7 @@ def registration_row(model: deeppointmap.Model, pairs: Iterable[deeppointmap.Sca
     row["is_right"] = row.pop("is_right_refined").tolist()
     row["motions"] = found.T_target_source.reshape(-1, 16).tolist()
     if len(found.confidence):
-        row |= {f"{stage}_s": float(np.median(seconds)) for stage, seconds in found.seconds._asdict().items()}
-        row["pair_s"] = float(np.median(found.seconds.total))
+        row["pair_s"] = float(np.median(found.seconds))
     return row
 
 

@@ -138,7 +138,7 @@ class Config(ProcessOptions):
 
 def main(config: Config) -> None:
     """Trains, evaluates, and writes the files; one of several processes writes."""
-    from dpmjax.deeppointmap.training.processes import is_first, join_processes, merged, together
+    from dpmjax.deeppointmap.training.processes import is_first, join_processes
 
     started = time.perf_counter()
     join_processes(config.coordinator, config.num_processes, config.process_id)
@@ -147,32 +147,27 @@ def main(config: Config) -> None:
     from dpmjax.cli.train_preparation import prepare_sources
     from dpmjax.cli.train_run import Records, run_training, training_part
 
-    with together():
-        first = None if config.weights is None else weights.load_model(config.weights)
-        settings = training_settings(config, first)
-        sources = training_sources(config, settings)
-        folder = cli.open_run_folder(config, NAME) if is_first() else None
+    first = None if config.weights is None else weights.load_model(config.weights)
+    settings = training_settings(config, first)
+    sources = training_sources(config, settings)
+    folder = cli.open_run_folder(config, NAME) if is_first() else None
     with cli.recording(folder) if folder is not None else nullcontext(), cli.StopFlag() as stop:
-        with together():
-            # Of several processes, none may end alone.
-            on_wait = stop.end_if_requested if config.coordinator is None else lambda: None
-            parts = [partial(training_part, source) for source in sources]
-            drives = prepare_sources(parts, settings, config.cache, seed=config.seed, on_wait=on_wait)
-            store = deeppointmap.ScanStore(drives)
-            settings = for_devices(settings, len(store.table))
-            records = None
-            if folder is not None:
-                settings = without_impossible_stage(settings, store)
-                print(f"{config.preset}: {describe_plan(settings, len(store.table))}")
-                selection = select_pairs(config, settings, sources, on_wait)
-                is_last = config.preset == "paper"
-                records = Records(folder, settings, selection, seed=config.seed, weights=first, takes_last=is_last)
+        parts = [partial(training_part, source) for source in sources]
+        drives = prepare_sources(parts, settings, config.cache, seed=config.seed, on_wait=stop.end_if_requested)
+        store = deeppointmap.ScanStore(drives)
+        settings = for_devices(settings, len(store.table))
+        records = None
+        if folder is not None:
+            settings = without_impossible_stage(settings, store)
+            print(f"{config.preset}: {describe_plan(settings, len(store.table))}")
+            selection = select_pairs(config, settings, sources, stop.end_if_requested)
+            is_last = config.preset == "paper"
+            records = Records(folder, settings, selection, seed=config.seed, weights=first, takes_last=is_last)
         hooks = deeppointmap.TrainingHooks(evaluate_every=config.recall_every, stop=lambda: stop.received or 0)
         total_s = 0.0 if config.finish else 3600 * (config.hours or math.inf)
         trained = run_training(records, store, settings, hooks, seed=config.seed, total_s=total_s)
         if trained.stopped_by:
             stop.request(trained.stopped_by)
-        bad = merged(store.bad)
         if folder is None or records is None:
             return
         ended = evaluate_and_calibrate(config, trained, records, chosen_sources(config, sources), stop)
@@ -180,7 +175,7 @@ def main(config: Config) -> None:
             **training_numbers(trained, records),
             **ended.numbers,
             "num_scans": len(store.table),
-            "bad_scans": bad,
+            "bad_scans": store.bad,
             "wall_s": time.perf_counter() - started,
             "status": stop.status,
             "seed": config.seed,

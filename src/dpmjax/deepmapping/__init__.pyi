@@ -1,8 +1,6 @@
 from .config import JOINT_DEPTH as JOINT_DEPTH
-from .config import ChamferComparison as ChamferComparison
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
-from .config import ProjectiveComparison as ProjectiveComparison
 from .config import as_direct as as_direct
 from .config import preset as preset
 from .config import with_steps as with_steps

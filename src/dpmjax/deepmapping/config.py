@@ -1,6 +1,6 @@
 """Settings of DeepMapping, and presets of planar scans and of depth images.
 
-Settings are the phases of a fit, the comparisons of scans, and the networks.
+Settings are the phases of a fit and the networks.
 """
 
 from __future__ import annotations
@@ -11,33 +11,6 @@ from typing import Literal
 from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry.se3 import Motion
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
-
-
-@dataclass(frozen=True)
-class ChamferComparison:
-    """Comparison of pairs of scans by the Chamfer distance (DeepMapping eq. 7).
-
-    Attributes:
-        limit: distance to which larger ones are clipped, at the start and at the end of the phase, so that points
-            outside the overlap have no gradient; None: no limit.
-    """
-
-    limit: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class ProjectiveComparison:
-    """Comparison of pairs of depth images by projection; offsets in time wrap around at the end of the sequence.
-
-    Attributes:
-        tolerance: tolerance of matching points as a share of the depth, at the start and at the end of the phase.
-    """
-
-    tolerance: tuple[float, float]
-
-
-Comparison = ChamferComparison | ProjectiveComparison
-CHAMFER = ChamferComparison()
 
 
 @dataclass(frozen=True)
@@ -65,7 +38,11 @@ class PhaseConfig:
             the samples of each beam are random, and all points have the same weight.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
-        comparison: method that compares pairs of scans; only depth images can be compared by projection.
+        chamfer_limit: distance to which the Chamfer distances of pairs of scans are clipped, at the start and at the
+            end of the phase, so that points outside the overlap have no gradient; None: no limit.
+        projective_tolerance: pairs of depth images are compared by projection instead of the Chamfer distance, with
+            this tolerance of matching points as a share of the depth, at the start and at the end of the phase. Offsets
+            in time wrap around at the end of the sequence then. None for other scans.
         scans_per_window: for planar scans, number of neighbours in time in a window. Each window has its own L-Net (or
             free poses), and windows are joined at the scans that they share. A step has all windows. None: one L-Net
             for the whole set.
@@ -86,7 +63,8 @@ class PhaseConfig:
     num_free: int = 1
     is_as_published: bool = False
     surface_distance: tuple[float, float] | None = None
-    comparison: Comparison = CHAMFER
+    chamfer_limit: tuple[float, float] | None = None
+    projective_tolerance: tuple[float, float] | None = None
     scans_per_window: int | None = None
 
     def __post_init__(self) -> None:
@@ -139,7 +117,6 @@ class DeepMappingConfig:
         occupancy: shape of M-Net.
         unit: unit of length of networks and losses, in the unit of the points; None: the typical range of the scans.
         steps_per_call: the largest number of steps that are compiled into one call.
-        map_margin: side of the map as a multiple of the extent of the scans at the start of a phase.
         motion: degrees of freedom of a depth camera.
     """
 
@@ -153,7 +130,6 @@ class DeepMappingConfig:
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
     unit: float | None = None
     steps_per_call: int = 25
-    map_margin: float = 1.15
     motion: Motion = "planar"
 
     def __post_init__(self) -> None:
@@ -232,7 +208,7 @@ UNROLL_DEPTH = replace(
     num_steps=300,
     learning_rate=1e-2,
     final_learning_rate=0.02,
-    comparison=ChamferComparison(limit=(0.5, 0.05)),
+    chamfer_limit=(0.5, 0.05),
 )
 
 # Free poses and a map that sharpens from coarse to fine. The Chamfer distance is biased by the spacing of the pixels
@@ -246,7 +222,7 @@ REFINE_DEPTH = replace(
     beams_per_step=200,
     max_offset=1 << 30,
     surface_distance=(0.05, 0.01),
-    comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
+    projective_tolerance=(0.05, 0.005),
 )
 
 # Phase of the paper for depth images (section 4.2): lambda = 0.1, 35 free samples on each ray, batches of 8 images. As
@@ -261,7 +237,6 @@ _FAST: dict[str, DeepMappingConfig] = {
         localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), dilation=3, hidden=(128, 64)),
         occupancy=OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64)),
         steps_per_call=50,
-        map_margin=1.2,
     ),
 }
 # Phase, L-Net and unit of the paper for each sensor. Its worlds have a side of 1024 px, two units of the published
@@ -306,7 +281,7 @@ def preset(
         config = replace(config, localization=net, occupancy=OccupancyConfig())
     elif sensor == "depth" and motion == "full":
         # Real depth images in SE(3) do not agree to half a percent of the depth, and initial poses are less accurate.
-        refine = replace(REFINE_DEPTH, comparison=ProjectiveComparison(tolerance=(0.1, 0.02)))
+        refine = replace(REFINE_DEPTH, projective_tolerance=(0.1, 0.02))
         config = replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
     if not is_organised:
         config = replace(config, localization=replace(config.localization, kind="point"))

@@ -66,18 +66,17 @@ class Registered(NamedTuple):
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: the poses of the smaller misfit.
         kept: source of the poses, the fit or the initial poses ("start").
-        misfit: disagreement of the scans at the poses of the fit, 0 or more: 1 less the `projective_consistency` of
-            depth images, or the `trajectory_misfit` of clouds.
-        start_misfit: misfit at the initial poses; None after a cold start.
-        start: (n, 4, 4) initial poses; None after a cold start.
-        fitted: DeepMapping of the scans.
+        misfit: 1 less the `projective_consistency` of the images at the poses of the fit, 0 or more.
+        start_misfit: the same at the initial poses.
+        start: (n, 4, 4) initial poses.
+        fitted: DeepMapping of the images.
     """
 
     T_world_scan: NDArray[np.float64]
     kept: Literal["fit", "start"]
     misfit: float
-    start_misfit: float | None
-    start: NDArray[np.float64] | None
+    start_misfit: float
+    start: NDArray[np.float64]
     fitted: Fitted
 
 
@@ -196,20 +195,11 @@ def register_depth(
         start = initialize_depth(scans, depth_search(config.motion), key=key)
     # Search and fit share the key, so that a fit from found poses equals a fit from the same poses, given as `start`.
     fitted = fit_deepmapping(scans, config, key=key, start=start, engine=engine)
-    return _keep_better(fitted, start, lambda T: 1.0 - float(projective_consistency(scans, T)))
-
-
-def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..., float]) -> Registered:
-    """Returns the poses of the fit or the initial poses, those of the smaller misfit; initial ones without a step."""
-    T, misfit = fitted.T_world_scan, misfit_of(fitted.T_world_scan)
-    if start is None:
-        return Registered(T, "fit", misfit, None, None, fitted)
-    T_start = np.asarray(start, np.float64)
-    start_misfit = misfit_of(T_start)
+    poses = {"fit": fitted.T_world_scan, "start": np.asarray(start, np.float64)}
+    misfits = {name: 1.0 - float(projective_consistency(scans, T)) for name, T in poses.items()}
     # The comparison is False for a misfit that is not finite, so the start is kept then.
-    if fitted.num_steps > 0 and misfit < start_misfit:
-        return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
-    return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)
+    kept: Literal["fit", "start"] = "fit" if fitted.num_steps > 0 and misfits["fit"] < misfits["start"] else "start"
+    return Registered(poses[kept], kept, misfits["fit"], misfits["start"], poses["start"], fitted)
 
 
 class MapPicture(NamedTuple):

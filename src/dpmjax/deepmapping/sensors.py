@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, ProjectiveComparison
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import (
     Terms,
     WorldBatch,
@@ -38,6 +38,9 @@ from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
 from dpmjax.types import ScanSet
 
 _ALL = slice(None)
+# Side of the map as a multiple of the extent of the scans at the start of a phase. If it is smaller, scans whose poses
+# still move leave the map; if it is larger, its cells are coarser. Depth images see farther past their neighbours.
+_PLANAR_MARGIN, _DEPTH_MARGIN = 1.15, 1.2
 # Largest coordinate of an initial pose, in typical ranges of the scans.
 _MAX_COORDINATE = 1e4
 
@@ -126,7 +129,7 @@ def _planar_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array,
     """Computes the square that the scans cover at these poses, with the margin of the map."""
     if config.occupancy.kind == "mlp":
         return MapFrame(centre=jnp.zeros(2), half_side=jnp.ones(()))
-    return choose_frame(se2.transform_points(poses, scans.points), scans.mask, config.map_margin)
+    return choose_frame(se2.transform_points(poses, scans.points), scans.mask, _PLANAR_MARGIN)
 
 
 def _planar_next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
@@ -193,7 +196,7 @@ def _planar_loss(
     world = WorldBatch(points, poses[:, :2], some.mask[flat], is_scan.reshape(-1), rows.shape[1], progress)
     free_key, offset_key = jax.random.split(loss_key)
     offsets = draw_offsets(phase, rows.shape[1] - 1, key=offset_key)
-    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)
+    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.chamfer_limit), key=free_key)
 
 
 def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
@@ -259,11 +262,11 @@ def _poses(
     return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
 
 
-def _choose_frame(config: DeepMappingConfig, scans: DepthScans, T: Float[Array, "n 4 4"]) -> MapFrame:
+def _depth_frame(scans: DepthScans, T: Float[Array, "n 4 4"]) -> MapFrame:
     """Computes the cube that the scans cover at these poses, with the margin of the map."""
     count = scans.mask.shape[0]
     world = rigid.transform_points(T, scans.points.reshape(count, -1, 3))
-    return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
+    return choose_frame(world, scans.mask.reshape(count, -1), _DEPTH_MARGIN)
 
 
 def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
@@ -278,7 +281,7 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Param
         poses=jnp.zeros((count, net.num_outputs)),
         occupancy=init_map_net(config.occupancy, key=map_key, num_dimensions=3),
         start=T_start,
-        frame=_choose_frame(config, scans, T_start),
+        frame=_depth_frame(scans, T_start),
     )
     first = config.cold_phases[0]
     if first.poses == "free" and start is None:
@@ -290,7 +293,7 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Param
 def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
     """Starts the next phase (`Problem.next_phase`): poses as estimated, motions zero, the map frame re-centred."""
     T = _poses(config, phase, params, data)
-    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))
+    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_depth_frame(data.scans, T))
 
 
 def _draw_pixels(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
@@ -326,12 +329,12 @@ def _depth_loss(
     points = rigid.transform_points(T, sample.points)
     world = WorldBatch(points, T[:, :3, 3], sample.mask, is_scan, count, progress)
     free_key, offset_key = jax.random.split(loss_key)
-    if isinstance(phase.comparison, ProjectiveComparison):
-        tolerance = interpolate_log(phase.comparison.tolerance, progress)
+    if phase.projective_tolerance is not None:
+        tolerance = interpolate_log(phase.projective_tolerance, progress)
         offsets = draw_offsets(phase, count // 2, key=offset_key)
         pair_term = 1.0 - consistency_of_pairs(T, sample, scans, offsets, tolerance)
     else:
-        pair_term = chamfer_term(world, draw_offsets(phase, count - 1, key=offset_key), phase.comparison)
+        pair_term = chamfer_term(world, draw_offsets(phase, count - 1, key=offset_key), phase.chamfer_limit)
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -66,12 +67,28 @@ def encode_scans(
     """
     require_type("model", model, Model, "load_model")
     require_some("scans", scans)
-    parts = []
-    for start in range(0, len(scans), CHUNK):
-        # JAX encodes the chunk before at the same time.
-        pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
-        parts.append(_encode_chunk(model, stack_chunk(pyramids), num_elements=num_elements))
-    return join_chunks(parts, len(scans))
+    pyramids = (pyramid_of_scan(points, model.config, scale=scale) for points in scans)
+    return jax.tree.map(jnp.asarray, encode_pyramids(model, pyramids, num_elements=num_elements))
+
+
+def encode_pyramids(
+    model: Model, pyramids: Iterable[PointPyramid], *, num_elements: int | None = None
+) -> DescriptorCloud:
+    """Encodes pyramids; an iterator makes the next ones while JAX encodes.
+
+    Args:
+        model: encoder and configuration.
+        pyramids: at least one, in normalised coordinates, from the host.
+        num_elements: see `encode`.
+
+    Returns:
+        Stacked clouds, as arrays of NumPy: moved to a device, another number of scans would be compiled again.
+    """
+    parts, num, remaining = [], 0, iter(pyramids)
+    while some := list(itertools.islice(remaining, CHUNK)):
+        parts.append(_encode_chunk(model, stack_chunk(some), num_elements=num_elements))
+        num += len(some)
+    return join_chunks(parts, num)
 
 
 def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
@@ -144,8 +161,8 @@ def stack_chunk(items: list[Any]) -> Any:
 
 
 def join_chunks(parts: Sequence[Any], num: int) -> Any:
-    """Joins the results of chunks, on the host: there, another number of parts compiles nothing."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num]), *jax.device_get(parts))
+    """Joins the results of chunks as arrays of NumPy: there, another number of parts compiles nothing."""
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *jax.device_get(parts))
 
 
 def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:

@@ -40,7 +40,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     measured, guesses = slam_map.edges_of("odometry"), slam_map.edges_of("guess")
     accepted = [number for number, loop in enumerate(state.loops) if loop.status == "accepted"]
     edges = [state.loops[number].edge for number in accepted]
-    T_world_keyframe = join_parts(slam_map.T_world_keyframe, measured_parts(slam_map), edges)
+    T_world_keyframe = move_parts(slam_map.T_world_keyframe, measured_parts(slam_map), edges)
     graph = as_pose_graph(replace(slam_map, T_world_keyframe=T_world_keyframe, edges=(*edges, *measured, *guesses)))
     trust = np.full(len(graph.edges.source), CERTAIN)
     trust[: len(edges)] = 1.0
@@ -54,7 +54,7 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     return slam_map, LoopState(tuple(loops), len(slam_map))
 
 
-def join_parts(T_world_keyframe: Poses, parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]) -> Poses:
+def move_parts(T_world_keyframe: Poses, parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]) -> Poses:
     """Moves whole parts, so that one edge between two parts holds exactly: a start near the solution.
 
     Args:
