@@ -51,7 +51,6 @@ SCANS_2D = Group("2-D scans", (
         "warm_phases": ("", "phases from given poses; see PhaseConfig"),
         "unit": ("unit of the scans", "512 px in `preset('paper')`; None: the typical range of the scans"),
         "steps_per_call": ("steps", "lower: progress and Ctrl-C react sooner; higher: less overhead on a GPU"),
-        "map_margin": ("share", "higher if the poses move far: M-Net covers this multiple of the scans' extent"),
     }),
     Section("PhaseConfig", "dpmjax.deepmapping", "`DeepMappingConfig(cold_phases=..., warm_phases=...)`", {
         "num_steps": ("steps", "more for large sets or noise; `deepmapping.with_steps(config, n)` scales all phases"),

@@ -20,7 +20,6 @@ PIPELINES: dict[str, Callable[[Any], Any]] = {
     "refine": lambda x: dpmjax.refine(SCANS, x * POSES),
     "fit_deepmapping": lambda x: dpmjax.fit_deepmapping(x * SCANS, key=KEY),
     "register_depth": lambda x: dpmjax.register_depth(x * jnp.ones((2, 4, 4)), key=KEY),
-    "register_clouds": lambda x: dpmjax.register_clouds([x * SCAN, SCAN], key=KEY),
     "relocalize": lambda x: dpmjax.relocalize(None, x * SCANS),
     "encode": lambda x: dpmjax.encode(None, x * SCAN),
     "encode_scans": lambda x: dpmjax.encode_scans(None, [x * SCAN]),

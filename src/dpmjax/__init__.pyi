@@ -22,7 +22,6 @@ from . import viz as viz
 from . import weights as weights
 from .compile_cache import enable_compile_cache as enable_compile_cache
 from .deepmapping.mapping import fit_deepmapping as fit_deepmapping
-from .deepmapping.mapping import register_clouds as register_clouds
 from .deepmapping.mapping import register_depth as register_depth
 from .deepmapping.relocalization import relocalize as relocalize
 from .deeppointmap.encoding import encode as encode

@@ -199,7 +199,7 @@ def require_shape(name: str, array: AnyArray, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
 
 
-def require_positive(name: str, value: float | AnyArray) -> None:
+def require_positive(name: str, value: Any) -> None:
     """Checks that a number is above zero; a traced number passes.
 
     Args:
@@ -207,9 +207,9 @@ def require_positive(name: str, value: float | AnyArray) -> None:
         value: the argument.
 
     Raises:
-        ValueError: the number is zero, negative or NaN.
+        ValueError: it is no number, zero, negative or NaN.
     """
-    if not isinstance(value, jax.core.Tracer) and not value > 0:
+    if not isinstance(value, jax.core.Tracer) and (isinstance(value, str) or not value > 0):
         raise ValueError(f"{name}: expected a number above 0, got {value}")
 
 

@@ -113,6 +113,9 @@ class DescriptorCloud:
     normals: Float[Array, "n 3"] | None = None
     planarity: Float[Array, " n"] | None = None
 
+    def __repr__(self) -> str:
+        return f"DescriptorCloud(positions {np.shape(self.positions)}, features {np.shape(self.features)})"
+
     @property
     def described(self) -> DescriptorCloud:
         """The points with features, without further surface elements, for matching; also of stacked clouds."""

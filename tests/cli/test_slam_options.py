@@ -1,4 +1,4 @@
-"""Options of `dpmjax slam`: saved maps are extended, trajectories refined, scans deskewed, and the viewer records."""
+"""Options of `dpmjax slam`: saved maps are extended, scans deskewed, and the viewer records."""
 
 from __future__ import annotations
 

@@ -25,12 +25,10 @@ from dpmjax.deeppointmap import (
     StepRecord,
     TrainingHooks,
     TrainingReport,
-    WallOffsets,
     begin_training,
     draw_evaluation_pairs,
     init_model,
     init_training,
-    measure_offsets,
     prepare_drive,
     training_preset,
 )
@@ -65,7 +63,7 @@ def train_both(folder: Path, *, stop_after: int = 99):
 
 
 def train(folder: Path, *, stop_after: int = 99, total_s: float = math.inf):
-    pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=KINDS)
     records = Records(run_in(folder), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
@@ -131,20 +129,17 @@ def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_pa
 
 
 def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path, monkeypatch) -> None:
-    true = np.random.default_rng(0).normal(size=(50, 3))
-    known = WallOffsets(true * [0.5, 1, 0], true, np.ones(50, bool))
+    r2 = np.array([0.75, 1.0, -0.25])
     recalls = (registration_recall(np.eye(4)[None], np.eye(4)[None]),)
-    found = Evaluation(recalls, (), (known, known), toy.cloud(np.zeros((1, 3))))
+    found = Evaluation(recalls, (), r2, toy.cloud(np.zeros((1, 3))))
     monkeypatch.setattr(train_run.dpm, "evaluate_registration", lambda model, pairs: found)
-    nothing, one = draw_evaluation_pairs(toy.drive(), 1, toy.MODEL, kinds=KINDS[:1]), np.ones(())
+    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL, kinds=KINDS[:1]), np.ones(())
     records = Records(run_in(tmp_path), TRAINING, Selection(nothing, "a toy"), seed=0)
     report = TrainingReport(one, ObjectiveTerms(one, one, one, one, np.ones((), int)), one, one)
     with records:
         for step, score in ((1, math.nan), (2, records.evaluate(records.untrained))):
             records.on_report(StepRecord(step, TRAINING.stage_at(step), report, score, Speed()), records.start)
     between, evaluated = run_in(tmp_path).read_table(HISTORY)
-    r2 = measure_offsets([known]).r2
-    assert r2[1] == 1 > r2[0] > r2[2]
     np.testing.assert_allclose([float(evaluated[name]) for name in train_run.OFFSETS], r2, rtol=1e-5)
     assert [between[name] for name in train_run.OFFSETS] == ["", "", ""]
     assert between["offset"] == "1"
@@ -241,7 +236,7 @@ def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(t
     assert settings.learning_rate == pytest.approx(0.2 * training_settings(TrainOptions()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
-    pairs = draw_evaluation_pairs(toy.drive(seed=9), 2, toy.MODEL, kinds=KINDS)
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=KINDS)
     sets = Selection(pairs, "a toy")
     with Records(run_in(tmp_path), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)

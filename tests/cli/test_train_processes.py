@@ -29,10 +29,10 @@ from tests.deeppointmap import toy
 REPOSITORY = Path(__file__).parents[2]
 TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
-# The second process gets a signal before its third step of four.
+# The first process gets a signal before its third step of four.
 PROCESS = """
 import os, signal, sys
-from dpmjax.deeppointmap.training.processes import is_first, join_processes, merged
+from dpmjax.deeppointmap.training.processes import is_first, join_processes
 coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
@@ -49,15 +49,14 @@ calls = []
 
 def stop_requested():
     calls.append(0)
-    if number == 1 and len(calls) == 3:
+    if number == 0 and len(calls) == 3:
         os.kill(os.getpid(), signal.SIGINT)
     return stop.received or 0
 
-assert merged({str(number): "bad"}) == {"0": "bad", "1": "bad"}
 assert is_first() == (number == 0)
 try:
     with StopFlag() as stop:
-        pairs = draw_evaluation_pairs(toy.drive(seed=9), 1, toy.MODEL, kinds=KINDS)
+        pairs = draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL, kinds=KINDS)
         sets = Selection(pairs, "a toy")
         records = Records(RunFolder(Path(folder), False), TRAINING, sets, seed=0) if is_first() else None
         store = toy.store()
@@ -105,7 +104,7 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
     assert [row["step"] for row in read_history(tmp_path / HISTORY)] == ["1", "2"]
 
     state, step = init_training(jax.random.key(0), TRAINING), make_step(TRAINING)
-    maker = SampleMaker(toy.store(), TRAINING, seed=0, num_samples=2)
+    maker = SampleMaker(toy.store(), TRAINING, seed=0, numbers=(0, 1), num_in_step=2)
     progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(
         replace(begin_training(TRAINING), best_params={}), fallback=None
     )
@@ -118,14 +117,6 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4 * largest), found, expected)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ((None, 2, 0), "^coordinator"),
-        (("localhost:1", None, 0), "^num_processes"),
-        (("localhost:1", 2, 2), "^process_id: expected from 0 to 1, got 2"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(options, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        join_processes(*options)
+def test_numbers_without_a_coordinator_are_refused() -> None:
+    with pytest.raises(ValueError, match="^coordinator: expected HOST:PORT"):
+        join_processes(None, 2, 0)

@@ -8,16 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.ndimage import maximum_filter
 
 import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping import localization_training
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.localization_training import make_raster, nearest_nodes, render_scans, shift_scan, turn_scan
+from dpmjax.deepmapping.localization_training import make_raster, nearest_nodes, render_scans, turn_scans
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame, bind_map
-from dpmjax.deepmapping.relocalization import largest_nearby, propose_poses
+from dpmjax.deepmapping.relocalization import propose_poses
 from dpmjax.geometry import se2
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig, init_map_net
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
@@ -150,13 +149,6 @@ def test_nothing_is_rendered_from_a_map_that_knows_nothing(unmapped, tiny_walk) 
     assert poses.shape == (0, 3)
 
 
-@pytest.mark.parametrize(("radius", "reach"), [(0.5, 0), (1.0, 1), (2.9, 1), (3.0, 3), (7.5, 7)])
-def test_the_largest_nearby_is_that_of_a_square(radius: float, reach: int) -> None:
-    values = np.random.default_rng(0).normal(size=(40, 40)).astype(np.float32)
-    found = np.asarray(largest_nearby(jnp.asarray(values), jnp.float32(radius)))
-    np.testing.assert_array_equal(found, maximum_filter(values, 2 * reach + 1, mode="wrap"))
-
-
 @pytest.mark.slow
 def test_one_scan_is_one_row_of_many(trained, queries) -> None:
     points = queries[0]
@@ -177,33 +169,8 @@ def test_teaching_keeps_poses_and_map(fitted, trained) -> None:
 def test_a_turned_sensor_sees_points_turned_back() -> None:
     points = np.random.default_rng(0).normal(size=(5, 2))
     world = se2.transform_points(np.array([[0.0, 0.0, 0.7]]), points[None])[0]
-    turned = np.asarray(turn_scan(jnp.asarray(points, jnp.float32), jnp.float32(0.4)))
+    turned = np.asarray(turn_scans(jnp.asarray(points[None], jnp.float32), jnp.array([0.4])))[0]
     np.testing.assert_allclose(se2.transform_points(np.array([[0.0, 0.0, 1.1]]), turned[None])[0], world, **ROUNDING)
-
-
-def test_a_shifted_scan_is_the_scan_of_the_place_in_a_convex_room() -> None:
-    room = np.ones((202, 202), bool)
-    room[1:-1, 1:-1] = False
-    here, there = np.array([[90.0, 110.0, 0.4]]), np.array([[90.0, 110.0, 0.4]])
-    shift = np.array([14.0, -9.0])
-    cos, sin = np.cos(0.4), np.sin(0.4)
-    there[0, :2] += [cos * shift[0] - sin * shift[1], sin * shift[0] + cos * shift[1]]
-    (near, mask), (truth, _) = scan_world(room, here), scan_world(room, there)
-    seen = np.asarray(shift_scan(jnp.asarray(near[0]), jnp.asarray(mask[0]), jnp.asarray(shift, jnp.float32)))
-    error = np.linalg.norm(seen - truth[0], axis=-1)
-    # Ranges are interpolated over corners; on the walls nothing is lost.
-    assert np.median(error) < 0.05
-    assert (error < 1.0).mean() > 0.95
-    unmoved = shift_scan(jnp.asarray(near[0]), jnp.asarray(mask[0]), jnp.zeros(2))
-    np.testing.assert_array_equal(np.asarray(unmoved), near[0])
-
-
-def test_a_shifted_scan_of_no_or_few_beams_stays_finite() -> None:
-    points = jnp.asarray(np.random.default_rng(0).normal(size=(16, 2)), jnp.float32)
-    for valid in (0, 1, 2):
-        seen = shift_scan(points, jnp.arange(16) < valid, jnp.asarray([0.3, 0.1]))
-        assert np.isfinite(np.asarray(seen)).all()
-        np.testing.assert_array_equal(np.asarray(seen)[valid:], np.asarray(points)[valid:])
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import calibrated_probability, merge_clouds, offset_quality, register_clouds
+from dpmjax.deeppointmap import calibrated_probability, merge_clouds, register_clouds
 from dpmjax.scans.element_alignment import align_elements_on_host
 from dpmjax.types import DescriptorCloud
 from tests.scans.surface_scenes import motion, seen_from, street
@@ -70,16 +70,3 @@ def test_a_merged_map_is_refined_like_a_scan(model, clouds) -> None:
     match = dpmjax.register(model, clouds[0], merged, refine=True)
     difference = np.linalg.inv(T_map_b @ T_B_A) @ np.asarray(match.T_target_source, float)
     assert np.linalg.norm(difference[:3, 3]) < 0.02
-
-
-@pytest.mark.slow
-def test_offsets_are_compared_with_the_true_ones(model, clouds) -> None:
-    quality = offset_quality(model, [(*clouds, T_B_A.astype(np.float32))])
-    assert quality.num_pairs > 100
-    np.testing.assert_allclose(quality.r2, 1 - (quality.rmse_m / quality.spread_m) ** 2, atol=1e-6)
-    apart = np.eye(4, dtype=np.float32)
-    apart[0, 3] = 1000
-    for nothing in ([], [(*clouds, apart)]):
-        quality = offset_quality(model, nothing)
-        assert quality.num_pairs == 0
-        assert np.isnan(quality.r2).all()

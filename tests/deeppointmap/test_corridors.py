@@ -12,7 +12,7 @@ from scipy.special import logit
 import dpmjax
 from dpmjax.deeppointmap.confidence import (
     CLOUD_FEATURES,
-    CORRIDOR_SHARE,
+    CORRIDOR_CONFIDENCE,
     ELEMENT_FEATURES,
     SCAN_FEATURES,
     Calibration,
@@ -97,16 +97,16 @@ def test_elements_tell_the_motion_from_shifts_but_are_never_sure(with_pillars) -
     assert right.num_slid == shifted.num_slid > 0
     assert right.facing_gap > 0 > shifted.facing_gap
     found = evidence_of(right)
-    assert found.lookalike_gap == pytest.approx(logit(CORRIDOR_SHARE))
+    assert found.lookalike_gap == pytest.approx(logit(CORRIDOR_CONFIDENCE))
     assert found.of_elements is not None
     sure = LogisticModel(ELEMENT_FEATURES, (0.0,) * 8, 20.0)
     calibration = Calibration(
         LogisticModel(CLOUD_FEATURES, (0.0,) * 4, 0.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 0.0), of_elements=sure
     )
-    assert calibrated_probability(calibration, found) == pytest.approx(CORRIDOR_SHARE)
+    assert calibrated_probability(calibration, found) == pytest.approx(CORRIDOR_CONFIDENCE)
     few = evidence_of(right, num_elements=256)
     assert few.of_elements is None
-    assert calibrated_probability(calibration, few) == pytest.approx(CORRIDOR_SHARE / 2)
+    assert calibrated_probability(calibration, few) == pytest.approx(CORRIDOR_CONFIDENCE / 2)
 
 
 def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None:

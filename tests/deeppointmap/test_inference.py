@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap import VerificationConfig, prepare_scan, scene_scale
+from dpmjax.deeppointmap import VerificationConfig, prepare_scan
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.geometry import PyramidConfig, PyramidStage
 from dpmjax.geometry.normals import pyramid_elements
@@ -89,6 +89,12 @@ def test_what_is_no_model_or_no_scale_is_named(as_user, model, scans, name, scal
         dpmjax.register("dpm_small" if name else model, *scans[:2], scale=scale)
 
 
+def test_a_model_and_a_cloud_print_one_line(model, scans) -> None:
+    for value in (model, dpmjax.encode(model, scans[0])):
+        assert len(repr(value)) < 120
+        assert "\n" not in repr(value)
+
+
 def test_an_empty_scan_is_a_failure_as_data(model, scans) -> None:
     empty = np.zeros((0, 3), np.float32)
     assert not dpmjax.encode(model, empty).mask.any()
@@ -153,16 +159,6 @@ def test_motions_are_in_metres_whatever_the_scale(model, scans) -> None:
     np.testing.assert_array_equal(dpmjax.register(model, *prepared).T_target_source, of_scans.T_target_source)
     with pytest.raises(ValueError, match="target: expected scale 2"):
         dpmjax.register(model, prepared[0], scans[1])
-    with pytest.raises(ValueError, match="needs scans"):
-        dpmjax.register(model, *clouds, scale="auto")
-
-
-@pytest.mark.parametrize(("extent_m", "scale"), [(60, 1), (24, 1), (17, 2), (8, 4), (2, 4), (0, 1)])
-def test_the_scale_of_a_scene_follows_the_larger_scan(model, extent_m: float, scale: float) -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
-    points *= extent_m / np.linalg.norm(points, axis=1, keepdims=True).clip(1e-9)
-    small = points[:0] if extent_m == 0 else points / 2
-    assert scene_scale([small, points], model.config) == scale
 
 
 def test_a_cloud_without_elements_is_not_refined(model, scans) -> None:

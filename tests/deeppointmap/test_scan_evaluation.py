@@ -110,7 +110,7 @@ def test_the_refined_motion_and_the_confidence_are_those_of_register(model) -> N
     drive = toy.drive()
     pairs = list(read_scan_pairs(drive, draw_scan_pairs(drive, "near", 3)))
     found = evaluate_scan_pairs(model, pairs)
-    assert len(found.confidence) == len(found.seconds.total) == 3
+    assert len(found.confidence) == len(found.seconds) == 3
     for number, pair in enumerate(pairs):
         match = dpmjax.register(model, pair.source, pair.target, refine=True)
         np.testing.assert_allclose(match.T_target_source, found.T_target_source[number], atol=1e-4)
@@ -120,7 +120,7 @@ def test_the_refined_motion_and_the_confidence_are_those_of_register(model) -> N
 
 def test_without_pairs_an_evaluation_is_empty(model) -> None:
     found = evaluate_scan_pairs(model, [])
-    assert (len(found.confidence), found.refined.recall, len(found.seconds.total)) == (0, 0.0, 0)
+    assert (len(found.confidence), found.refined.recall, len(found.seconds)) == (0, 0.0, 0)
     none = evaluate_overlap(model, toy.drive(num_scans=4), 5)
     assert len(none.probability) == 0
     assert np.isnan(none.area_under_curve)

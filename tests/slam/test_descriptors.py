@@ -27,7 +27,7 @@ from dpmjax.slam import (
     slam_preset,
     step_slam,
 )
-from dpmjax.slam.descriptor_loops import disjoint_neighbours, find_candidates, verify_match
+from dpmjax.slam.descriptor_loops import disjoint_neighbours, find_loop_targets, verify_match
 from dpmjax.slam.descriptor_odometry import neighbours_of, next_ratio
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, steps_from
@@ -245,7 +245,7 @@ def test_neighbours_and_candidates_are_those_of_a_slow_search(seed) -> None:
         if np.isinf(steps[other]) or is_near:
             expected.append(other)
     is_allowed = np.arange(num) < row
-    assert find_candidates(slam_map, [last], row, steps, is_allowed).tolist() == expected
+    assert find_loop_targets(slam_map, [last], row, steps, is_allowed).tolist() == expected
     assert 0 in expected
 
 

@@ -24,7 +24,7 @@ from dpmjax.slam.loop_closure import (
     search_again,
 )
 from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted
-from dpmjax.slam.map_optimization import optimize_map, with_motions
+from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 
@@ -232,7 +232,7 @@ def test_of_equal_vectors_the_first_are_returned() -> None:
     np.testing.assert_array_equal(most_similar(vectors, vectors[0], 16)[0], np.arange(16))
 
 
-def test_a_guess_that_loops_replaced_bends_neither_the_graph_nor_a_refined_map() -> None:
+def test_a_guess_that_loops_replaced_does_not_bend_the_graph() -> None:
     truth = laps(1, side_m=40.0, step_m=2.0)
     truth = rigid.inverse(truth[0]) @ truth
     slam_map = map_of(truth, segments=[0] * 40 + [1] * (len(truth) - 40))
@@ -243,6 +243,5 @@ def test_a_guess_that_loops_replaced_bends_neither_the_graph_nor_a_refined_map()
     loops = tuple(loop_between(truth, len(truth) - 1 - row, row) for row in (0, 3, 6))
     joined, _ = optimize_map(slam_map, LoopState(loops))
     solved = optimize_pose_graph(as_pose_graph(joined)).graph.poses
-    motions = {row: rigid.inverse(truth[row - 1]) @ truth[row] for row in range(1, len(truth))}
-    for poses in (joined.T_world_keyframe, solved, with_motions(joined, motions).T_world_keyframe):
+    for poses in (joined.T_world_keyframe, solved):
         np.testing.assert_allclose(poses, truth, atol=1e-6)

@@ -170,6 +170,13 @@ def test_every_scan_gets_a_pose_and_empty_ones_are_flagged() -> None:
     assert absolute_trajectory_error(result.T_world_scan[2:, :3, 3], truth[2:, :3, 3]) < 0.5
 
 
+def test_a_result_and_its_map_print_one_line() -> None:
+    result = run(laps(1, side_m=20.0, step_m=2.0))
+    assert repr(result) == "SlamResult(40 scans, 20 keyframes, 2 loops)"
+    assert len(repr(result.map)) < 120
+    assert "\n" not in repr(result.map)
+
+
 def test_only_empty_scans_stay_at_the_origin() -> None:
     methods = SlamMethods(TruthMatcher(np.eye(4)[None]), TruthGeometry(np.eye(4)[None]), CONFIG)
     result = run_slam(methods, [EMPTY, EMPTY])

@@ -192,19 +192,6 @@ def test_converter_converts(model: Model, tmp_path: Path) -> None:
     assert read_card(tmp_path / "b.safetensors") == "copy"
 
 
-@pytest.mark.slow
-def test_converter_makes_the_mean_of_two_models(model: Model, tmp_path: Path, capsys) -> None:
-    other = model.replace(params=jax.tree.map(lambda x: x + 2.0, model.params))
-    one, two, mean = (tmp_path / f"{name}.safetensors" for name in ("one", "two", "mean"))
-    save_model(model, one)
-    save_model(other, two)
-    assert main([str(one), str(mean), "--mean-with", str(two)]) == 0
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(y, x + 1.0, atol=1e-6), model.params, load_model(mean).params)
-    assert load_model(mean).config.calibration is None
-    assert main([str(one), str(mean), "--mean-with", "dpm_small"]) == 2
-    assert "expected a network of the same shapes" in capsys.readouterr().err
-
-
 def test_converter_tells_bad_input_in_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "dpmjax.weights", str(tmp_path / "no.pth"), str(tmp_path / "x.safetensors")]
     result = subprocess.run(command, capture_output=True, text=True)

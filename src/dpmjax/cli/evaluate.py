@@ -144,7 +144,7 @@ def registration_row(model: deeppointmap.Model, pair: deeppointmap.ScanPair) -> 
         row["confidence"] = float(deeppointmap.calibrated_probability(calibration, found.evidence))
     for stage, T_target_source in zip(STAGES, motions, strict=True):
         row |= motion_errors(stage, T_target_source, pair)
-    return row | {"pair_s": found.seconds.total}
+    return row | {"pair_s": found.seconds}
 
 
 def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.ScanPair) -> cli.Row:

@@ -64,9 +64,8 @@ class TrainOptions(RunOptions):
     """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
-    frame: Literal["lidar", "bearing", "local"] | None = None
-    """Frame of the encoder's features: of the lidar, of the ray to each point, or of the wall at it; without it, the
-    preset decides."""
+    frame: Literal["lidar", "local"] | None = None
+    """Frame of the encoder's features: of the lidar, or of the wall at each point; without it, the preset decides."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
     epochs: Annotated[float | None, arg(metavar="N")] = None
@@ -131,7 +130,7 @@ class TrainOptions(RunOptions):
 
 def main(options: TrainOptions, run: Run) -> Numbers:
     """Trains, evaluates, and writes the files; one of several processes writes."""
-    from dpmjax.deeppointmap.training.processes import is_first, join_processes, merged, together
+    from dpmjax.deeppointmap.training.processes import is_first, join_processes
 
     join_processes(options.coordinator, options.num_processes, options.process_id)
     if options.coordinator is not None:  # not before the processes have found each other
@@ -139,33 +138,28 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     from dpmjax.cli.train_preparation import prepare_sources
     from dpmjax.cli.train_run import Records, run_training, training_part
 
-    with together():
-        first = None if options.weights is None else weights.load_model(options.weights)
-        settings = training_settings(options, first)
-        sources = training_sources(options, settings)
-        if is_first():
-            run.open()
-    with together():
-        # Of several processes, none may end alone.
-        on_wait = run.check_stop if options.coordinator is None else lambda: None
-        parts = [partial(training_part, source) for source in sources]
-        drives = prepare_sources(parts, settings, options.cache, seed=options.seed, on_wait=on_wait)
-        store = deeppointmap.ScanStore(drives)
-        settings = for_devices(settings, len(store.table))
-        records = None
-        if run.is_open:
-            settings = without_impossible_stage(settings, store)
-            run.say(f"{options.preset}: {describe_plan(settings, len(store.table))}")
-            selection = select_pairs(options, settings, sources, on_wait)
-            is_last = options.preset == "paper"
-            records = Records(run, settings, selection, seed=options.seed, weights=first, takes_last=is_last)
+    first = None if options.weights is None else weights.load_model(options.weights)
+    settings = training_settings(options, first)
+    sources = training_sources(options, settings)
+    if is_first():
+        run.open()
+    parts = [partial(training_part, source) for source in sources]
+    drives = prepare_sources(parts, settings, options.cache, seed=options.seed, on_wait=run.check_stop)
+    store = deeppointmap.ScanStore(drives)
+    settings = for_devices(settings, len(store.table))
+    records = None
+    if run.is_open:
+        settings = without_impossible_stage(settings, store)
+        run.say(f"{options.preset}: {describe_plan(settings, len(store.table))}")
+        selection = select_pairs(options, settings, sources, run.check_stop)
+        is_last = options.preset == "paper"
+        records = Records(run, settings, selection, seed=options.seed, weights=first, takes_last=is_last)
     hooks = deeppointmap.TrainingHooks(evaluate_every=options.recall_every, stop=lambda: run.is_stopped)
     total_s = 0.0 if options.finish else 3600 * (options.hours or math.inf)
     trained = run_training(records, store, settings, hooks, seed=options.seed, total_s=total_s)
-    bad = merged(store.bad)
     if records is None:
         return {}
-    numbers = {**training_numbers(trained, records), "num_scans": len(store.table), "bad_scans": bad}
+    numbers = {**training_numbers(trained, records), "num_scans": len(store.table), "bad_scans": store.bad}
     ended = evaluate_and_calibrate(options, trained, records, numbers, chosen_sources(options, sources))
     numbers |= ended.numbers
     numbers = {"verdict": train_files.verdict(numbers), **numbers}

@@ -95,7 +95,8 @@ def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppoint
     title = f"Pair of scans left out of the training, the one of the median error ({errors[number]:.2f} m)\n"
     title += "right matches are less than 3 m apart under the true motion"
     motions = {"source moved by the estimated motion": np.asarray(matches.T_target_source[number], np.float64)}
-    pair = viz.RegisteredPair(title, pairs.scan_points(a), pairs.scan_points(b), motions)
+    source, target = (np.asarray(pairs.scans[row].points)[np.asarray(pairs.scans[row].mask)] for row in (a, b))
+    pair = viz.RegisteredPair(title, source, target, motions)
     viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), run / "matches.png")
 
 

@@ -21,7 +21,6 @@ from tqdm import tqdm
 from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.compile_cache import enable_compile_cache
-from dpmjax.deeppointmap.training.processes import together
 from dpmjax.types import Poses
 
 # Least number of scans of a part of a drive; each part opens the drive again. A drive this short is prepared here.
@@ -72,8 +71,6 @@ def prepare_sources(
 ) -> list[dpm.PreparedDrive]:
     """Prepares all drives by all processors and keeps them in a folder for later runs.
 
-    Of several hosts, each prepares its share first; where they share the folder, each then finds the other drives.
-
     Args:
         sources: the drives.
         settings: settings of training.
@@ -97,9 +94,6 @@ def prepare_sources(
             on_scan = lambda: (bar.update(1), on_wait())  # noqa: E731
             return [dpm.prepare_drive(drive, settings, folder=folder, seed=seed, on_scan=on_scan)]
     with _workers(work) as pool:
-        if jax.process_count() > 1:
-            with together():
-                _prepare(pool, sources[jax.process_index() :: jax.process_count()], work, on_wait)
         return _prepare(pool, sources, work, on_wait)
 
 

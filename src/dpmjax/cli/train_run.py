@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -90,18 +90,17 @@ def draw_selection(
     Returns:
         The pairs; none where no drive has any.
     """
-    parts = []
-    for source in tqdm(drives, desc="prepare evaluation", unit=" drives", dynamic_ncols=True):
-        on_wait()
-        drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
-        drive = drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
-        if not (kinds := dpm.pair_kinds(drive, KINDS)) or kinds[0].num_scans > 1:
-            continue
-        num = max(1, num_pairs // len(drives))
-        parts.append(dpm.draw_evaluation_pairs(drive, num, settings.model, kinds=kinds, max_scans=max_scans))
-    if not parts:
+
+    def opened() -> Iterator[LidarSequence]:
+        for source in tqdm(drives, desc="prepare evaluation", unit=" drives", dynamic_ncols=True):
+            on_wait()
+            drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
+            yield drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
+
+    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model, kinds=KINDS)
+    if not pairs.pairs:
         return Selection(None, "the last step: no drive has held-out places")
-    return Selection(dpm.join_evaluation_pairs(parts), chosen_by)
+    return Selection(pairs, chosen_by)
 
 
 class Records:
@@ -159,9 +158,8 @@ class Records:
             return math.nan
         found = dpm.evaluate_registration(model, pairs)
         named = zip(pairs.pairs, found.recalls, strict=True)
-        r2 = dpm.measure_offsets(found.offsets if model.config.decoder.predicts_offsets else []).r2.tolist()
         self._recalls |= {KIND_NAMES[some.kind]: recall.recall for some, recall in named}
-        self._recalls |= dict(zip(OFFSETS, r2, strict=True))
+        self._recalls |= dict(zip(OFFSETS, found.offset_r2.tolist(), strict=True))
         return float(np.mean([recall.recall for recall in found.recalls]))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:

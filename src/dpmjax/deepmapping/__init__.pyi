@@ -1,11 +1,6 @@
-from .cloud_scans import CloudScans as CloudScans
-from .cloud_scans import as_cloud_scans as as_cloud_scans
 from .config import JOINT_DEPTH as JOINT_DEPTH
-from .config import ChamferComparison as ChamferComparison
 from .config import DeepMappingConfig as DeepMappingConfig
 from .config import PhaseConfig as PhaseConfig
-from .config import PlaneComparison as PlaneComparison
-from .config import ProjectiveComparison as ProjectiveComparison
 from .config import as_direct as as_direct
 from .config import preset as preset
 from .config import with_steps as with_steps
@@ -29,7 +24,6 @@ from .mapping import fit_deepmapping as fit_deepmapping
 from .mapping import map_picture as map_picture
 from .mapping import mapping_data as mapping_data
 from .mapping import mapping_problem as mapping_problem
-from .mapping import register_clouds as register_clouds
 from .mapping import register_depth as register_depth
 from .problem import MappingData as MappingData
 from .problem import Problem as Problem

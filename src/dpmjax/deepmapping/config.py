@@ -1,6 +1,6 @@
-"""Settings of DeepMapping, and presets of planar scans, of depth images and of lidar clouds.
+"""Settings of DeepMapping, and presets of planar scans and of depth images.
 
-Settings are the phases of a fit, the comparisons of scans, and the networks.
+Settings are the phases of a fit and the networks.
 """
 
 from __future__ import annotations
@@ -11,44 +11,6 @@ from typing import Literal
 from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry.se3 import Motion
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
-
-
-@dataclass(frozen=True)
-class ChamferComparison:
-    """Comparison of pairs of scans by the Chamfer distance (DeepMapping eq. 7).
-
-    Attributes:
-        limit: distance to which larger ones are clipped, at the start and at the end of the phase, so that points
-            outside the overlap have no gradient; None: no limit.
-    """
-
-    limit: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class ProjectiveComparison:
-    """Comparison of pairs of depth images by projection; offsets in time wrap around at the end of the sequence.
-
-    Attributes:
-        tolerance: tolerance of matching points as a share of the depth, at the start and at the end of the phase.
-    """
-
-    tolerance: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class PlaneComparison:
-    """Comparison of pairs of lidar clouds by the distances of points to planes, revisits in space among the pairs.
-
-    Attributes:
-        width: width of the robust kernel, at the start and at the end of the phase.
-    """
-
-    width: tuple[float, float]
-
-
-Comparison = ChamferComparison | ProjectiveComparison | PlaneComparison
-CHAMFER = ChamferComparison()
 
 
 @dataclass(frozen=True)
@@ -76,8 +38,11 @@ class PhaseConfig:
             the samples of each beam are random, and all points have the same weight.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
-        comparison: method that compares pairs of scans. Only depth images can be compared by projection, and only
-            clouds by planes.
+        chamfer_limit: distance to which the Chamfer distances of pairs of scans are clipped, at the start and at the
+            end of the phase, so that points outside the overlap have no gradient; None: no limit.
+        projective_tolerance: pairs of depth images are compared by projection instead of the Chamfer distance, with
+            this tolerance of matching points as a share of the depth, at the start and at the end of the phase. Offsets
+            in time wrap around at the end of the sequence then. None for other scans.
         scans_per_window: for planar scans, number of neighbours in time in a window. Each window has its own L-Net (or
             free poses), and windows are joined at the scans that they share. A step has all windows. None: one L-Net
             for the whole set.
@@ -98,7 +63,8 @@ class PhaseConfig:
     num_free: int = 1
     is_as_published: bool = False
     surface_distance: tuple[float, float] | None = None
-    comparison: Comparison = CHAMFER
+    chamfer_limit: tuple[float, float] | None = None
+    projective_tolerance: tuple[float, float] | None = None
     scans_per_window: int | None = None
 
     def __post_init__(self) -> None:
@@ -142,7 +108,7 @@ REFINE = PhaseConfig(
 
 @dataclass(frozen=True)
 class DeepMappingConfig:
-    """Settings of a fit, by default of planar scans; `preset` has those of depth images and clouds.
+    """Settings of a fit, by default of planar scans; `preset` has those of depth images.
 
     Attributes:
         cold_phases: phases of a fit from zero poses.
@@ -151,8 +117,7 @@ class DeepMappingConfig:
         occupancy: shape of M-Net.
         unit: unit of length of networks and losses, in the unit of the points; None: the typical range of the scans.
         steps_per_call: the largest number of steps that are compiled into one call.
-        map_margin: side of the map as a multiple of the extent of the scans at the start of a phase.
-        motion: degrees of freedom of a depth camera; "full" for clouds.
+        motion: degrees of freedom of a depth camera.
     """
 
     cold_phases: tuple[PhaseConfig, ...] = (LOCALIZE, REFINE)
@@ -165,7 +130,6 @@ class DeepMappingConfig:
     occupancy: OccupancyConfig = field(default_factory=lambda: OccupancyConfig(kind="grid"))
     unit: float | None = None
     steps_per_call: int = 25
-    map_margin: float = 1.15
     motion: Motion = "planar"
 
     def __post_init__(self) -> None:
@@ -216,9 +180,6 @@ def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
     return replace(config, cold_phases=cold, warm_phases=warm, steps_per_call=min(config.steps_per_call, num_steps))
 
 
-# M-Net of the fast presets in space.
-_SPATIAL_GRID = OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64))
-
 # Phase of the paper (section 4.1). With gamma = 1 / (1 + lambda), both losses have the ratio of eq. 6 with lambda = 10,
 # and Adam's steps do not depend on the common factor. The paper does not give the number of neighbours of eq. 7; the
 # published program has 3.
@@ -247,7 +208,7 @@ UNROLL_DEPTH = replace(
     num_steps=300,
     learning_rate=1e-2,
     final_learning_rate=0.02,
-    comparison=ChamferComparison(limit=(0.5, 0.05)),
+    chamfer_limit=(0.5, 0.05),
 )
 
 # Free poses and a map that sharpens from coarse to fine. The Chamfer distance is biased by the spacing of the pixels
@@ -261,35 +222,12 @@ REFINE_DEPTH = replace(
     beams_per_step=200,
     max_offset=1 << 30,
     surface_distance=(0.05, 0.01),
-    comparison=ProjectiveComparison(tolerance=(0.05, 0.005)),
+    projective_tolerance=(0.05, 0.005),
 )
 
 # Phase of the paper for depth images (section 4.2): lambda = 0.1, 35 free samples on each ray, batches of 8 images. As
 # in the published program, each image is compared to the next one.
 JOINT_DEPTH = replace(JOINT, occupancy_weight=1.0 / 1.1, scans_per_step=8, num_offsets=1, max_offset=1, num_free=35)
-
-# Cold start of clouds.
-LOCALIZE_CLOUDS = replace(LOCALIZE_DEPTH, num_steps=300, beams_per_step=256)
-
-# Free poses of clouds, as `UNROLL_DEPTH`.
-UNROLL_CLOUDS = replace(UNROLL_DEPTH, num_steps=200, beams_per_step=256, scans_per_step=64)
-
-# Free poses, planes and a map that sharpens from coarse to fine. The Chamfer distance aligns the sparse rings of two
-# scans; the distance to the plane between the rings does not.
-REFINE_CLOUDS = replace(
-    REFINE_DEPTH,
-    name="free poses, planes and map",
-    num_steps=300,
-    final_learning_rate=0.01,
-    scans_per_step=64,
-    beams_per_step=128,
-    max_offset=8,
-    comparison=PlaneComparison(width=(0.04, 0.002)),
-)
-
-# Losses and sampling of the paper, for clouds, which it does not have.
-JOINT_CLOUDS = replace(JOINT, scans_per_step=64, beams_per_step=2048)
-
 
 _FAST: dict[str, DeepMappingConfig] = {
     "planar": DeepMappingConfig(),
@@ -297,17 +235,8 @@ _FAST: dict[str, DeepMappingConfig] = {
         cold_phases=(LOCALIZE_DEPTH, UNROLL_DEPTH, REFINE_DEPTH),
         warm_phases=(REFINE_DEPTH,),
         localization=LocalizationNetConfig(features=(32, 64, 128), strides=(2, 2, 1), dilation=3, hidden=(128, 64)),
-        occupancy=_SPATIAL_GRID,
+        occupancy=OccupancyConfig(kind="grid", resolutions=(8, 16, 32, 64)),
         steps_per_call=50,
-        map_margin=1.2,
-    ),
-    "clouds": DeepMappingConfig(
-        cold_phases=(LOCALIZE_CLOUDS, UNROLL_CLOUDS, REFINE_CLOUDS),
-        warm_phases=(REFINE_CLOUDS,),
-        localization=LocalizationNetConfig(kind="point", features=(32, 64, 128), hidden=(128, 64)),
-        occupancy=_SPATIAL_GRID,
-        map_margin=1.05,
-        motion="full",
     ),
 }
 # Phase, L-Net and unit of the paper for each sensor. Its worlds have a side of 1024 px, two units of the published
@@ -315,13 +244,12 @@ _FAST: dict[str, DeepMappingConfig] = {
 _PAPER = {
     "planar": (JOINT, LocalizationNetConfig(), 512.0),
     "depth": (JOINT_DEPTH, LocalizationNetConfig(features=(64, 128, 256, 1024), strides=(1,) * 4), 2.0),
-    "clouds": (JOINT_CLOUDS, LocalizationNetConfig(kind="point"), None),
 }
 
 
 def preset(
     name: Literal["fast", "paper"],
-    sensor: Literal["planar", "depth", "clouds"] = "planar",
+    sensor: Literal["planar", "depth"] = "planar",
     *,
     motion: Motion = "planar",
     is_organised: bool = True,
@@ -332,7 +260,7 @@ def preset(
         name: "fast" (seconds to a minute on two cores) or "paper" (its networks, losses, sampling, epochs and unit).
             The unit of planar scans is that of the paper's worlds, 512 px; for scans in metres use
             `dataclasses.replace(preset("paper"), unit=None)`, or half of the side of the area.
-        sensor: "planar" scans, "depth" images or lidar "clouds".
+        sensor: "planar" scans or "depth" images.
         motion: degrees of freedom of a depth camera.
         is_organised: False for planar scans whose beams have no order; L-Net is a PointNet then.
 
@@ -353,7 +281,7 @@ def preset(
         config = replace(config, localization=net, occupancy=OccupancyConfig())
     elif sensor == "depth" and motion == "full":
         # Real depth images in SE(3) do not agree to half a percent of the depth, and initial poses are less accurate.
-        refine = replace(REFINE_DEPTH, comparison=ProjectiveComparison(tolerance=(0.1, 0.02)))
+        refine = replace(REFINE_DEPTH, projective_tolerance=(0.1, 0.02))
         config = replace(config, cold_phases=(*config.cold_phases[:-1], refine), warm_phases=(refine,))
     if not is_organised:
         config = replace(config, localization=replace(config.localization, kind="point"))

@@ -1,4 +1,4 @@
-"""Training of L-Net on the poses of a fit, with scans that are turned, shifted, masked or rendered from the map."""
+"""Training of L-Net on the poses of a fit, with scans of the fit and scans rendered from its map, turned and masked."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from dpmjax.checks import require_count
-from dpmjax.deepmapping.config import DeepMappingConfig
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.engine import solve
 from dpmjax.deepmapping.mapping import Fitted
-from dpmjax.deepmapping.problem import MapFrame, Params, bind_map, choose_frame
+from dpmjax.deepmapping.problem import MapFrame, Params, Problem, bind_map, choose_frame
 from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
 from dpmjax.types import ScanSet
@@ -37,9 +38,6 @@ _LEAST_BEAMS = 0.5
 _LEARNING_RATE = 2e-3
 # Largest random heading of a scan; `relocalize` tries all turns, so L-Net needs only a range of headings.
 _MAX_TURN_DEG = 20.0
-# Largest distance, in units of the fit, to which scans are re-projected (`shift_scan`), so that L-Net learns the
-# surroundings of the trajectory.
-_MAX_SHIFT = 0.2
 # Number of scans of a step, drawn with replacement. Number of scans rendered from the map at random free positions;
 # half of each step are rendered scans, so that L-Net learns observed places off the trajectory.
 _SCANS_PER_STEP, _NUM_RENDERED = 64, 4096
@@ -170,8 +168,8 @@ def has_windows(fitted: Fitted) -> bool:
 def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps: int = 5000, key: jax.Array) -> Fitted:
     """Trains L-Net on the poses of the fit, for `relocalize` in the same world frame.
 
-    The labels are the poses of the fit, not ground truth. Scans are turned, shifted and partly masked. Further scans
-    are rendered from the map of M-Net at positions off the trajectory.
+    The labels are the poses of the fit, not ground truth. Scans are turned and partly masked. Half of them are rendered
+    from the map of M-Net at positions off the trajectory.
 
     Args:
         fitted: any fit, also from given poses.
@@ -192,113 +190,79 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
     measured = replace(scans, points=scans.points / fitted.unit)
     render_key, train_key = jax.random.split(key)
-    raster = make_raster(fitted)
-    rendered = render_scans(raster, measured, _NUM_RENDERED, key=render_key)
+    rendered, places = render_scans(make_raster(fitted), measured, _NUM_RENDERED, key=render_key)
     begin = fitted.params.localization
     if has_windows(fitted):
         begin = jax.tree.map(lambda weights: weights[0], begin)
-    sources = ((measured, poses), rendered) if len(rendered[1]) else ((measured, poses),)
-    net = _train(begin, sources, train_key, config=fitted.config, num_steps=num_steps)
-    params = replace(fitted.params, localization=net, start=jnp.zeros_like(fitted.params.start))
+    shares = [np.full(len(some), 1.0 / len(some)) for some in (poses, places) if len(some)]
+    both, labels = jax.tree.map(lambda *parts: jnp.concatenate(parts), (measured, poses), (rendered, places))
+    phase = replace(fitted.config.cold_phases[0], num_steps=num_steps, num_epochs=0)
+    problem = Problem(
+        fitted.config, (phase,), _init, _optimizer, _loss, _no_poses, _next_phase, fitted.config.steps_per_call
+    )
+    state, _ = solve(problem, TrainingScans(begin, both, labels, jnp.asarray(np.concatenate(shares))), key=train_key)
+    params = replace(fitted.params, localization=state.params, start=jnp.zeros_like(fitted.params.start))
     return fitted._replace(params=params)
 
 
-@partial(jax.jit, static_argnames=("config", "num_steps"))
-def _train(
-    params: Any,
-    sources: tuple[tuple[ScanSet, Float[Array, "_n 3"]], ...],
-    key: jax.Array,
-    *,
-    config: DeepMappingConfig,
-    num_steps: int,
-) -> Any:
-    optimizer = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, num_steps, 0.01))
-    count = _SCANS_PER_STEP // len(sources)
+class TrainingScans(NamedTuple):
+    """Data of the problem of `train_localization`, in units of the fit.
 
-    def loss_of(params: Any, step_key: jax.Array) -> Array:
-        parts = [
-            _draw_training_batch(*source, config, count, key=jax.random.fold_in(step_key, index))
-            for index, source in enumerate(sources)
-        ]
-        batch, labels = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-        error = localize_scans(params, batch.points, batch.mask, config) - labels
-        return jnp.mean(jnp.sum(jnp.abs(error[:, :2]), -1) + jnp.abs(se2.wrap_angle(error[:, 2])))
+    Attributes:
+        begin: weights of L-Net before the first step.
+        scans: scans of the fit, and rendered ones.
+        poses: labels.
+        weights: frequency with which each scan is drawn.
+    """
 
-    def one_step(carry: tuple[Any, Any], step: Array) -> tuple[tuple[Any, Any], None]:
-        params, state = carry
-        gradient = jax.grad(loss_of)(params, jax.random.fold_in(key, step))
-        updates, state = optimizer.update(gradient, state, params)
-        return (optax.apply_updates(params, updates), state), None
-
-    return jax.lax.scan(one_step, (params, optimizer.init(params)), jnp.arange(num_steps))[0][0]
+    begin: Any
+    scans: ScanSet
+    poses: Float[Array, "n 3"]
+    weights: Float[Array, " n"]
 
 
-def _draw_training_batch(
-    scans: ScanSet, poses: Float[Array, "n 3"], config: DeepMappingConfig, count: int, *, key: jax.Array
-) -> tuple[ScanSet, Float[Array, "m 3"]]:
-    """Draws scans that are turned, shifted and partly masked, and their poses."""
-    row_key, first_key, turn_key, share_key, drop_key, shift_key = jax.random.split(key, 6)
-    num_scans, num_beams = scans.mask.shape
-    rows = jax.random.randint(row_key, (count,), 0, num_scans)
-    beams = choose_beams(num_beams, config.cold_phases[0], jax.random.randint(first_key, (), 0, num_beams))
-    points, mask = scans.points[rows][:, beams], scans.mask[rows][:, beams]
+def _init(config: DeepMappingConfig, key: jax.Array, data: TrainingScans) -> Any:
+    return data.begin
+
+
+def _optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
+    return optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, phase.num_steps, 0.01))
+
+
+def _no_poses(config: DeepMappingConfig, phase: PhaseConfig, params: Any, data: TrainingScans) -> None:
+    return None
+
+
+def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Any, data: TrainingScans) -> Any:
+    return params
+
+
+def _loss(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Any, data: TrainingScans, step: Array, key: jax.Array
+) -> tuple[Float[Array, ""], None]:
+    """Computes the mean error of L-Net's poses for scans that are drawn, turned and partly masked."""
+    row_key, first_key, turn_key, share_key, drop_key = jax.random.split(key, 5)
+    num_scans, num_beams = data.scans.mask.shape
+    rows = jax.random.choice(row_key, num_scans, (_SCANS_PER_STEP,), p=data.weights)
+    beams = choose_beams(num_beams, phase, jax.random.randint(first_key, (), 0, num_beams))
+    points, mask, poses = data.scans.points[rows][:, beams], data.scans.mask[rows][:, beams], data.poses[rows]
     limit = np.deg2rad(_MAX_TURN_DEG)
-    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[rows, 2]
-    shift = _draw_shifts(shift_key, len(rows), _MAX_SHIFT)
-    points = jax.vmap(shift_scan)(points, mask, shift)
-    moved = jax.vmap(turn_scan)(shift[:, None], -poses[rows, 2])[:, 0]
-    points = jax.vmap(turn_scan)(points, turn)
-    share = _LARGEST_DROP * jax.random.uniform(share_key, (*rows.shape, 1))
-    hidden = jax.random.uniform(drop_key, mask.shape) < share
+    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[:, 2]
+    hidden = jax.random.uniform(drop_key, mask.shape) < _LARGEST_DROP * jax.random.uniform(share_key, (len(rows), 1))
     # At least one beam of a scan remains.
     seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
-    return ScanSet(points, seen), poses[rows] + jnp.concatenate([moved, turn[:, None]], axis=-1)
+    error = localize_scans(params, turn_scans(points, turn), seen, config) - poses
+    return jnp.mean(jnp.abs(error[:, :2]).sum(-1) + jnp.abs(se2.wrap_angle(error[:, 2] - turn))), None
 
 
-def _draw_shifts(key: jax.Array, count: int, largest: float) -> Float[Array, "n 2"]:
-    """Draws shifts of random direction and length; half of them are zero, because shifted scans are approximate."""
-    length_key, side_key = jax.random.split(key)
-    length = largest * jax.random.uniform(length_key, (count,), minval=-1.0).clip(0.0)
-    side = jax.random.uniform(side_key, (count,), maxval=2.0 * jnp.pi)
-    return length[:, None] * jnp.stack([jnp.cos(side), jnp.sin(side)], axis=-1)
-
-
-def turn_scan(points: Float[Array, "b 2"], turn: Float[Array, ""]) -> Float[Array, "b 2"]:
-    """Simulates the scan of a sensor whose heading is larger by `turn`, by turning all points back.
+def turn_scans(points: Float[Array, "m b 2"], turns: Float[Array, " m"]) -> Float[Array, "m b 2"]:
+    """Simulates scans of sensors whose headings are larger by `turns`, by turning all points back.
 
     Args:
-        points: points in the sensor frame.
-        turn: radians.
+        points: points in the sensor frames.
+        turns: radians.
 
     Returns:
-        Points in the frame of the turned sensor.
+        Points in the frames of the turned sensors.
     """
-    cos, sin = jnp.cos(turn), jnp.sin(turn)
-    return jnp.stack([cos * points[:, 0] + sin * points[:, 1], cos * points[:, 1] - sin * points[:, 0]], axis=-1)
-
-
-def shift_scan(points: Float[Array, "b 2"], mask: Bool[Array, " b"], shift: Float[Array, " 2"]) -> Float[Array, "b 2"]:
-    """Approximates the scan of a sensor nearby, at the same angles.
-
-    Occlusion is ignored: the points are sorted by their new angles, and ranges are interpolated between them.
-
-    Args:
-        points: points in the sensor frame.
-        mask: True for valid beams; other beams keep their points.
-        shift: position of the new sensor in the frame of the old one.
-
-    Returns:
-        Points in the frame of the new sensor; unchanged without a shift.
-    """
-    safe = jnp.where(mask[:, None], points, 1.0)
-    moved = safe - shift
-    angle = jnp.where(mask, jnp.arctan2(moved[:, 1], moved[:, 0]), jnp.inf)
-    order = jnp.argsort(angle)
-    # The inverse range along a straight wall is nearly linear in the angle.
-    inverse = 1.0 / jnp.maximum(jnp.linalg.norm(moved, axis=-1), 1e-6)
-    target = jnp.arctan2(safe[:, 1], safe[:, 0])
-    last = jnp.maximum(mask.sum() - 1, 0)
-    known = jnp.where(jnp.arange(len(order)) <= last, angle[order], 4.0)
-    ranges = 1.0 / jnp.interp(target, known, jnp.where(known < 4.0, inverse[order], inverse[order][last]))
-    seen = ranges[:, None] * jnp.stack([jnp.cos(target), jnp.sin(target)], -1)
-    return jnp.where(mask[:, None], jnp.where((shift == 0).all(), points, seen), points)
+    return se2.transform_points(jnp.zeros((len(turns), 3)).at[:, 2].set(-turns), points)

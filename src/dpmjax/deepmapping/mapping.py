@@ -1,25 +1,23 @@
 """DeepMapping of scans of any sensor: `fit_deepmapping`, and the choice between the fit and its initial poses.
 
-The type of the scans chooses the sensor: a ScanSet is planar, DepthScans are depth images, CloudScans lidar clouds.
+The type of the scans chooses the sensor: a ScanSet is planar, DepthScans are depth images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import require_type, runs_on_host
-from dpmjax.deepmapping.cloud_scans import CloudScans, as_cloud_scans, find_partners, trajectory_misfit
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
-from dpmjax.deepmapping.sensors import CLOUDS, DEPTH, PLANAR, as_scan_set
+from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
@@ -28,15 +26,13 @@ from dpmjax.registration_rgbd.projective_consistency import projective_consisten
 from dpmjax.registration_rgbd.trajectory_search import initialize_depth
 from dpmjax.types import ScanSet
 
-_SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH, CloudScans: CLOUDS}
-# Kernel width, in typical ranges, of the misfit that compares the fit of clouds with its initial poses.
-_MISFIT_KERNEL_WIDTH = 0.004
+_SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH}
 # A given unit of length is between the first of these shares and the second of the typical range.
 _UNIT_SHARES = 0.1, 10.0
 # Number of samples on a beam that mark cells as explored.
 _SAMPLES = 64
 
-Scans = ScanSet | DepthScans | CloudScans
+Scans = ScanSet | DepthScans
 
 
 class Fitted(NamedTuple):
@@ -65,23 +61,22 @@ class Fitted(NamedTuple):
 
 
 class Registered(NamedTuple):
-    """Result of `register_depth` and of `register_clouds`.
+    """Result of `register_depth`.
 
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: the poses of the smaller misfit.
         kept: source of the poses, the fit or the initial poses ("start").
-        misfit: disagreement of the scans at the poses of the fit, 0 or more: 1 less the `projective_consistency` of
-            depth images, or the `trajectory_misfit` of clouds.
-        start_misfit: misfit at the initial poses; None after a cold start.
-        start: (n, 4, 4) initial poses; None after a cold start.
-        fitted: DeepMapping of the scans.
+        misfit: 1 less the `projective_consistency` of the images at the poses of the fit, 0 or more.
+        start_misfit: the same at the initial poses.
+        start: (n, 4, 4) initial poses.
+        fitted: DeepMapping of the images.
     """
 
     T_world_scan: NDArray[np.float64]
     kept: Literal["fit", "start"]
     misfit: float
-    start_misfit: float | None
-    start: NDArray[np.float64] | None
+    start_misfit: float
+    start: NDArray[np.float64]
     fitted: Fitted
 
 
@@ -91,7 +86,7 @@ def mapping_data(
     """Checks scans and poses, and scales both to the unit of length of the fit.
 
     Args:
-        scans: DepthScans, CloudScans, or planar scans as `as_scan_set` takes them.
+        scans: DepthScans, or planar scans as `as_scan_set` takes them.
         start: initial poses: (n, 3) x, y, heading or (n, 3, 3) matrices of planar scans, else (n, 4, 4)
             T_world_scan; None: cold start.
         unit: unit of length of the fit (`DeepMappingConfig.unit`); None: the typical range of the scans.
@@ -103,7 +98,7 @@ def mapping_data(
         ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or the unit
             is more than ten times smaller or larger than the typical range.
     """
-    checked = scans if isinstance(scans, DepthScans | CloudScans) else as_scan_set(scans)
+    checked = scans if isinstance(scans, DepthScans) else as_scan_set(scans)
     reach, sensor = typical_range(checked.points, checked.mask), _SENSORS[type(checked)]
     unit = reach if unit is None else unit
     if not _UNIT_SHARES[0] * reach <= unit <= _UNIT_SHARES[1] * reach:
@@ -112,11 +107,7 @@ def mapping_data(
             f"{unit:.4g}; dataclasses.replace(config, unit=None) takes the ranges as unit"
         )
     T_start = None if start is None else sensor.scaled_start(start, len(checked.points), unit)
-    scaled = replace(checked, points=checked.points / unit)
-    if isinstance(scaled, CloudScans):
-        partners = scaled.partners if T_start is None else find_partners(np.asarray(T_start), 1.0)
-        scaled = replace(scaled, spacing=scaled.spacing / unit, partners=partners)
-    return MappingData(scaled, T_start), unit
+    return MappingData(replace(checked, points=checked.points / unit), T_start), unit
 
 
 def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
@@ -128,12 +119,7 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
 
     Returns:
         The problem; poses are as in `Fitted`, in units of the fit.
-
-    Raises:
-        ValueError: clouds move in the plane by these settings.
     """
-    if isinstance(data.scans, CloudScans) and config.motion != "full":
-        raise ValueError(f"motion: expected 'full' of clouds, got {config.motion!r}")
     sensor = _SENSORS[type(data.scans)]
     return Problem(
         config, phases_of(config, data), sensor.init, make_optimizer, sensor.loss, sensor.poses, sensor.next_phase,
@@ -154,7 +140,7 @@ def fit_deepmapping(
 
     Args:
         scans: planar scans (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
-            ScanSet, DepthScans (section 4.2) or CloudScans.
+            ScanSet or DepthScans (section 4.2).
         config: settings; None: the fast preset of planar scans; `preset` has those of other sensors.
         key: key of the whole run.
         start: initial poses, as `mapping_data` takes them; None: cold start, of all poses at zero, or free poses at the
@@ -209,57 +195,11 @@ def register_depth(
         start = initialize_depth(scans, depth_search(config.motion), key=key)
     # Search and fit share the key, so that a fit from found poses equals a fit from the same poses, given as `start`.
     fitted = fit_deepmapping(scans, config, key=key, start=start, engine=engine)
-    return _keep_better(fitted, start, lambda T: 1.0 - float(projective_consistency(scans, T)))
-
-
-@runs_on_host("call deepmapping.solve there")
-def register_clouds(
-    scans: CloudScans | Sequence[ArrayLike],
-    config: DeepMappingConfig | None = None,
-    *,
-    key: jax.Array,
-    start: ArrayLike | None = None,
-    engine: Callable[..., Fit] = fit,
-) -> Registered:
-    """Registers 3-D lidar scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6, in SE(3)).
-
-    The fit replaces given initial poses only if it has the smaller misfit, computed without ground truth.
-
-    Args:
-        scans: (m_i, 3) points in the lidar frames, any unit, in the order of time; or CloudScans.
-        config: settings; None: `preset("fast", "clouds")`.
-        key: key of the whole run.
-        start: (n, 4, 4) initial T_world_scan; None: cold start.
-        engine: engine of the fit, as in `fit_deepmapping`.
-
-    Returns:
-        Registered, in the world of `start`, or an arbitrary one after a cold start.
-
-    Raises:
-        ValueError: as `as_cloud_scans`, or `start` has a wrong shape or is not finite.
-    """
-    scans = scans if isinstance(scans, CloudScans) else as_cloud_scans(scans)
-    fitted = fit_deepmapping(scans, config or preset("fast", "clouds"), key=key, start=start, engine=engine)
-    (scaled, _), unit = mapping_data(scans, start)
-
-    def misfit_of(T: ArrayLike) -> float:
-        poses = jnp.asarray(CLOUDS.unscaled(T, 1.0 / unit), jnp.float32)
-        return float(trajectory_misfit(scaled, poses, _MISFIT_KERNEL_WIDTH))
-
-    return _keep_better(fitted, start, misfit_of)
-
-
-def _keep_better(fitted: Fitted, start: ArrayLike | None, misfit_of: Callable[..., float]) -> Registered:
-    """Returns the poses of the fit or the initial poses, those of the smaller misfit; initial ones without a step."""
-    T, misfit = fitted.T_world_scan, misfit_of(fitted.T_world_scan)
-    if start is None:
-        return Registered(T, "fit", misfit, None, None, fitted)
-    T_start = np.asarray(start, np.float64)
-    start_misfit = misfit_of(T_start)
+    poses = {"fit": fitted.T_world_scan, "start": np.asarray(start, np.float64)}
+    misfits = {name: 1.0 - float(projective_consistency(scans, T)) for name, T in poses.items()}
     # The comparison is False for a misfit that is not finite, so the start is kept then.
-    if fitted.num_steps > 0 and misfit < start_misfit:
-        return Registered(T, "fit", misfit, start_misfit, T_start, fitted)
-    return Registered(T_start, "start", misfit, start_misfit, T_start, fitted)
+    kept: Literal["fit", "start"] = "fit" if fitted.num_steps > 0 and misfits["fit"] < misfits["start"] else "start"
+    return Registered(poses[kept], kept, misfits["fit"], misfits["start"], poses["start"], fitted)
 
 
 class MapPicture(NamedTuple):

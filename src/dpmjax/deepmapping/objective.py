@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from dpmjax.deepmapping.config import CHAMFER, ChamferComparison, Comparison, PhaseConfig
+from dpmjax.deepmapping.config import PhaseConfig
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import sample_free_space
 from dpmjax.losses import chamfer_distance, occupancy_loss
@@ -166,7 +166,7 @@ class Terms(NamedTuple):
     Attributes:
         occupancy: eq. 4, in nats.
         chamfer: eq. 7 divided by the number of pairs, in units of the fit; for images compared by projection, 1 less
-            the projective consistency; for clouds compared by planes, the misfit.
+            the projective consistency.
     """
 
     occupancy: Float[Array, ""]
@@ -240,25 +240,22 @@ def occupancy_term(
     return hit + occupancy_loss(logits[num_hits:], jnp.zeros(()), free_weights)
 
 
-def chamfer_term(world: WorldBatch, offsets: Int[Array, " o"], comparison: Comparison = CHAMFER) -> Float[Array, ""]:
+def chamfer_term(
+    world: WorldBatch, offsets: Int[Array, " o"], limit: tuple[float, float] | None = None
+) -> Float[Array, ""]:
     """Computes DeepMapping eq. 7: mean Chamfer distance of each scan to the scans `offsets` later in the block.
 
     Args:
         world: the scans.
         offsets: distances in time.
-        comparison: comparison of the phase, with its limit of the distances.
+        limit: distance to which larger ones are clipped, at the start and at the end of the phase.
 
     Returns:
         The mean over all pairs, in units of the fit; 0 without a pair.
-
-    Raises:
-        ValueError: the comparison is of another type.
     """
-    if not isinstance(comparison, ChamferComparison):
-        raise ValueError(f"comparison: expected a ChamferComparison of these scans, got {comparison}")
     num_scans = world.mask.shape[0]
     own = jnp.arange(num_scans)
-    max_distance = None if comparison.limit is None else interpolate_log(comparison.limit, world.progress)
+    max_distance = None if limit is None else interpolate_log(limit, world.progress)
 
     def compare(offset: Int[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
         later = jnp.minimum(own + offset, num_scans - 1)

@@ -63,7 +63,7 @@ class MappingData(NamedTuple):
     """Data of DeepMapping, in units of the fit (`DeepMappingConfig.unit`), by default typical ranges.
 
     Attributes:
-        scans: ScanSet, DepthScans or CloudScans.
+        scans: ScanSet or DepthScans.
         start: initial poses in the parametrisation of the sensor; None: cold start.
     """
 

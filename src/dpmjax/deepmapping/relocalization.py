@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from dpmjax.checks import runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.localization_training import (
-    NUM_NODES,
     MapRaster,
     has_windows,
     make_raster,
     nearest_nodes,
-    turn_scan,
+    turn_scans,
 )
 from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.problem import MapFrame
@@ -39,8 +39,6 @@ _FIRST_STEP, _NUM_LEVELS = 0.08, 5
 _NUM_KEPT, _NUM_BEAMS = 6, 64
 # Number of headings of each scan for L-Net, evenly spaced.
 _NUM_TURNS = 24
-# Largest number of scans of a batch.
-_CHUNK = 1024
 # Positions on a beam at which the map must be free, as shares of the length.
 _FREE_SHARES = (0.3, 0.6, 0.85)
 # Largest cost of one hit or one free sample, nats, for robustness to people and noise.
@@ -63,7 +61,6 @@ class MapFields(NamedTuple):
     frame: MapFrame
 
 
-@jax.jit
 def map_fields(raster: MapRaster) -> MapFields:
     """Computes the costs of hits and of free samples, blurred for each level by the step of its grid.
 
@@ -73,30 +70,14 @@ def map_fields(raster: MapRaster) -> MapFields:
     Returns:
         MapFields.
     """
+    logits = np.asarray(raster.logits)
     # A hit on a surface lies between a free and an occupied node, so the least radius is one node.
-    radii = jnp.maximum(0.5 * _FIRST_STEP * 0.5 ** np.arange(_NUM_LEVELS) / raster.spacing, 1.0)
-    highest = jnp.stack([largest_nearby(raster.logits, radius) for radius in radii])
-    lowest = -jnp.stack([largest_nearby(-raster.logits, radius) for radius in radii])
+    radii = np.maximum(0.5 * _FIRST_STEP * 0.5 ** np.arange(_NUM_LEVELS) / float(raster.spacing), 1.0)
+    sizes = 2 ** (1 + np.floor(np.log2(radii + 1.0)).astype(int)) - 1
+    highest = jnp.stack([maximum_filter(logits, size, mode="wrap") for size in sizes])
+    lowest = jnp.stack([minimum_filter(logits, size, mode="wrap") for size in sizes])
     hit, free = jax.nn.softplus(-highest), jax.nn.softplus(lowest)
     return MapFields(jnp.minimum(hit, _MAX_NATS), jnp.minimum(free, _MAX_NATS), raster.frame)
-
-
-def largest_nearby(values: Float[Array, "r r"], radius: Float[Array, ""]) -> Float[Array, "r r"]:
-    """Computes the largest value of the map's raster around each node, by doubling; the raster is periodic.
-
-    Args:
-        values: values at the nodes.
-        radius: radius of the square in nodes, rounded down to one less than a power of two.
-
-    Returns:
-        The maxima.
-    """
-    for reach in 2 ** np.arange(int(np.log2(NUM_NODES))):
-        moved = values
-        for axis in (0, 1):
-            moved = jnp.maximum(jnp.maximum(jnp.roll(moved, reach, axis), jnp.roll(moved, -reach, axis)), moved)
-        values = jnp.where(2 * reach - 1 <= radius, moved, values)
-    return values
 
 
 def _nats(
@@ -200,17 +181,14 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
         )
     is_one = not isinstance(scan, ScanSet) and np.ndim(scan) == 2
     scans = as_scan_set(np.asarray(scan)[None] if is_one else scan, min_scans=1)
-    fields = map_fields(make_raster(fitted))
-    parts = []
-    for k in range(0, len(scans.points), _CHUNK):
-        part = ScanSet(scans.points[k : k + _CHUNK] / fitted.unit, scans.mask[k : k + _CHUNK])
-        proposals = propose_poses(fitted.params.localization, part, num_turns=_NUM_TURNS, fit_config=fitted.config)
-        parts.append(search_map(part, proposals, fields))
-    poses, nats = (np.concatenate([np.asarray(x, np.float64) for x in each]) for each in zip(*parts, strict=True))
+    scaled = ScanSet(scans.points / fitted.unit, scans.mask)
+    proposals = propose_poses(fitted.params.localization, scaled, num_turns=_NUM_TURNS, fit_config=fitted.config)
+    found = search_map(scaled, proposals, map_fields(make_raster(fitted)))
+    poses, nats = (np.array(values, np.float64) for values in found)
     poses[:, :2] *= fitted.unit
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    found = Relocalized(poses, nats, nats <= max_nats)
-    return Relocalized(*(x[0] for x in found)) if is_one else found
+    result = Relocalized(poses, nats, nats <= max_nats)
+    return Relocalized(*(values[0] for values in result)) if is_one else result
 
 
 @partial(jax.jit, static_argnames=("num_turns", "fit_config"))
@@ -229,11 +207,11 @@ def propose_poses(
         x, y, heading of the scans before the turn, in units of the fit and radians.
     """
     beams = choose_beams(scans.mask.shape[1], fit_config.cold_phases[0])
-    mask, turns = scans.mask[:, beams], 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns
+    turns = 2.0 * jnp.pi * jnp.arange(num_turns) / num_turns
 
-    def propose(turn: Float[Array, ""]) -> Float[Array, "m 3"]:
-        points = jax.vmap(turn_scan, in_axes=(0, None))(scans.points[:, beams], turn)
-        found = localize_scans(params, points, mask, fit_config)
-        return found - turn * jnp.array([0.0, 0.0, 1.0])
+    def propose(scan: ScanSet) -> Float[Array, "t 3"]:
+        points, mask = (jnp.stack([values[beams]] * num_turns) for values in (scan.points, scan.mask))
+        found = localize_scans(params, turn_scans(points, turns), mask, fit_config)
+        return found - turns[:, None] * jnp.array([0.0, 0.0, 1.0])
 
-    return jnp.swapaxes(jax.lax.map(propose, turns), 0, 1)
+    return jnp.asarray(jax.lax.map(propose, scans, batch_size=32))

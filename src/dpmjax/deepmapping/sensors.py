@@ -1,8 +1,8 @@
 """The sensors of DeepMapping: their poses, and the losses of their scans (sections 3 and 4.2).
 
-Planar scans have poses x, y, heading, by one L-Net or by one for each window. Depth images and lidar clouds have poses
-T_start @ motion in SE(3). T_start is constant in a phase; the motion is L-Net's output or a free parameter. Images are
-compared by projection, clouds by planes, all sensors also by the Chamfer distance.
+Planar scans have poses x, y, heading, by one L-Net or by one for each window. Depth images have poses T_start @ motion
+in SE(3). T_start is constant in a phase; the motion is L-Net's output or a free parameter. Scans are compared by the
+Chamfer distance, images also by projection.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import as_beams
-from dpmjax.deepmapping.cloud_scans import CloudScans, misfit_of_pairs, rows_of
-from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig, PlaneComparison, ProjectiveComparison
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import (
     Terms,
     WorldBatch,
@@ -36,13 +35,12 @@ from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.nets.mapping import LocalizationNet, init_map_net
 from dpmjax.registration_rgbd.depth_images import DepthScans, PixelSample
 from dpmjax.registration_rgbd.projective_consistency import consistency_of_pairs
-from dpmjax.types import ScanSet, SurfaceElements
+from dpmjax.types import ScanSet
 
-SpatialScans = DepthScans | CloudScans
 _ALL = slice(None)
-# Number of scans near in space but not in time that each cloud is compared to by planes.
-_NUM_REVISITS = 1
-
+# Side of the map as a multiple of the extent of the scans at the start of a phase. If it is smaller, scans whose poses
+# still move leave the map; if it is larger, its cells are coarser. Depth images see farther past their neighbours.
+_PLANAR_MARGIN, _DEPTH_MARGIN = 1.15, 1.2
 # Largest coordinate of an initial pose, in typical ranges of the scans.
 _MAX_COORDINATE = 1e4
 
@@ -131,7 +129,7 @@ def _planar_frame(config: DeepMappingConfig, scans: ScanSet, poses: Float[Array,
     """Computes the square that the scans cover at these poses, with the margin of the map."""
     if config.occupancy.kind == "mlp":
         return MapFrame(centre=jnp.zeros(2), half_side=jnp.ones(()))
-    return choose_frame(se2.transform_points(poses, scans.points), scans.mask, config.map_margin)
+    return choose_frame(se2.transform_points(poses, scans.points), scans.mask, _PLANAR_MARGIN)
 
 
 def _planar_next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
@@ -198,7 +196,7 @@ def _planar_loss(
     world = WorldBatch(points, poses[:, :2], some.mask[flat], is_scan.reshape(-1), rows.shape[1], progress)
     free_key, offset_key = jax.random.split(loss_key)
     offsets = draw_offsets(phase, rows.shape[1] - 1, key=offset_key)
-    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.comparison), key=free_key)
+    return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.chamfer_limit), key=free_key)
 
 
 def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
@@ -245,7 +243,7 @@ def _net(config: DeepMappingConfig) -> LocalizationNet:
 
 
 def _motions(
-    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: SpatialScans, rows: Int[Array, " m"] | slice
+    config: DeepMappingConfig, phase: PhaseConfig, params: Params, scans: DepthScans, rows: Int[Array, " m"] | slice
 ) -> Float[Array, "m k"]:
     if phase.poses == "free":
         return params.poses[rows]
@@ -264,11 +262,11 @@ def _poses(
     return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
 
 
-def _choose_frame(config: DeepMappingConfig, scans: SpatialScans, T: Float[Array, "n 4 4"]) -> MapFrame:
+def _depth_frame(scans: DepthScans, T: Float[Array, "n 4 4"]) -> MapFrame:
     """Computes the cube that the scans cover at these poses, with the margin of the map."""
     count = scans.mask.shape[0]
     world = rigid.transform_points(T, scans.points.reshape(count, -1, 3))
-    return choose_frame(world, scans.mask.reshape(count, -1), config.map_margin)
+    return choose_frame(world, scans.mask.reshape(count, -1), _DEPTH_MARGIN)
 
 
 def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
@@ -283,7 +281,7 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Param
         poses=jnp.zeros((count, net.num_outputs)),
         occupancy=init_map_net(config.occupancy, key=map_key, num_dimensions=3),
         start=T_start,
-        frame=_choose_frame(config, scans, T_start),
+        frame=_depth_frame(scans, T_start),
     )
     first = config.cold_phases[0]
     if first.poses == "free" and start is None:
@@ -295,7 +293,7 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Param
 def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Params, data: MappingData) -> Params:
     """Starts the next phase (`Problem.next_phase`): poses as estimated, motions zero, the map frame re-centred."""
     T = _poses(config, phase, params, data)
-    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_choose_frame(config, data.scans, T))
+    return replace(params, poses=jnp.zeros_like(params.poses), start=T, frame=_depth_frame(data.scans, T))
 
 
 def _draw_pixels(scans: DepthScans, count: int, *, key: jax.Array) -> PixelSample:
@@ -331,70 +329,14 @@ def _depth_loss(
     points = rigid.transform_points(T, sample.points)
     world = WorldBatch(points, T[:, :3, 3], sample.mask, is_scan, count, progress)
     free_key, offset_key = jax.random.split(loss_key)
-    if isinstance(phase.comparison, ProjectiveComparison):
-        tolerance = interpolate_log(phase.comparison.tolerance, progress)
+    if phase.projective_tolerance is not None:
+        tolerance = interpolate_log(phase.projective_tolerance, progress)
         offsets = draw_offsets(phase, count // 2, key=offset_key)
         pair_term = 1.0 - consistency_of_pairs(T, sample, scans, offsets, tolerance)
     else:
-        pair_term = chamfer_term(world, draw_offsets(phase, count - 1, key=offset_key), phase.comparison)
-    return mapping_loss(config, phase, params, world, pair_term, key=free_key)
-
-
-def _draw_points(scans: SurfaceElements, count: int, *, key: jax.Array) -> SurfaceElements:
-    """Draws a random run of the shuffled points of each scan."""
-    num_scans, capacity = scans.mask.shape
-    if count >= capacity:
-        return scans
-    first = jax.random.randint(key, (num_scans, 1), 0, capacity)
-    rows = (first + jnp.arange(count)) % capacity
-    return jax.vmap(rows_of)(scans, rows)
-
-
-def _draw_partners(scans: CloudScans, rows: Int[Array, " m"], count: int, *, key: jax.Array) -> Int[Array, "r m"]:
-    """Draws revisit partners of each scan; -1: none."""
-    columns = jax.random.choice(key, scans.partners.shape[1], (count,), replace=False)
-    return scans.partners[rows][:, columns].T
-
-
-def _cloud_loss(
-    config: DeepMappingConfig,
-    phase: PhaseConfig,
-    params: Params,
-    data: MappingData,
-    step: Int[Array, ""],
-    key: jax.Array,
-) -> tuple[Float[Array, ""], Terms]:
-    """Computes eq. 6 of DeepMapping for lidar clouds (`Problem.loss`): points by planes or the Chamfer distance."""
-    row_key, point_key, partner_key, free_key, offset_key = jax.random.split(key, 5)
-    scans, progress = data.scans, step / phase.num_steps
-    blocks, is_scan = blocks_of_step(phase, scans.mask.shape[0], step, key=row_key)
-    rows, length = blocks.reshape(-1), blocks.shape[1]
-    offsets = draw_offsets(phase, length - 1, key=offset_key)
-    comparison = phase.comparison
-    num_revisits = _NUM_REVISITS if isinstance(comparison, PlaneComparison) else 0
-    partners = _draw_partners(scans, rows, num_revisits, key=partner_key)
-    seen = jnp.concatenate([rows, jnp.maximum(partners, 0).reshape(-1)])
-    T = _poses(config, phase, params, data, seen)
-    clouds = rows_of(scans.planes, seen)
-    samples = _draw_points(clouds, phase.beams_per_step, key=point_key)
-    own = jnp.arange(len(rows))
-    points = rigid.transform_points(T[own], samples.positions[own])
-    world = WorldBatch(points, T[own, :3, 3], samples.mask[own], is_scan.reshape(-1), length, progress)
-    if not isinstance(comparison, PlaneComparison):
-        pair_term = chamfer_term(world, offsets, comparison)
-    else:
-        later = jnp.minimum(own + offsets[:, None], len(rows) - 1)
-        is_later = own % length + offsets[:, None] < length
-        others = jnp.concatenate([later.reshape(-1), jnp.arange(len(rows), len(seen))])
-        pairs = jnp.stack([jnp.resize(own, others.shape), others], axis=-1)
-        is_pair = jnp.concatenate([is_later.reshape(-1), partners.reshape(-1) >= 0])
-        width = interpolate_log(comparison.width, progress)
-        pair_term = misfit_of_pairs(T, samples, clouds, pairs, is_pair, (width, scans.spacing))
+        pair_term = chamfer_term(world, draw_offsets(phase, count - 1, key=offset_key), phase.chamfer_limit)
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
 
 
 # DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
 DEPTH = Sensor(_scaled_start, _unscaled, _init, _depth_loss, _poses, _next_phase)
-
-# DeepMapping of lidar clouds; poses are (n, 4, 4) T_world_scan.
-CLOUDS = DEPTH._replace(loss=_cloud_loss)

@@ -6,7 +6,7 @@ second is the weights and the input of a network with the output x. Both are pro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import flax.linen as nn
@@ -156,7 +156,7 @@ def _init(config: ToyConfig, key: jax.Array, data: None) -> ToyParams:
     net_key, z_key = jax.random.split(key)
     z = jax.random.normal(z_key)
     params = ToyParams(jnp.zeros(()), ScalarNet(config.initialization).init(net_key, z), z)
-    return params.replace(x=network_value(config, params))  # type: ignore[attr-defined]
+    return replace(params, x=network_value(config, params))
 
 
 def _optimizer(config: ToyConfig, phase: ToyConfig) -> optax.GradientTransformation:

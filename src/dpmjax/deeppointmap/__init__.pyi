@@ -15,7 +15,6 @@ from .encoding import encode as encode
 from .encoding import encode_scans as encode_scans
 from .encoding import pooled_vector as pooled_vector
 from .encoding import pyramid_of_cloud as pyramid_of_cloud
-from .encoding import scene_scale as scene_scale
 from .evaluation_pairs import DISTANCE_BANDS_M as DISTANCE_BANDS_M
 from .evaluation_pairs import PlaceSplit as PlaceSplit
 from .evaluation_pairs import ScanPair as ScanPair
@@ -52,7 +51,6 @@ from .scan_evaluation import NO_OVERLAP_M as NO_OVERLAP_M
 from .scan_evaluation import OverlapEvaluation as OverlapEvaluation
 from .scan_evaluation import ScanEvaluation as ScanEvaluation
 from .scan_evaluation import StagedRegistration as StagedRegistration
-from .scan_evaluation import StageSeconds as StageSeconds
 from .scan_evaluation import encode_turned as encode_turned
 from .scan_evaluation import evaluate_overlap as evaluate_overlap
 from .scan_evaluation import evaluate_scan_pairs as evaluate_scan_pairs
@@ -73,8 +71,6 @@ from .training.evaluation import EvaluationPairs as EvaluationPairs
 from .training.evaluation import PairKind as PairKind
 from .training.evaluation import draw_evaluation_pairs as draw_evaluation_pairs
 from .training.evaluation import evaluate_registration as evaluate_registration
-from .training.evaluation import join_evaluation_pairs as join_evaluation_pairs
-from .training.evaluation import pair_kinds as pair_kinds
 from .training.loop import Speed as Speed
 from .training.loop import StepRecord as StepRecord
 from .training.loop import Trained as Trained
@@ -84,10 +80,6 @@ from .training.loop import TrainingProgress as TrainingProgress
 from .training.loop import begin_training as begin_training
 from .training.loop import train as train
 from .training.objective import ObjectiveConfig as ObjectiveConfig
-from .training.offset_quality import OffsetQuality as OffsetQuality
-from .training.offset_quality import WallOffsets as WallOffsets
-from .training.offset_quality import measure_offsets as measure_offsets
-from .training.offset_quality import offset_quality as offset_quality
 from .training.overlap_stage import OverlapHooks as OverlapHooks
 from .training.overlap_stage import OverlapRecord as OverlapRecord
 from .training.overlap_stage import OverlapState as OverlapState

@@ -29,7 +29,7 @@ MAX_RMSE_M = 5.0
 MAX_SCORE = 3.0
 # The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure. The share has the
 # best likelihood on places left out of the fit (by a script, on the pairs of `experiments.dpm_calibrate`).
-CORRIDOR_SHARE = 0.88
+CORRIDOR_CONFIDENCE = 0.88
 # Fewer elements see and meet less of each other than those of the fit.
 MIN_NUM_ELEMENTS = 512
 # Few elements of a cloud face an axis; more of them say no more.
@@ -127,7 +127,7 @@ class MatchEvidence(NamedTuple):
         of_scans: `SCAN_FEATURES`; None without scans.
         of_weak_scans: `WEAK_FEATURES`; None where the walls constrain all directions, and without scans.
         lookalike_gap: lead over other places, as log odds; infinite where none looks alike. For surface elements it is
-            that of `CORRIDOR_SHARE` in corridors.
+            that of `CORRIDOR_CONFIDENCE` in corridors.
         of_elements: `ELEMENT_FEATURES`; None without 512 surface elements that were compared.
     """
 
@@ -170,7 +170,9 @@ def gather_evidence(
         facing_gap = np.clip(elements.facing_gap, -MAX_FACING_GAP, MAX_FACING_GAP)
         is_dense = num_elements >= MIN_NUM_ELEMENTS
         of_elements = np.array([*of_clouds, *elements[:3], facing_gap]) if is_dense else None
-        return MatchEvidence(of_clouds, None, None, logit(CORRIDOR_SHARE if elements.num_slid else 1.0), of_elements)
+        return MatchEvidence(
+            of_clouds, None, None, logit(CORRIDOR_CONFIDENCE if elements.num_slid else 1.0), of_elements
+        )
     if verification is None:
         return MatchEvidence(of_clouds, None)
     of_verification = verification[: verification._fields.index("num_tried")]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -15,14 +16,11 @@ from dpmjax.checks import as_host_points, require_positive, require_some, requir
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
-from dpmjax.scans.preprocess import first_of_each_voxel, preprocess_scan_on_host
+from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
 # Number of scans, or of pairs, in one call of a compiled program.
 CHUNK = 4
-
-# A scan whose extent is nearest to a half or a quarter of the full one is enlarged by 2 or 4.
-EXTENT_PERCENT, FULL_EXTENT_M, MAX_SCALE = 90, 32.0, 4.0
 
 
 @runs_on_host("call encode_pyramid on geometry.build_pyramid there")
@@ -35,7 +33,7 @@ def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: i
     Args:
         model: its configuration includes the preprocessing.
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
-        scale: factor by which the points are enlarged first, for rooms (`scene_scale`). All scans that are compared
+        scale: factor by which the points are enlarged first, for rooms. All scans that are compared
             or merged must share it; positions, and poses for `merge_clouds`, are then in metres times this factor.
         num_elements: number of surface elements, from that of the descriptors to that of the points of the first stage
             of `model.config.pyramid`. Elements beyond the descriptors have no features, and make `register` of two
@@ -69,37 +67,28 @@ def encode_scans(
     """
     require_type("model", model, Model, "load_model")
     require_some("scans", scans)
-    parts = []
-    for start in range(0, len(scans), CHUNK):
-        # JAX encodes the chunk before at the same time.
-        pyramids = [pyramid_of_scan(points, model.config, scale=scale) for points in scans[start : start + CHUNK]]
-        parts.append(_encode_chunk(model, stack_chunk(pyramids), num_elements=num_elements))
-    return join_chunks(parts, len(scans))
+    pyramids = (pyramid_of_scan(points, model.config, scale=scale) for points in scans)
+    return jax.tree.map(jnp.asarray, encode_pyramids(model, pyramids, num_elements=num_elements))
 
 
-def scene_scale(scans: Sequence[RawScan], config: ModelConfig) -> float:
-    """Chooses the factor by which scans are enlarged so that rooms fill the range of the encoder as streets do.
+def encode_pyramids(
+    model: Model, pyramids: Iterable[PointPyramid], *, num_elements: int | None = None
+) -> DescriptorCloud:
+    """Encodes pyramids; an iterator makes the next ones while JAX encodes.
 
     Args:
-        scans: all scans that are to be compared, metres, each in the frame of its lidar; the largest decides.
-        config: range and voxels of the preprocessing.
+        model: encoder and configuration.
+        pyramids: at least one, in normalised coordinates, from the host.
+        num_elements: see `encode`.
 
     Returns:
-        1 outdoors; 2 or 4 where the thinned points of all scans are near.
+        Stacked clouds, as arrays of NumPy: moved to a device, another number of scans would be compiled again.
     """
-    extent_m = max((_extent_m(valid_points(points), config) for points in scans), default=0.0)
-    if extent_m == 0:
-        return 1.0
-    return float(np.clip(2.0 ** np.round(np.log2(FULL_EXTENT_M / extent_m)), 1, MAX_SCALE))
-
-
-def _extent_m(points: Float[np.ndarray, "n 3"], config: ModelConfig) -> float:
-    limits = config.preprocess
-    with np.errstate(invalid="ignore", over="ignore"):
-        ranges = np.linalg.norm(points, axis=1)
-        points = points[(ranges >= limits.min_range_m) & (ranges <= limits.max_range_m)]
-    thinned = points[first_of_each_voxel(points, limits.voxel_size_m)]
-    return float(np.percentile(np.linalg.norm(thinned, axis=1), EXTENT_PERCENT)) if len(thinned) else 0.0
+    parts, num, remaining = [], 0, iter(pyramids)
+    while some := list(itertools.islice(remaining, CHUNK)):
+        parts.append(_encode_chunk(model, stack_chunk(some), num_elements=num_elements))
+        num += len(some)
+    return join_chunks(parts, num)
 
 
 def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
@@ -172,8 +161,8 @@ def stack_chunk(items: list[Any]) -> Any:
 
 
 def join_chunks(parts: Sequence[Any], num: int) -> Any:
-    """Joins the results of chunks, on the host: there, another number of parts compiles nothing."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num]), *jax.device_get(parts))
+    """Joins the results of chunks as arrays of NumPy: there, another number of parts compiles nothing."""
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *jax.device_get(parts))
 
 
 def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:

@@ -120,13 +120,26 @@ def read_scan_pairs(drive: LidarSequence, pairs: Int[np.ndarray, "p 2"], *, seed
     poses = true_poses(drive)
     rng = np.random.default_rng([PAIR_STREAM, len(DISTANCE_BANDS_M), seed])
     for pair in pairs:
-        scans, T_world_scan = [], []
-        for row in pair:
-            T = np.eye(4)
-            T[:2, :2] = se2.rotation(np.asarray(rng.uniform(-np.pi, np.pi)))
-            scans.append((drive.read_scan(int(row)) @ T[:3, :3].T).astype(np.float32))
-            T_world_scan.append(poses[row] @ inverse(T))
-        yield ScanPair(scans[0], scans[1], inverse(T_world_scan[1]) @ T_world_scan[0])
+        (source, T_source), (target, T_target) = (turn_scan(drive.read_scan(int(row)), poses[row], rng) for row in pair)
+        yield ScanPair(source, target, inverse(T_target) @ T_source)
+
+
+def turn_scan(
+    points: Float[np.ndarray, "n 3"], T_world_lidar: Pose, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Pose]:
+    """Turns a scan about the vertical by a random yaw, as if the lidar had another heading.
+
+    Args:
+        points: metres, in the frame of the lidar.
+        T_world_lidar: true pose.
+        rng: source of the yaw.
+
+    Returns:
+        float32 points in the turned frame, and its pose.
+    """
+    T = np.eye(4)
+    T[:2, :2] = se2.rotation(np.asarray(rng.uniform(-np.pi, np.pi)))
+    return (points @ T[:3, :3].T).astype(np.float32), T_world_lidar @ inverse(T)
 
 
 def true_poses(drive: LidarSequence) -> Poses:

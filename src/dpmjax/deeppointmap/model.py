@@ -38,6 +38,11 @@ class Model:
     params: dict[str, Any]
     config: ModelConfig = flax.struct.field(pytree_node=False)
 
+    def __repr__(self) -> str:
+        num = sum(np.size(leaf) for leaf in jax.tree.leaves(self.params))
+        channels, trained = self.config.encoder.output_channels, " and ".join(self.config.trained) or "nothing"
+        return f"Model({self.config.num_descriptors} x {channels} descriptors, {num:,} parameters, trained: {trained})"
+
 
 Initialization = Literal["normal", "uniform"]
 

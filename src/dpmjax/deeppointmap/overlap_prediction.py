@@ -94,7 +94,7 @@ def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequenc
         The probabilities.
     """
     require_overlap(model)
-    return _apply_to_pairs(overlap_probability, model, sources, targets)
+    return jnp.asarray(_apply_to_pairs(overlap_probability, model, sources, targets))
 
 
 def require_overlap(model: Model) -> None:

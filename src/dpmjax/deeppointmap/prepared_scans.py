@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Int16, UInt8
@@ -38,9 +38,6 @@ class PreparedScan(NamedTuple):
 
 # A raw scan, a prepared scan, or descriptors of a scan or of a map.
 ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
-
-# Factor by which scans are enlarged for the encoder; "auto" chooses it by `scene_scale`.
-Scale = float | Literal["auto"]
 
 
 def descriptors_of(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:

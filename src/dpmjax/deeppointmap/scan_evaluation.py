@@ -18,21 +18,17 @@ from jaxtyping import Bool, Float, Int
 
 from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability, gather_evidence
 from dpmjax.deeppointmap.encoding import encode
-from dpmjax.deeppointmap.evaluation_pairs import ScanPair, draw_rows, scan_distances, true_poses
+from dpmjax.deeppointmap.evaluation_pairs import ScanPair, draw_rows, scan_distances, true_poses, turn_scan
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, overlap_pairs
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import measure_scan
-from dpmjax.geometry import se2
 from dpmjax.metrics.drives import path_lengths
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud, Pose, Poses
-
-# Seconds of one registration, or of each of several.
-Seconds = float | Float[np.ndarray, " p"]
 
 # Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out.
 NO_OVERLAP_M = 40.0
@@ -43,29 +39,6 @@ REVISIT_PATH_M = 100.0
 REVISIT_STREAM = 4133
 
 
-class StageSeconds(NamedTuple):
-    """Seconds of the stages of a registration, both scans together.
-
-    Attributes:
-        encode: preprocessing and network.
-        measure: surfaces and free space of the scans.
-        match: decoder and consensus.
-        verify: comparison of the hypotheses, the search among views included.
-        refine: the final alignment.
-    """
-
-    encode: Seconds
-    measure: Seconds
-    match: Seconds
-    verify: Seconds
-    refine: Seconds
-
-    @property
-    def total(self) -> Seconds:
-        """Seconds of all stages."""
-        return sum(self[1:], self[0])
-
-
 class StagedRegistration(NamedTuple):
     """A registration with the motion after each stage.
 
@@ -74,14 +47,14 @@ class StagedRegistration(NamedTuple):
         verified: motion under which the scans agree best.
         refined: verified motion after the final alignment.
         evidence: features of the confidence of the verified motion.
-        seconds: seconds of each stage.
+        seconds: seconds of all stages.
     """
 
     descriptors: Pose
     verified: Pose
     refined: Pose
     evidence: MatchEvidence
-    seconds: StageSeconds
+    seconds: float
 
 
 class ScanEvaluation(NamedTuple):
@@ -94,7 +67,7 @@ class ScanEvaluation(NamedTuple):
         confidence: confidence of each registration; a probability where the model is calibrated, else the mean score of
             the pairs of descriptors.
         T_target_source: refined motions.
-        seconds: seconds of the stages of each registration.
+        seconds: seconds of each registration.
     """
 
     descriptors: RegistrationRecall
@@ -102,11 +75,11 @@ class ScanEvaluation(NamedTuple):
     refined: RegistrationRecall
     confidence: Float[np.ndarray, " p"]
     T_target_source: Poses
-    seconds: StageSeconds
+    seconds: Float[np.ndarray, " p"]
 
 
 def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
-    """Registers a pair as `register` does with `refine=True`, and measures each stage.
+    """Registers a pair as `register` does with `refine=True`, and keeps the motion after each stage.
 
     Scans of fewer than 20 descriptors, which `register` does not register, are treated as all others.
 
@@ -115,27 +88,22 @@ def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
         pair: two scans.
 
     Returns:
-        The motion after each stage, and the seconds of each.
+        The motion after each stage.
     """
-    settings, times = model.config.verification, [time.perf_counter()]
+    settings, begun = model.config.verification, time.perf_counter()
     scans = pair.source, pair.target
-    clouds = [jax.block_until_ready(encode(model, points)) for points in scans]
-    times.append(time.perf_counter())
+    clouds = [encode(model, points) for points in scans]
     source, target = (measure_scan(points, settings) for points in scans)
-    times.append(time.perf_counter())
     hypotheses = match_clouds(model, *clouds, config=model.config.matching)
     motions = distinct_motions(hypotheses)
-    times.append(time.perf_counter())
     verified = choose_motion(source, target, motions, settings)
-    times.append(time.perf_counter())
     refined = refine_motion(source, target, verified, settings)
-    times.append(time.perf_counter())
     return StagedRegistration(
         descriptors=motions[0],
         verified=verified.T_target_source,
         refined=refined.T_target_source,
         evidence=gather_evidence(hypotheses, verified.row, verified.verification),
-        seconds=StageSeconds(*np.diff(times).tolist()),
+        seconds=time.perf_counter() - begun,
     )
 
 
@@ -161,14 +129,13 @@ def evaluate_scan_pairs(model: Model, pairs: Iterable[ScanPair]) -> ScanEvaluati
     def errors(motions: list[Pose]) -> RegistrationRecall:
         return registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
 
-    seconds = np.reshape([result.seconds for result in found], (-1, len(StageSeconds._fields)))
     return ScanEvaluation(
         descriptors=errors([result.descriptors for result in found]),
         verified=errors([result.verified for result in found]),
         refined=errors([result.refined for result in found]),
         confidence=np.array([_confidence(model, result.evidence) for result in found]),
         T_target_source=np.reshape([result.refined for result in found], (-1, 4, 4)),
-        seconds=StageSeconds(*seconds.T),
+        seconds=np.array([result.seconds for result in found]),
     )
 
 
@@ -261,11 +228,9 @@ def encode_turned(
     Returns:
         Descriptors of each scan, as arrays of NumPy.
     """
-    turns = np.asarray(se2.rotation(rng.uniform(-np.pi, np.pi, len(rows))))
     clouds = []
-    for row, turn in zip(rows, turns, strict=True):
-        points = drive.read_scan(int(row)).astype(np.float32)
-        points[:, :2] = points[:, :2] @ turn.T
+    for row in rows:
+        points, _ = turn_scan(drive.read_scan(int(row)), np.eye(4), rng)
         clouds.append(jax.device_get(encode(model, points)))
         if on_scan is not None:
             on_scan()

@@ -15,13 +15,11 @@ from jaxtyping import Array
 
 from dpmjax.checks import require_pairs, require_type, runs_on_host
 from dpmjax.deeppointmap.confidence import MatchEvidence, gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import scene_scale
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, verify_elements
 from dpmjax.deeppointmap.prepared_scans import (
     PreparedScan,
-    Scale,
     ScanOrCloud,
     descriptors_of,
     is_verified_pair,
@@ -54,7 +52,7 @@ def register(
     *,
     config: MatchConfig | None = None,
     refine: bool | None = None,
-    scale: Scale = 1.0,
+    scale: float = 1.0,
 ) -> Registration:
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
 
@@ -73,8 +71,8 @@ def register(
             clouds, if they have some. False returns the motion of the short alignment that verified it for two
             scans, else that of the descriptors. None is True with a calibrated model; published weights give the
             published motion.
-        scale: factor by which raw scans are enlarged for the encoder, or by which the scans of descriptors were; "auto"
-            chooses 1, 2 or 4 from the extent of both scans. Prepared scans have their own. The result is in metres.
+        scale: factor by which raw scans are enlarged for the encoder, or by which the scans of descriptors were.
+            Prepared scans have their own. The result is in metres.
 
     Returns:
         `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
@@ -88,7 +86,7 @@ def register(
 
     Raises:
         ValueError: if the model is none, the points are no real numbers (n, 3), features have another width than the
-            model, both have another scale, the scale is another word than "auto", or "auto" meets descriptors.
+            model, the scale is not positive, or both have another scale.
     """
     return register_each(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
 
@@ -99,7 +97,7 @@ def register_each(
     *,
     config: MatchConfig | None = None,
     refine: bool | None = None,
-    scale: Scale = 1.0,
+    scale: float = 1.0,
 ) -> list[Registration]:
     """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
 
@@ -118,7 +116,6 @@ def register_each(
     """
     require_type("model", model, Model, "load_model")
     refine = model.config.calibration is not None if refine is None else refine
-    scale = _scale_of(pairs, scale, model)
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
     prepared = prepare_each(model, pairs, scale, num_elements=num_elements)
     matching, verification = config or model.config.matching, model.config.verification
@@ -151,7 +148,7 @@ def register_pairs(
     *,
     config: MatchConfig | None = None,
     refine: bool | None = None,
-    scale: Scale = 1.0,
+    scale: float = 1.0,
 ) -> Registration:
     """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
 
@@ -234,18 +231,6 @@ class _RegisteredMotion(NamedTuple):
     weak: WeakDirection | None = None
     elements: Verification | None = None
     num_elements: int = 0
-
-
-def _scale_of(pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: Scale, model: Model) -> float:
-    """Returns the scale of all raw scans; "auto" chooses it from their extents."""
-    if scale != "auto":
-        if np.asarray(scale).dtype.kind not in "fiu":
-            raise ValueError(f'scale: expected a number or "auto", got {scale!r}')
-        return scale
-    scans = [scan for pair in pairs for scan in pair if not isinstance(scan, PreparedScan)]
-    if any(isinstance(scan, DescriptorCloud) for scan in scans):
-        raise ValueError('scale: "auto" needs scans, got descriptors; give the factor that they were encoded with')
-    return scene_scale([scan for scan in scans if not isinstance(scan, DescriptorCloud)], model.config)
 
 
 def _shared_scale(

@@ -22,7 +22,7 @@ from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute
 from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
-Frame = Literal["lidar", "bearing", "local"]
+Frame = Literal["lidar", "local"]
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,9 @@ class EncoderConfig:
         expansion: width of the hidden layer in inverted residual blocks, relative to its input.
         output_channels: channels of a descriptor.
         frame: frame of the offsets between points. With "lidar" it has the axes of the lidar, as in the published
-            networks, which learn rotations by augmentation. With "bearing" it lies along and across the ray from the
-            lidar to each point, with "local" along and across the normal of the wall there. In both, descriptors are
-            invariant to rotations of the scan about the vertical, and the offsets between descriptors are predicted in
-            these frames, too. Local frames do not turn where the lidar moves past a wall.
+            networks, which learn rotations by augmentation. With "local" it lies along and across the normal of the
+            wall at each point: descriptors are invariant to rotations of the scan about the vertical, and the offsets
+            between descriptors are predicted in these frames, too.
         compute_dtype: type of the matrix products over features.
     """
 
@@ -193,10 +192,8 @@ def frame_directions(frame: Frame, finer: PyramidLevel, level: PyramidLevel) -> 
     """
     if frame == "lidar":
         return None
-    rays = ray_directions(level.positions)
-    if frame == "bearing":
-        return rays
-    return wall_normals(jnp.asarray(finer.positions[level.neighbours[0]] - level.positions[:, None]), rays)
+    offsets = jnp.asarray(finer.positions[level.neighbours[0]] - level.positions[:, None])
+    return wall_normals(offsets, ray_directions(level.positions))
 
 
 class FeaturePropagation(nn.Module):
@@ -256,9 +253,7 @@ class PointEncoder(nn.Module):
         config = self.config
         levels = [_in_float32(without_masked(level)) for level in pyramid.levels]
         seen = jnp.asarray(levels[0].positions)
-        if config.frame == "bearing":
-            seen = to_ray_frame(seen, ray_directions(seen))
-        elif config.frame == "local":
+        if config.frame == "local":
             seen = seen * jnp.array([0, 0, 1])  # heights
         features = [linear(config.stem_channels, "float32", "stem")(seen)]
         for stage, radii in enumerate(self.radii):

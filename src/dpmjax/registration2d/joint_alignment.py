@@ -10,6 +10,7 @@ refinement and not after it. The pose graph is solved again with the previous re
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -251,6 +252,6 @@ def _linearise(
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
     filled = np.resize(np.arange(len(source)), rounded_up(len(source), _PAIRS_AT_ONCE, _PAIRS_ROUNDED))
     rows = source[filled], target[filled], relative[filled].astype(np.float32)
-    system = _linearise_pairs(scans.replace(is_ordered=False), rows, scale, source_stride=stride)
+    system = _linearise_pairs(replace(scans, is_ordered=False), rows, scale, source_stride=stride)
     information, gradient, _ = (np.asarray(x, np.float64)[: len(source)] for x in system)
     return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)

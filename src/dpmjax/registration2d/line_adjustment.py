@@ -7,6 +7,7 @@ because its noise is parallel to the wall. The lines are eliminated, so each res
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -199,7 +200,7 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
     """
     if len(poses) < 2 or scans.noise <= 0:
         return poses
-    radius, scans = _RADIUS * scans.typical_range, scans.replace(is_ordered=False)
+    radius, scans = _RADIUS * scans.typical_range, replace(scans, is_ordered=False)
     for _ in range(_NUM_ROUNDS):
         around = _choose_around(poses, radius)
         nearest = _find_nearest(scans, around, _relative_to_own(poses, around))

@@ -7,7 +7,7 @@ contradict it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -166,7 +166,7 @@ def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> Plana
     is_there = (rows >= 0) & (rows < len(poses))
     rows = np.clip(rows, 0, len(poses) - 1)
     relative = se2.relative(poses[centres][:, None], poses[rows]).astype(np.float32)
-    return _merge_scans(scans.replace(is_ordered=False), rows, is_there, relative)
+    return _merge_scans(replace(scans, is_ordered=False), rows, is_there, relative)
 
 
 @jax.jit

@@ -13,6 +13,7 @@ The noise is estimated from the scans.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -105,13 +106,13 @@ class PlanarScans(flax.struct.PyTreeNode):
     def take(self, rows: Any) -> PlanarScans:
         """Returns the scans of these rows (an index, a slice, a list or an array), without an order in time."""
         index = np.array(rows) if isinstance(rows, list) else rows
-        return jax.tree.map(lambda x: x[index], self).replace(is_ordered=False)
+        return replace(jax.tree.map(lambda x: x[index], self), is_ordered=False)
 
     def thin(self, stride: int) -> PlanarScans:
         """Returns the same scans with every `stride`-th beam."""
         kept = (slice(None),) * (self.mask.ndim - 1) + (slice(None, None, stride),)
         names = ("points", "mask", "normals", "centroids", "is_on_line")
-        return self.replace(**{name: getattr(self, name)[kept] for name in names})
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
 
 @jax.enable_x64(False)  # float32, also where JAX has 64 bits
@@ -152,7 +153,7 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     # Beams on lines end on walls; with all beams, people and clutter would change the unit.
     is_used = np.asarray(fitted.is_on_line if fitted.is_on_line.any() else fitted.mask)
     length = jnp.full(len(values), typical_range(np.asarray(fitted.points), is_used), jnp.float32)
-    return fitted.replace(typical_ranges=length, is_ordered=is_ordered)
+    return replace(fitted, typical_ranges=length, is_ordered=is_ordered)
 
 
 def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:

@@ -7,6 +7,7 @@ of two scans is the agreement of their visible beams.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -104,12 +105,12 @@ def make_profiles(scans: PlanarScans, num_bearings: int = _NUM_BEARINGS) -> Rang
         RangeProfiles with arrays (n, c).
     """
     # Profiles do not depend on the order of the scans; one program serves both.
-    return _make_profiles(scans.replace(is_ordered=False), num_bearings=num_bearings)
+    return _make_profiles(replace(scans, is_ordered=False), num_bearings=num_bearings)
 
 
 @partial(jax.jit, static_argnames="num_bearings")
 def _make_profiles(scans: PlanarScans, *, num_bearings: int) -> RangeProfiles:
-    return jax.vmap(partial(_profile, num_bearings=num_bearings))(scans.replace(points=_smooth_ranges(scans)))
+    return jax.vmap(partial(_profile, num_bearings=num_bearings))(replace(scans, points=_smooth_ranges(scans)))
 
 
 def _profile(scan: PlanarScans, num_bearings: int) -> RangeProfiles:

@@ -6,7 +6,7 @@ With range noise the scans are then adjusted to common lines (line_adjustment.py
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
@@ -108,7 +108,7 @@ def refine(
     if prior is not None and config.loops is not None and not _is_sound(scans, start):
         rows = distinct_rows(scans)
         if len(rows) < len(scans):
-            some = scans.take(rows).replace(is_ordered=True)
+            some = replace(scans.take(rows), is_ordered=True)
             fitting = refine(some, start[rows], config, prior=prior.through(rows), on_progress=on_progress)
             whole = interpolate(len(scans), rows, fitting.poses)
             return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))

@@ -165,7 +165,7 @@ def _submap_profiles(sequence: _Sequence, centres: Indices, members: list[Indice
         points[row, beams], mask[row, beams] = seen[order[first]], True
     made = planar_scans(points, mask, is_ordered=False)
     ones = jnp.ones(len(centres))
-    return make_profiles(made.replace(noises=scans.noise * ones, typical_ranges=scans.typical_range * ones))
+    return make_profiles(replace(made, noises=scans.noise * ones, typical_ranges=scans.typical_range * ones))
 
 
 def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfig) -> Hypotheses:

@@ -39,8 +39,6 @@ from .localization import localize_each as localize_each
 from .loop_closure import most_similar as most_similar
 from .loops import DESCRIPTOR_INFORMATION as DESCRIPTOR_INFORMATION
 from .loops import Loop as Loop
-from .map_optimization import RefinedKeyframes as RefinedKeyframes
-from .map_optimization import refine_keyframes as refine_keyframes
 from .model_methods import NetworkMatcher as NetworkMatcher
 from .model_methods import make_methods as make_methods
 from .surface_geometry import SurfaceGeometry as SurfaceGeometry

@@ -26,7 +26,7 @@ from dpmjax.slam.keyframe_map import (
     submap_of,
 )
 from dpmjax.slam.loops import Loop, LoopState, LoopStatus
-from dpmjax.slam.map_optimization import join_parts
+from dpmjax.slam.map_optimization import move_parts
 
 # Largest horizontal distance of a candidate by the estimated poses.
 RADIUS_M = 100.0
@@ -43,7 +43,9 @@ STEP_SIGMA_M, STEP_SIGMA_RAD, NUM_SIGMAS = 0.4, math.radians(0.5), 3.0
 NUM_TRANSLATION_STEPS, NUM_ROTATION_STEPS = 100, 5000
 
 
-def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
+def close_loops_by_descriptors(
+    methods: SlamMethods, slam_map: KeyframeMap, state: LoopState
+) -> tuple[KeyframeMap, LoopState]:
     """Looks for a loop of the newest keyframe, and optimises where one was found.
 
     Args:
@@ -57,11 +59,11 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     if not methods.config.loops.is_on:
         return slam_map, state
     row = len(slam_map) - 1
-    slam_map, loops = join_keyframe(methods, slam_map, state.loops, row, np.arange(len(slam_map)) < row)
+    slam_map, loops = join_keyframe_by_descriptors(methods, slam_map, state.loops, row, np.arange(len(slam_map)) < row)
     return slam_map, LoopState(loops, len(slam_map))
 
 
-def join_keyframe(
+def join_keyframe_by_descriptors(
     methods: SlamMethods, slam_map: KeyframeMap, loops: tuple[Loop, ...], row: int, is_allowed: Bool[np.ndarray, " k"]
 ) -> tuple[KeyframeMap, tuple[Loop, ...]]:
     """Looks for a loop from a keyframe to allowed ones, and optimises the map where one is accepted.
@@ -77,7 +79,7 @@ def join_keyframe(
         The map and the loops after.
     """
     steps = steps_from(slam_map, row)
-    targets = find_candidates(slam_map, loops, row, steps, is_allowed)
+    targets = find_loop_targets(slam_map, loops, row, steps, is_allowed)
     if not len(targets):
         return slam_map, loops
     compact = [slam_map.keyframes[target].compact for target in targets]
@@ -95,7 +97,7 @@ def join_keyframe(
     return slam_map, (*loops, loop)
 
 
-def find_candidates(
+def find_loop_targets(
     slam_map: KeyframeMap,
     loops: Sequence[Loop],
     row: int,
@@ -186,7 +188,7 @@ def optimize_with_loop(slam_map: KeyframeMap, loop: Loop) -> KeyframeMap:
     Returns:
         The map after; the first keyframe stays.
     """
-    T_world_keyframe = join_parts(slam_map.T_world_keyframe, measured_parts(slam_map), [loop.edge])
+    T_world_keyframe = move_parts(slam_map.T_world_keyframe, measured_parts(slam_map), [loop.edge])
     slam_map = replace(slam_map, T_world_keyframe=T_world_keyframe, edges=(*slam_map.edges, loop.edge))
     solved = optimize_pose_graph(as_pose_graph(slam_map), PoseGraphConfig(is_chordal_start=False))
     return replace(slam_map, T_world_keyframe=solved.graph.poses)

@@ -35,7 +35,9 @@ RATIO_MEMORY = 0.9
 Placed = tuple[FrontEndState, KeyframeMap, ScanReport]
 
 
-def place_scan(methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: PreparedInput) -> Placed:
+def place_by_descriptors(
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: PreparedInput
+) -> Placed:
     """Registers a scan with the nearest keyframe, and makes it a keyframe where it is far from all others.
 
     A registration beyond the limits is dropped, and the scan gets the pose of the last motion. Of five scans in a row

@@ -102,6 +102,9 @@ class KeyframeMap:
     def __len__(self) -> int:
         return len(self.keyframes)
 
+    def __repr__(self) -> str:
+        return f"KeyframeMap({len(self)} keyframes, {len(self.edges)} edges, by {self.origin})"
+
     def column(self, name: str) -> np.ndarray:
         """Returns one field of all keyframes, such as "path_m", as an array."""
         return np.array([getattr(keyframe, name) for keyframe in self.keyframes])

@@ -37,7 +37,9 @@ class SlamProcedure(NamedTuple):
 _PROCEDURES = {
     "surfaces": SlamProcedure(front_end.place_scan, loop_closure.close_loops, loop_closure.join_keyframe),
     "descriptors": SlamProcedure(
-        descriptor_odometry.place_scan, descriptor_loops.close_loops, descriptor_loops.join_keyframe
+        descriptor_odometry.place_by_descriptors,
+        descriptor_loops.close_loops_by_descriptors,
+        descriptor_loops.join_keyframe_by_descriptors,
     ),
 }
 

@@ -68,6 +68,10 @@ class SlamResult(NamedTuple):
     state: SlamState
     T_odometry_scan: Poses
 
+    def __repr__(self) -> str:
+        accepted = sum(loop.status == "accepted" for loop in self.loops)
+        return f"SlamResult({len(self.reports)} scans, {len(self.keyframes)} keyframes, {accepted} loops)"
+
     @property
     def map(self) -> KeyframeMap:
         """The map: keyframes, poses and edges."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import (
     ObjectiveConfig,
@@ -14,11 +17,10 @@ from dpmjax.deeppointmap import (
     draw_evaluation_pairs,
     evaluate_registration,
     init_model,
-    measure_offsets,
-    offset_quality,
 )
+from dpmjax.deeppointmap.model import encode_pyramid
 from dpmjax.deeppointmap.training import evaluation as evaluation_module
-from dpmjax.deeppointmap.training.step import encode_sample
+from dpmjax.deeppointmap.training.offset_quality import offset_r2, wall_offsets
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
@@ -26,12 +28,13 @@ from tests.tolerances import ACCUMULATED
 @pytest.mark.slow
 def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
     model = init_model(jax.random.key(0), toy.MODEL)
-    pairs = draw_evaluation_pairs(toy.drive(num_scans=4), 2, toy.MODEL)
+    pairs = draw_evaluation_pairs([toy.drive(num_scans=4)], 2, toy.MODEL)
     clouds = evaluate_registration(model, pairs).clouds
-    expected = jax.vmap(functools.partial(encode_sample, model))(pairs.scans)
-    np.testing.assert_array_equal(clouds.mask, expected.mask)
-    np.testing.assert_allclose(clouds.positions, expected.positions, atol=1e-4)
-    np.testing.assert_allclose(clouds.features, expected.features, **ACCUMULATED)
+    for row, pyramid in enumerate(pairs.pyramids):
+        expected = encode_pyramid(model, pyramid)
+        np.testing.assert_array_equal(clouds.mask[row], expected.mask)
+        np.testing.assert_allclose(clouds.positions[row], expected.positions, atol=1e-4)
+        np.testing.assert_allclose(clouds.features[row], expected.features, **ACCUMULATED)
 
 
 @pytest.mark.slow
@@ -39,7 +42,7 @@ def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(asse
     model = init_model(jax.random.key(0), toy.MODEL)
     kinds = (PairKind(2.0, 10.0), PairKind(2.0, 10.0, num_scans=3))
     few, many = (
-        draw_evaluation_pairs(toy.drive(num_scans=num_scans), num_pairs, toy.MODEL, kinds=kinds)
+        draw_evaluation_pairs([toy.drive(num_scans=num_scans)], num_pairs, toy.MODEL, kinds=kinds)
         for num_scans, num_pairs in ((6, 3), (24, 13))
     )
     evaluate_registration(model, few)
@@ -50,27 +53,35 @@ def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(asse
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_offsets_of_an_evaluation_are_those_of_its_pairs(monkeypatch) -> None:
-    wide = ObjectiveConfig(offset_radius_m=10.0)  # the points of the toy lie far apart
-    monkeypatch.setattr(evaluation_module, "TRAINED", wide)
+    # The points of the toy lie far apart.
+    wide = functools.partial(wall_offsets, config=ObjectiveConfig(offset_radius_m=10.0))
+    monkeypatch.setattr(evaluation_module, "wall_offsets", wide)
     model = init_model(jax.random.key(0), toy.SLAM_MODEL)
-    pairs = draw_evaluation_pairs(toy.drive(num_scans=6), 4, toy.SLAM_MODEL)
+    pairs = draw_evaluation_pairs([toy.drive(num_scans=6)], 4, toy.SLAM_MODEL)
     evaluation, some = evaluate_registration(model, pairs), pairs.pairs[0]
-    sources, targets = (
-        [jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in rows[:, 0]]
-        for rows in (some.sources, some.targets)
-    )
-    motions = pairs.true_motions(some).astype(np.float32)
-    expected = offset_quality(model, zip(sources, targets, motions, strict=True), config=wide)
-    found = measure_offsets(evaluation.offsets)
-    assert found.num_pairs == expected.num_pairs > 0
-    np.testing.assert_allclose(found.r2, expected.r2, **ACCUMULATED)
+    parts = []
+    for source, target, T in zip(some.sources[:, 0], some.targets[:, 0], pairs.true_motions(some), strict=True):
+        sides = (jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in (source, target))
+        parts.append(jax.device_get(wide(model, *sides, jnp.asarray(T, jnp.float32))))
+    assert np.isfinite(evaluation.offset_r2).all()
+    np.testing.assert_allclose(evaluation.offset_r2, offset_r2(parts), **ACCUMULATED)
+
+
+def test_scans_are_turned_with_their_poses() -> None:
+    drive = toy.drive(num_scans=4)
+    pairs = draw_evaluation_pairs([drive], 2, toy.MODEL)
+    for row, (scan, T) in enumerate(zip(pairs.scans, pairs.T_world_scan, strict=True)):
+        T_lidar_scan = np.linalg.inv(drive.T_world_lidar[row]) @ T
+        points = np.asarray(scan.points)[np.asarray(scan.mask)]
+        back = points @ T_lidar_scan[:3, :3].T + T_lidar_scan[:3, 3]
+        assert cKDTree(drive.read_scan(row)).query(back)[0].max() < 1e-3
+        assert abs(Rotation.from_matrix(T_lidar_scan[:3, :3]).as_rotvec()[:2]).max() < 1e-6
 
 
 def test_a_map_holds_its_first_scan_once() -> None:
     kind = PairKind(2.0, 10.0, num_scans=4)
-    some = draw_evaluation_pairs(toy.drive(num_scans=12, step_m=3.0), 20, toy.MODEL, kinds=(kind,)).pairs[0]
+    some = draw_evaluation_pairs([toy.drive(num_scans=12, step_m=3.0)], 20, toy.MODEL, kinds=(kind,)).pairs[0]
     for rows in (*some.sources, *some.targets):
         assert np.count_nonzero(rows == rows[0]) == 1
         assert len(set(rows.tolist())) == 4
@@ -78,5 +89,5 @@ def test_a_map_holds_its_first_scan_once() -> None:
 
 def test_a_scan_without_neighbours_is_repeated() -> None:
     kind = PairKind(10.0, 14.0, num_scans=3)
-    some = draw_evaluation_pairs(toy.drive(num_scans=4, step_m=12.0), 2, toy.MODEL, kinds=(kind,)).pairs[0]
+    some = draw_evaluation_pairs([toy.drive(num_scans=4, step_m=12.0)], 2, toy.MODEL, kinds=(kind,)).pairs[0]
     np.testing.assert_array_equal(some.sources, some.sources[:, :1].repeat(3, axis=1))

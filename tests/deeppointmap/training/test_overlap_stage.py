@@ -15,7 +15,7 @@ from dpmjax.deeppointmap.training.sampling import ScanTable
 from tests.deeppointmap import toy
 
 NEW = replace(toy.TRAINING, stages=("overlap",), overlap=OverlapConfig(num_epochs=1, batch_pairs=8))
-POOL = replace(NEW, overlap=OverlapConfig(num_epochs=3, batch_pairs=8, pool_pairs=16, hard_share=0.25))
+POOL = replace(NEW, overlap=OverlapConfig(num_epochs=3, batch_pairs=8, pool_pairs=16))
 
 
 def table(positions: np.ndarray, scene: np.ndarray | None = None) -> ScanTable:
@@ -135,7 +135,7 @@ def test_drives_that_teach_no_overlap_are_refused() -> None:
         dpmjax.train(toy.store(toy.drive(num_scans=4)), config)
 
 
-@pytest.mark.parametrize("settings", [{"pool_pairs": 0, "hard_share": 0.5}, {"num_epochs": 0}, {"rate_share": 0.0}])
+@pytest.mark.parametrize("settings", [{"num_epochs": 0}, {"rate_share": 0.0}])
 def test_settings_out_of_range_are_refused(settings) -> None:
     with pytest.raises(ValueError, match=next(name for name in reversed(settings))):
         OverlapConfig(**settings)

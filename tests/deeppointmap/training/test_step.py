@@ -172,7 +172,7 @@ def test_a_sample_depends_on_seed_and_step_alone(maker) -> None:
 
 
 def test_devices_share_the_anchors_of_an_epoch(maker) -> None:
-    both = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=2)
+    both = SampleMaker(toy.store(), toy.TRAINING, seed=0, numbers=(0, 1), num_in_step=2)
     toy.assert_trees_equal(jax.tree.map(lambda leaf: leaf[:1], both(0)), maker(0))
     num = len(toy.store().table)
     alone = [maker._anchor(step, 0) for step in range(num)]
@@ -238,7 +238,7 @@ from dpmjax.deeppointmap.training.processes import device_mesh, place
 from dpmjax.deeppointmap.training.step import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
-maker = SampleMaker(toy.store(), toy.TRAINING, seed=0, num_samples=8)
+maker = SampleMaker(toy.store(), toy.TRAINING, seed=0, numbers=range(8), num_in_step=8)
 batch, params = maker(0), init_training(jax.random.key(0), toy.TRAINING).params
 gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
 alone = gradient(params, batch)

@@ -97,25 +97,19 @@ class OverlapConfig:
         num_epochs: number of times that each scan is the first of a pair; of a pool, that each pair is seen.
         batch_pairs: number of pairs of a step.
         pool_pairs: number of pairs whose features are computed once and kept in memory; 0 draws and encodes new pairs
-            for each step.
-        hard_share: share of the pairs of a pool that are hard. Half of these are of one street that was seen twice; the
-            others look alike, at least 20 m apart. Without such pairs, they are drawn as all others.
+            for each step. A quarter of a pool is of streets that were seen twice, or of places that look alike.
         rate_share: learning rate and weight decay, as shares of those of the first stage.
     """
 
     num_epochs: int = 10
     batch_pairs: int = 32
     pool_pairs: int = 0
-    hard_share: float = 0.0
     rate_share: float = 0.1
 
     def __post_init__(self) -> None:
         require_fields(self, "num_epochs", "batch_pairs", low=1)
         require_fields(self, "pool_pairs", low=0)
         require_positive_fields(self, "rate_share")
-        if not 0 <= self.hard_share <= (1 if self.pool_pairs else 0):
-            expected = "expected 0 to 1, and 0 without a pool of pairs"
-            raise ValueError(f"hard_share: {expected}, got {self.hard_share}")
 
     def num_steps(self, num_scans: int) -> int:
         """Computes the number of steps.
@@ -331,7 +325,7 @@ PRESETS = {
         learning_rate=2e-3,
         warmup_steps=20,
         max_gradient_norm=5.0,
-        overlap=OverlapConfig(num_epochs=30, pool_pairs=1024, hard_share=0.25),
+        overlap=OverlapConfig(num_epochs=30, pool_pairs=1024),
     ),
     "small": TrainingConfig(
         model=model_preset("small"),
@@ -350,7 +344,7 @@ PRESETS = {
         thins_maps=True,
         initialization="normal",
         scans_at_once=4,
-        overlap=OverlapConfig(num_epochs=40, pool_pairs=2048, hard_share=0.25),
+        overlap=OverlapConfig(num_epochs=40, pool_pairs=2048),
     ),
     # Steps of the curriculum: twelve epochs of 10,000 scans on one device.
     "paper": TrainingConfig(num_epochs=12.0),

@@ -4,45 +4,32 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dpmjax.deeppointmap.evaluation_pairs import draw_rows_apart, scan_distances, true_poses
+from dpmjax.deeppointmap.encoding import encode_pyramids, pyramid_of_cloud, thin_scan
+from dpmjax.deeppointmap.evaluation_pairs import draw_rows_apart, scan_distances, true_poses, turn_scan
 from dpmjax.deeppointmap.matching import merge_clouds, thinned_mask
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.deeppointmap.scan_registration import trace_match
-from dpmjax.deeppointmap.training.curriculum import TrainingConfig
-from dpmjax.deeppointmap.training.offset_quality import TRAINED, WallOffsets, wall_offsets
-from dpmjax.deeppointmap.training.preparation import prepare_drive
-from dpmjax.deeppointmap.training.sampling import SampleScans
-from dpmjax.deeppointmap.training.scan_store import ScanStore
-from dpmjax.deeppointmap.training.step import encode_sample
+from dpmjax.deeppointmap.training.offset_quality import WallOffsets, offset_r2, wall_offsets
+from dpmjax.deeppointmap.training.preparation import read_or_note
 from dpmjax.geometry import rigid
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
-from dpmjax.scans.augment import AugmentConfig
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import DescriptorCloud, Poses, Registration
+from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, Pose, Poses, Registration
 
 PAIR_STREAM = 3103
-# Scans, maps or pairs that one compiled program evaluates in turn.
-CHUNK = 10
+# Maps or pairs that one compiled program evaluates in turn.
+PAIRS_AT_ONCE = 10
 # Largest distance of the scans of an evaluated map from its first scan.
 MAP_RADIUS_M = 10.0
-
-# No augmentation but a random yaw.
-UPRIGHT = AugmentConfig(
-    max_drop_ratio=0.0,
-    sector_probability=0.0,
-    box_probability=0.0,
-    max_tilt_rad=0.0,
-    translation_sigma_m=0.0,
-    jitter_sigma_m=0.0,
-)
 
 
 class PairKind(NamedTuple):
@@ -77,29 +64,16 @@ class EvaluationPairs(NamedTuple):
     """Pairs that are ready for all models of one configuration.
 
     Attributes:
-        scans: all scans, and the yaw of each.
+        scans: all scans, thinned, each turned by a random yaw.
+        pyramids: their pyramids.
         T_world_scan: (n, 4, 4) true poses after the yaw, float64 metres.
         pairs: pairs of each kind.
-        scale_m: metres in one unit of the pyramids.
     """
 
-    scans: SampleScans
+    scans: list[PointCloud]
+    pyramids: list[PointPyramid]
     T_world_scan: Poses
     pairs: tuple[Pairs, ...]
-    scale_m: float
-
-    def scan_points(self, row: int) -> Float[np.ndarray, "n 3"]:
-        """Returns the preprocessed points of a scan.
-
-        Args:
-            row: number of the scan.
-
-        Returns:
-            Points in the frame of the scan, metres.
-        """
-        stored, T = self.scans.pyramids, self.scans.T_augmented_lidar[row]
-        points = stored.points[row, : stored.num_points[row]] * (stored.unit[row] * np.float32(self.scale_m))
-        return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
     def true_motions(self, pairs: Pairs) -> Poses:
         """Computes the true motions of pairs.
@@ -120,102 +94,71 @@ class Evaluation(NamedTuple):
     Attributes:
         recalls: errors and share of correct registrations of each kind.
         matches: stacked registrations of each kind.
-        offsets: stacked offsets of the close descriptors of each kind; `measure_offsets` measures them.
+        offset_r2: coefficients of determination of predicted offsets (`offset_r2`), all kinds together.
         clouds: descriptors of all scans, stacked.
     """
 
     recalls: tuple[RegistrationRecall, ...]
     matches: tuple[Registration, ...]
-    offsets: tuple[WallOffsets, ...]
+    offset_r2: Float[np.ndarray, " 3"]
     clouds: DescriptorCloud
 
 
 def draw_evaluation_pairs(
-    drive: LidarSequence,
+    drives: Iterable[LidarSequence],
     num_pairs: int,
     config: ModelConfig,
     *,
     kinds: tuple[PairKind, ...] = (PairKind(),),
-    max_scans: int = 160,
     seed: int = 0,
 ) -> EvaluationPairs:
-    """Draws random pairs of one drive.
+    """Draws random pairs of scans of each drive.
 
     Args:
-        drive: scans with true poses.
-        num_pairs: number of pairs of each kind; fewer where the drive has fewer.
+        drives: scans with true poses; a drive without pairs of any kind is left out.
+        num_pairs: number of pairs of each kind of a drive; fewer where the drive has fewer.
         config: preprocessing and pyramid.
         kinds: kinds of pairs.
-        max_scans: a longer drive is thinned to this number of scans, evenly.
         seed: seed of the draws.
 
     Returns:
-        The pairs.
+        The pairs, of the kinds of which some drive has one.
 
     Raises:
-        ValueError: if the drive has no poses, or no pairs of a kind.
+        ValueError: if a drive has no poses.
     """
-    true_poses(drive)
-    rng = np.random.default_rng([PAIR_STREAM, seed])
-    thinned = drive.take(slice(None, None, -(-len(drive) // max_scans)))
-    pairs = tuple(_draw(thinned, num_pairs, kind, rng) for kind in kinds)
-    settings = TrainingConfig(model=config, augment=UPRIGHT, num_variants=1, thins_as_in_use=True)
-    store = ScanStore([prepare_drive(thinned, settings)])
-    scans, placed = store.read(np.arange(len(thinned)), settings, rng)
-    return EvaluationPairs(scans, placed.T_world_scan, pairs, config.scale_m)
-
-
-def join_evaluation_pairs(parts: Sequence[EvaluationPairs]) -> EvaluationPairs:
-    """Joins the pairs of several drives, those of one kind together.
-
-    Args:
-        parts: at least one; pairs of one configuration.
-
-    Returns:
-        The pairs of all drives.
-    """
-    starts = np.cumsum([0, *(len(part.T_world_scan) for part in parts)])
-    found: dict[PairKind, list[Pairs]] = {}
-    for start, part in zip(starts, parts, strict=False):
-        for some in part.pairs:
-            found.setdefault(some.kind, []).append(Pairs(some.kind, some.sources + start, some.targets + start))
-    joined = tuple(
-        Pairs(kind, *(np.concatenate([getattr(one, side) for one in some]) for side in ("sources", "targets")))
-        for kind, some in found.items()
-    )
-    scans = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(part.scans for part in parts))
-    poses = np.concatenate([part.T_world_scan for part in parts])
-    return EvaluationPairs(scans, poses, joined, parts[0].scale_m)
-
-
-def pair_kinds(drive: LidarSequence, kinds: Sequence[PairKind]) -> tuple[PairKind, ...]:
-    """Finds the kinds of which a drive has pairs.
-
-    Args:
-        drive: scans with true poses.
-        kinds: kinds of pairs.
-
-    Returns:
-        Some of the kinds, in order.
-    """
-    distances = scan_distances(drive)
-    return tuple(
-        kind for kind in kinds if np.any((distances >= kind.min_distance_m) & (distances <= kind.max_distance_m))
+    scans, poses = list[PointCloud](), list[Pose]()
+    found: dict[PairKind, list[Pairs]] = {kind: [] for kind in kinds}
+    for drive in drives:
+        rng = np.random.default_rng([PAIR_STREAM, seed])
+        drawn = [_draw(drive, num_pairs, kind, rng) for kind in kinds]
+        if not any(len(some.sources) for some in drawn):
+            continue
+        for kind, sources, targets in drawn:
+            found[kind].append(Pairs(kind, sources + len(scans), targets + len(scans)))
+        for row, T in enumerate(true_poses(drive)):
+            points, T_turned = turn_scan(read_or_note(drive, row, {}), T, rng)
+            scans.append(thin_scan(points, config))
+            poses.append(T_turned)
+    joined = [
+        Pairs(kind, *map(np.concatenate, list(zip(*some, strict=True))[1:])) for kind, some in found.items() if some
+    ]
+    pairs = tuple(some for some in joined if len(some.sources))
+    return EvaluationPairs(
+        scans, [pyramid_of_cloud(scan, config) for scan in scans], np.reshape(poses, (-1, 4, 4)), pairs
     )
 
 
 def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
     distances = scan_distances(drive)
     pairs = draw_rows_apart(distances, kind.min_distance_m, kind.max_distance_m, num_pairs, rng)
-    if len(pairs) == 0:
-        raise ValueError(f"drive: expected scans {kind.min_distance_m} to {kind.max_distance_m} m apart, got none")
 
     def maps(rows: Int[np.ndarray, " p"]) -> Int[np.ndarray, "p s"]:
         is_near = (distances <= MAP_RADIUS_M) & ~np.eye(len(distances), dtype=bool)
         # A scan without neighbours is repeated.
         near = [np.flatnonzero(is_near[row]) if is_near[row].any() else np.array([row]) for row in rows]
         others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans - 1) for around in near]
-        return np.concatenate([rows[:, None], np.stack(others)], axis=1).astype(int)
+        return np.concatenate([rows[:, None], np.reshape(others, (len(rows), kind.num_scans - 1))], axis=1).astype(int)
 
     return Pairs(kind, maps(pairs[:, 0]), maps(pairs[:, 1]))
 
@@ -228,9 +171,9 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
         pairs: pairs from `draw_evaluation_pairs`.
 
     Returns:
-        Errors, registrations, offsets and descriptors.
+        Errors, registrations, descriptors, and the accuracy of offsets.
     """
-    clouds = _in_chunks(functools.partial(_encode_all, model), pairs.scans)
+    clouds = encode_pyramids(model, pairs.pyramids)
     matches, offsets, recalls = [], [], []
     for some in pairs.pairs:
         sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
@@ -239,7 +182,8 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
         matches.append(match)
         offsets.append(found)
         recalls.append(registration_recall(match.T_target_source, motions))
-    return Evaluation(tuple(recalls), tuple(matches), tuple(offsets), clouds)
+    r2 = offset_r2(offsets if model.config.decoder.predicts_offsets else [])
+    return Evaluation(tuple(recalls), tuple(matches), r2, clouds)
 
 
 def _in_chunks(function: Callable[..., Any], *trees: Any) -> Any:
@@ -247,15 +191,10 @@ def _in_chunks(function: Callable[..., Any], *trees: Any) -> Any:
     trees = jax.tree.map(np.asarray, trees)
     num = len(jax.tree.leaves(trees)[0])
     parts = []
-    for start in range(0, num, CHUNK):
-        rows = np.minimum(np.arange(start, start + CHUNK), num - 1)
+    for start in range(0, num, PAIRS_AT_ONCE):
+        rows = np.minimum(np.arange(start, start + PAIRS_AT_ONCE), num - 1)
         parts.append(jax.device_get(function(*jax.tree.map(operator.itemgetter(rows), trees))))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
-
-
-@jax.jit
-def _encode_all(model: Model, scans: SampleScans) -> DescriptorCloud:
-    return jax.lax.map(functools.partial(encode_sample, model), scans)
 
 
 @jax.jit
@@ -265,7 +204,7 @@ def _register_all(
     def best_motion(pair: tuple[DescriptorCloud, DescriptorCloud, Array]) -> tuple[Registration, WallOffsets]:
         source, target, T = pair
         hypotheses = trace_match(model, source.described, target.described, config=model.config.matching)
-        return jax.tree.map(lambda leaf: leaf[0], hypotheses), wall_offsets(model, source, target, T, TRAINED)
+        return jax.tree.map(lambda leaf: leaf[0], hypotheses), wall_offsets(model, source, target, T)
 
     return jax.lax.map(best_motion, (sources, targets, T_target_source))
 
@@ -276,8 +215,7 @@ def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: P
     merged = _in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
     unions = zip(merged.positions, merged.mask, strict=True)
     masks = [thinned_mask(positions, mask, clouds.mask.shape[1]) for positions, mask in unions]
-    thinned: DescriptorCloud = merged.replace(mask=np.stack(masks))
-    return thinned
+    return replace(merged, mask=np.stack(masks))
 
 
 @jax.jit

@@ -33,7 +33,7 @@ from dpmjax.deeppointmap.training.overlap_stage import (
     why_no_overlap,
     with_head,
 )
-from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, largest, place, together
+from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, place
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
 from dpmjax.sequences import LidarSequence
@@ -102,16 +102,15 @@ class StepRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class TrainingHooks:
-    """Functions that the loop calls. `evaluate` and `on_report` are called in process 0 only.
+    """Functions that the loop calls; of several processes, those of process 0 count.
 
     Attributes:
         evaluate: scores a model, larger is better; the model with the best score is kept.
         evaluate_every: number of steps from one evaluation to the next.
         on_report: gets the record and the progress after each step.
-        stop: called before each step; any number but 0 ends training in all processes.
+        stop: called before each step; any number but 0 ends training.
         steps_left: called before each step with the number of steps done; any number but 0 sets the end that many
-            steps ahead, at most at that of the curriculum, as `training.finish` does. Of several processes the largest
-            number counts.
+            steps ahead, at most at that of the curriculum, as `training.finish` does.
     """
 
     evaluate: Callable[[Model], float] | None = None
@@ -254,9 +253,8 @@ def _with_trained_head(
 ) -> Trained:
     """Does the second stage, in process 0."""
     state = init_overlap(first.model)
-    with together():
-        if is_first():
-            _, state = train_overlap(store, first.model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
+    if is_first():
+        _, state = train_overlap(store, first.model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
     state = from_first(state)
     is_whole = int(state.step) >= config.overlap.num_steps(len(store.table))
     model = _local(with_head(first.model, state.head, is_trained=is_whole))
@@ -271,16 +269,16 @@ def _run_steps(
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     speed, seen, stopped_by = Speed(), set[Layout](), 0
-    first_sample, num_in_step = jax.process_index() * num_local, jax.device_count()
+    numbers = jax.process_index() * num_local + np.arange(num_local)
     number, end = int(progress.state.step), int(progress.state.end)
-    with SampleMaker(
-        store, config, seed=seed, num_samples=num_local, first_sample=first_sample, num_in_step=num_in_step
-    ) as maker:
+    with SampleMaker(store, config, seed=seed, numbers=numbers, num_in_step=jax.device_count()) as maker:
         batches = maker.batches(number, max(end, config.num_steps))
-        with together():
-            batch = next(batches) if number < end else None
-        while batch is not None and not (stopped_by := largest(int(hooks.stop()))):
-            left = largest(0 if hooks.steps_left is None else hooks.steps_left(number))
+        batch = next(batches) if number < end else None
+        while batch is not None:
+            wanted = int(hooks.stop()), 0 if hooks.steps_left is None else hooks.steps_left(number)
+            stopped_by, left = map(int, from_first(wanted))
+            if stopped_by:
+                break
             if left > 0 and (new_end := min(number + left, max(end, config.num_steps))) != end:
                 progress, end = replace(progress, state=_ended_at(progress.state, new_end, mesh)), new_end
             stage, layout = config.stage_at(number), config.layout_at(number, seed=seed)
@@ -288,8 +286,7 @@ def _run_steps(
             begun = time.perf_counter()
             state, report = step(progress.state, place(batch, mesh, is_batch=True))
             number += 1
-            with together():  # the next batch is prepared while the device computes
-                batch = next(batches) if number < end else None
+            batch = next(batches) if number < end else None  # prepared while the device computes
             report = jax.device_get(report)
             seconds = time.perf_counter() - begun
             speed = _timed(speed, seconds, 0 if capacity not in seen else layout.num_scans * jax.device_count())
@@ -298,9 +295,8 @@ def _run_steps(
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, config, hooks)
-            with together():
-                if hooks.on_report is not None and is_first():
-                    hooks.on_report(StepRecord(number, stage, report, score, speed), progress)
+            if hooks.on_report is not None and is_first():
+                hooks.on_report(StepRecord(number, stage, report, score, speed), progress)
     return progress, stopped_by, speed
 
 
@@ -328,9 +324,8 @@ def _evaluate_when_due(
     if done % hooks.evaluate_every and done != int(progress.state.end):
         return progress, math.nan
     score = math.nan
-    with together():
-        if hooks.evaluate is not None and is_first():
-            score = hooks.evaluate(_local(Model(progress.state.params, config.model)))
+    if hooks.evaluate is not None and is_first():
+        score = hooks.evaluate(_local(Model(progress.state.params, config.model)))
     return after_evaluation(progress, float(from_first(np.asarray(score, np.float32)))), score
 
 

@@ -6,7 +6,7 @@ because the height alone can make the loss small.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -42,65 +42,30 @@ class WallOffsets(NamedTuple):
     mask: Bool[AnyArray, "*p"]
 
 
-class OffsetQuality(NamedTuple):
-    """Accuracy of predicted offsets along the normal of the wall, along the wall, and up.
-
-    Attributes:
-        r2: coefficient of determination: 1 less the mean squared residual over the variance of the true offsets; NaN
-            along an axis without variance.
-        rmse_m: root mean square residual, metres.
-        spread_m: standard deviation of the true offsets, metres: the residual of the best constant.
-        num_pairs: number of pairs of descriptors.
-    """
-
-    r2: Float[np.ndarray, " 3"]
-    rmse_m: Float[np.ndarray, " 3"]
-    spread_m: Float[np.ndarray, " 3"]
-    num_pairs: int
-
-
-def measure_offsets(parts: Sequence[WallOffsets]) -> OffsetQuality:
-    """Measures predicted offsets, all parts together.
+def offset_r2(parts: Sequence[WallOffsets]) -> Float[np.ndarray, " 3"]:
+    """Computes the coefficients of determination of predicted offsets, all parts together.
 
     Args:
         parts: offsets of any number of pairs of clouds.
 
     Returns:
-        The quality; NaN without a pair.
+        1 less the mean squared residual over the variance of the true offsets, along the normal of the wall, along the
+        wall, and up. NaN along an axis without variance, and without a pair.
     """
     pairs = [(np.asarray(part.predicted)[part.mask], np.asarray(part.true)[part.mask]) for part in parts]
-    num_pairs = sum(len(true) for _, true in pairs)
-    if num_pairs == 0:
-        nothing = np.full(3, np.nan)
-        return OffsetQuality(nothing, nothing, nothing, 0)
+    if not sum(len(true) for _, true in pairs):
+        return np.full(3, np.nan)
     predicted, true = (np.concatenate(some).astype(np.float64) for some in zip(*pairs, strict=True))
     squared, variance = np.mean((predicted - true) ** 2, axis=0), np.var(true, axis=0)
-    r2 = 1 - np.divide(squared, variance, out=np.full(3, np.nan), where=variance > 0)
-    return OffsetQuality(r2, np.sqrt(squared), np.sqrt(variance), num_pairs)
-
-
-def offset_quality(
-    model: Model,
-    pairs: Iterable[tuple[DescriptorCloud, DescriptorCloud, Float[AnyArray, "4 4"]]],
-    *,
-    config: ObjectiveConfig = TRAINED,
-) -> OffsetQuality:
-    """Compares predicted offsets with the true ones, over all close descriptors of which the first lies on a wall.
-
-    Args:
-        model: encoder and decoder.
-        pairs: source, target and true motion `T_target_source` of each pair of clouds.
-        config: radius and number of close pairs, as in training.
-
-    Returns:
-        The quality; NaN where no two descriptors are close.
-    """
-    parts = [_wall_offsets(model, source, target, jnp.asarray(T), config) for source, target, T in pairs]
-    return measure_offsets(jax.device_get(parts))
+    return np.asarray(1 - np.divide(squared, variance, out=np.full(3, np.nan), where=variance > 0))
 
 
 def wall_offsets(
-    model: Model, source: DescriptorCloud, target: DescriptorCloud, T_target_source: Array, config: ObjectiveConfig
+    model: Model,
+    source: DescriptorCloud,
+    target: DescriptorCloud,
+    T_target_source: Array,
+    config: ObjectiveConfig = TRAINED,
 ) -> WallOffsets:
     """Predicts the offsets of all close descriptors of which the first lies on an upright wall.
 
@@ -125,9 +90,6 @@ def wall_offsets(
     offsets = predict_offsets(model, correlated.features[:, None], others.features, directions, close.indices)
     predicted, true = (to_ray_frame(values, normals[:, None]) for values in (offsets, close.offsets))
     return WallOffsets(predicted, true, close.mask & is_wall[:, None])
-
-
-_wall_offsets = jax.jit(wall_offsets, static_argnames="config")
 
 
 def _walls(cloud: DescriptorCloud) -> tuple[Float[Array, "m 2"], Bool[Array, " m"]]:

@@ -33,6 +33,9 @@ from dpmjax.types import AnyArray, DescriptorCloud
 POOL_STREAM, PAIR_STREAM, ORDER_STREAM = 3107, 3108, 3109
 # Largest number of scans that the pairs of a pool are made of; 1,024 of `small` take 0.3 GB and some minutes.
 MAX_POOL_SCANS = 1024
+# Share of the pairs of a pool that are hard: half of one street that was seen twice, half that look alike. Without them
+# the head learns from easy pairs alone; with more it sees too few of the usual ones.
+HARD_SHARE = 0.25
 # Number of scans, and of pairs, in one call of a compiled program.
 SCANS_AT_ONCE, PAIRS_AT_ONCE = 16, 8
 
@@ -289,7 +292,7 @@ def _make_pool(store: ScanStore, model: Model, config: TrainingConfig, seed: int
     clouds = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(rows)], *parts)
     table = ScanTable(store.table.T_world_lidar[rows], store.table.scene[rows])
     vectors = np.stack([pooled_vector(jax.tree.map(lambda leaf, k=k: leaf[k], clouds)) for k in range(len(rows))])
-    hard = hard_pairs(table, vectors, round(settings.hard_share * settings.pool_pairs), rng)
+    hard = hard_pairs(table, vectors, round(HARD_SHARE * settings.pool_pairs), rng)
     pairs = np.concatenate([draw_overlap_pairs(table, settings.pool_pairs - len(hard), rng), hard])
     found = []
     for start in range(0, len(pairs), PAIRS_AT_ONCE):

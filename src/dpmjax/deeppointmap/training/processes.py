@@ -1,14 +1,8 @@
-"""Data-parallel training on all devices of one or several processes: sharding, and agreement between processes.
-
-With one process, the functions that compare processes return their input at once.
-"""
+"""Data-parallel training on all devices of one or several processes."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -18,16 +12,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 TreeT = TypeVar("TreeT")
 BATCH_AXIS = "batch"
 AUTO = "auto"
-# A process without a heartbeat for this long counts as dead, and all processes end.
-_HEARTBEAT_TIMEOUT_S = 300
-
-
-class OtherProcessError(RuntimeError):
-    """Another process failed; its own error message gives the reason."""
 
 
 def join_processes(coordinator: str | None, num_processes: int | None, process_id: int | None) -> None:
-    """Makes this process one of several; call it before JAX is used. Without any argument it does nothing.
+    """Makes this process one of several; call it before JAX is used. Without a coordinator it does nothing.
 
     Args:
         coordinator: HOST:PORT on which process 0 listens; or `auto`, for the scheduler that started the processes
@@ -42,18 +30,11 @@ def join_processes(coordinator: str | None, num_processes: int | None, process_i
         if num_processes is not None or process_id is not None:
             raise ValueError("coordinator: expected HOST:PORT with num_processes and process_id, got none")
         return
-    is_auto = coordinator == AUTO
-    if not is_auto and (num_processes is None or process_id is None):
-        raise ValueError(f"num_processes, process_id: expected both with coordinator {coordinator}")
-    if num_processes is not None and process_id is not None and not 0 <= process_id < num_processes:
-        raise ValueError(f"process_id: expected from 0 to {num_processes - 1}, got {process_id}")
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    address = None if is_auto else coordinator
     try:
-        jax.distributed.initialize(address, num_processes, process_id, heartbeat_timeout_seconds=_HEARTBEAT_TIMEOUT_S)
+        jax.distributed.initialize(None if coordinator == AUTO else coordinator, num_processes, process_id)
     except (RuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"coordinator {coordinator}: the processes do not find each other: {reason}") from error
+        raise ValueError(f"coordinator {coordinator}: {str(error).splitlines()[0]}") from error
 
 
 def device_mesh() -> Mesh:
@@ -82,24 +63,8 @@ def place(tree: TreeT, mesh: Mesh, *, is_batch: bool = False) -> TreeT:
 
 
 def is_first() -> bool:
-    """Returns True in the one process that writes, prints and shows progress.
-
-    Returns:
-        True in process 0; True with one process.
-    """
+    """Returns True in the one process that writes, prints and shows progress: process 0."""
     return jax.process_index() == 0
-
-
-def largest(number: int) -> int:
-    """Computes the maximum over all processes.
-
-    Args:
-        number: value of this process.
-
-    Returns:
-        The maximum.
-    """
-    return number if _is_alone() else int(np.max(multihost_utils.process_allgather(np.int32(number))))
 
 
 def from_first(tree: TreeT) -> TreeT:
@@ -109,52 +74,6 @@ def from_first(tree: TreeT) -> TreeT:
         tree: tree of the same structure, shapes and types in every process.
 
     Returns:
-        The tree of process 0.
+        The tree of process 0; with one process, its input at once.
     """
-    if _is_alone():
-        return tree
-    return multihost_utils.broadcast_one_to_all(jax.tree.map(np.asarray, tree))
-
-
-def merged(table: dict[str, Any]) -> dict[str, Any]:
-    """Merges the tables of all processes.
-
-    Args:
-        table: entries of this process; values that JSON can hold.
-
-    Returns:
-        The entries of all processes.
-    """
-    if _is_alone():
-        return table
-    written = np.frombuffer(json.dumps(table).encode(), np.uint8)
-    padded = np.zeros(largest(len(written)), np.uint8)
-    padded[: len(written)] = written
-    rows = np.asarray(multihost_utils.process_allgather(padded))
-    return {name: value for row in rows for name, value in json.loads(row.tobytes().rstrip(b"\0")).items()}
-
-
-@contextmanager
-def together() -> Iterator[None]:
-    """Runs a block that succeeds in all processes or fails in all; a process where it failed raises its own error.
-
-    Yields:
-        Nothing.
-
-    Raises:
-        OtherProcessError: if the block failed in another process.
-    """
-    failure: Exception | None = None
-    try:
-        yield
-    except Exception as error:
-        failure = error
-    any_failed = largest(int(failure is not None))
-    if failure is not None:
-        raise failure
-    if any_failed:
-        raise OtherProcessError("another process failed; its own message gives the reason")
-
-
-def _is_alone() -> bool:
-    return jax.process_count() == 1
+    return tree if jax.process_count() == 1 else multihost_utils.broadcast_one_to_all(jax.tree.map(np.asarray, tree))

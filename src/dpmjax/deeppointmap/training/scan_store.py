@@ -140,9 +140,8 @@ class SampleMaker:
         config: TrainingConfig,
         *,
         seed: int,
-        num_samples: int = 1,
-        first_sample: int = 0,
-        num_in_step: int | None = None,
+        numbers: Sequence[int] | Int[np.ndarray, " d"] = (0,),
+        num_in_step: int = 1,
     ) -> None:
         """Starts the thread.
 
@@ -150,13 +149,11 @@ class SampleMaker:
             store: the scans.
             config: settings of training.
             seed: seed of the run.
-            num_samples: number of samples of a batch, one for each device of this process.
-            first_sample: number of the first sample among the samples of all processes.
-            num_in_step: number of samples of all processes; None: this process is alone.
+            numbers: which of the samples of a step this process makes, one for each of its devices.
+            num_in_step: number of samples of a step, one for each device of all processes.
         """
         self._store, self._config, self._seed = store, config, seed
-        self._numbers = range(first_sample, first_sample + num_samples)
-        self._num_in_step = num_in_step or num_samples
+        self._numbers, self._num_in_step = [int(number) for number in numbers], num_in_step
         self._thread = ThreadPoolExecutor(1)
 
     def __enter__(self) -> SampleMaker:
