@@ -30,8 +30,8 @@ import jax
 import jaxtyping
 import pytest
 
-# Before the first import of the package, so that the functions of these rooms, kernels and network, are wrapped. Wrapping
-# all rooms takes twelve seconds of each worker. An integer is a float, as for mypy.
+# Before the first import of the package, so that the functions of these rooms (kernels and network) are wrapped: all
+# rooms would take twelve seconds of each worker. An integer is a float, as for mypy.
 CHECKED_ROOMS = ("checks", "deeppointmap", "geometry", "losses", "metrics", "nets", "pose_graph", "scans", "sequences")
 CHECKED_FILES = (
     *("deepmapping.objective", "deepmapping.localization_training"),

@@ -40,8 +40,8 @@ def trajectory_figure(
     """
     ends = np.zeros((0, 2, 3)) if loops is None else loops
     # Wider than the result, so that they are seen where all agree.
-    others: list[Layer] = [track._replace(width=4.0) for track in tracks[:-1]]
-    layers = [*others, *tracks[-1:], Edges(ends, LOOP, counted(len(ends), "loop"))]
+    others = [track._replace(width=4.0) for track in tracks[:-1]]
+    layers: list[Layer] = [*others, *tracks[-1:], Edges(ends, LOOP, counted(len(ends), "loop"))]
     return figure([Panel("", layers, reference)], title=title)
 
 
