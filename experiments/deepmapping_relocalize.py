@@ -67,7 +67,7 @@ def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
     truth = free_poses(grid, options)
     found = dm.relocalize(trained, scan_all(grid, truth, sequence))
     numbers = {"training_s": training_s, "relocalization_s": time.perf_counter() - begun}
-    numbers["ate_of_fit_px"] = cli.planar_errors(sequence, fitted.poses)["ate_px"]
+    numbers["ate_of_fit_px"] = metrics.planar_errors(sequence, fitted.poses)["ate_px"]
     distance, nearest = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
     turned = np.column_stack([truth[:, :2], sequence.reference_poses[nearest, 2]])
     network = fitted if can_localize_alone(fitted) else trained

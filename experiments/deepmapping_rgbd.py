@@ -29,7 +29,7 @@ import jax
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, io, simulation
+from dpmjax import cli, io, metrics, simulation
 from dpmjax import deepmapping as dm
 from dpmjax import registration_rgbd as rgbd
 from experiments._baselines import multiway_images
@@ -117,7 +117,7 @@ def read_walk(options: RgbdOptions, walk: int) -> io.DepthSequence:
 
 def errors_of(T: np.ndarray, sequence: io.DepthSequence) -> cli.Row:
     """Returns the errors of (n, 4, 4) T_world_camera in metres and degrees, and whether they are small enough."""
-    errors = cli.depth_errors(sequence, T)
+    errors = metrics.depth_errors(sequence, T)
     spread_m = float(np.sqrt(np.var(sequence.T_world_camera[:, :3, 3], axis=0).sum()))
     is_right = errors["ate_m"] < RIGHT_SHARE * spread_m and errors["largest_turn_error_deg"] < RIGHT_DEG
     is_right = is_right and errors["point_distance_m"] < RIGHT_M

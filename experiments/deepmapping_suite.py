@@ -108,7 +108,7 @@ def run_method(name: str, task: Task) -> cli.Row:
     if len(candidates) > 1:
         kept, _ = registration2d.choose_trajectory(task.planar, candidates)
     seconds = {"seconds": time.perf_counter() - begun, "cpu_s": time.process_time() - begun_cpu}
-    errors = {other: cli.planar_errors(task.sequence, poses) for other, poses in candidates.items()}
+    errors = {other: metrics.planar_errors(task.sequence, poses) for other, poses in candidates.items()}
     least = min(numbers["ate_px"] for numbers in errors.values())
     success = errors[kept]["ate_px"] < SUCCESS_PX
     is_trusted = registration2d.assess_trajectory(task.planar, candidates[kept]).is_trusted

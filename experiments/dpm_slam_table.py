@@ -171,7 +171,7 @@ def map_by_setting(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods
         return None
     files = [save_map(run / f"map_{one}.npz", result.map, one) for one in PRECISIONS] if len(result.map) else []
     map_mb, map_int8_mb = [path.stat().st_size / 1e6 for path in files] or (None, None)
-    before = cli.trajectory_errors(result.T_odometry_scan, drive.T_world_lidar)
+    before = metrics.trajectory_errors(result.T_odometry_scan, drive.T_world_lidar)
     return measure_trajectory(run, drive, result.T_world_scan, found_loops(result.loops, result.keyframes)) | {
         "ate_before_loops_m": before.get("ate_m"),
         "num_keyframes": len(result.keyframes),
@@ -200,7 +200,7 @@ def map_by_agents(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods)
     row: cli.Row = {"num_scans": len(T_world_scan), "num_loops": len(loops), "num_keyframes": len(scans)}
     if drive.T_world_lidar is not None:
         reference = np.concatenate([part.T_world_lidar for part in parts])
-        errors = cli.trajectory_errors(T_world_scan, reference) if num_maps == 1 else {}
+        errors = metrics.trajectory_errors(T_world_scan, reference) if num_maps == 1 else {}
         row |= {"ate_m": errors.get("ate_m"), "num_wrong_loops": int((~are_right(loops, reference)).sum())}
     sent_mb = sum(traffic.keyframe_bytes for traffic in found.traffic) / 1e6
     return row | {"num_maps": num_maps, "sent_mb": sent_mb, **mean_seconds(scan_s)}
@@ -273,7 +273,7 @@ def measure_trajectory(run: cli.Run, drive: LidarSequence, T_world_scan: np.ndar
     newer = np.reshape([loop.newer for loop in loops], (-1, 2)).astype(int)
     revisits = metrics.find_revisits(reference, distance_m=distance_m, min_path_m=min_path_m)
     recall = metrics.loop_recall(reference, newer[is_right], revisits, reach_m=reach_m)
-    errors = cli.trajectory_errors(T_world_scan, reference)
+    errors = metrics.trajectory_errors(T_world_scan, reference)
     return row | {
         "path_m": float(metrics.path_lengths(reference)[-1]),
         "ate_m": errors.get("ate_m"),

@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from dpmjax.cli import depth_errors
 from dpmjax.cli.depth import DepthOptions, read_images
 from dpmjax.geometry import rigid
+from dpmjax.metrics import depth_errors
 from dpmjax.sequences import DepthSequence, InputError
 
 

@@ -9,7 +9,6 @@ from .calibrate import measure_drives as measure_drives
 from .calibrate import measure_overlap as measure_overlap
 from .calibrate import measure_pair as measure_pair
 from .calibrate import rate_pair as rate_pair
-from .depth import depth_errors as depth_errors
 from .drives import DriveOptions as DriveOptions
 from .drives import ScanReader as ScanReader
 from .drives import Source as Source
@@ -34,7 +33,6 @@ from .machine import require_importable as require_importable
 from .machine import select_device as select_device
 from .machine import why_not_importable as why_not_importable
 from .map2d_results import named_initial as named_initial
-from .map2d_results import planar_errors as planar_errors
 from .map2d_results import spans_of as spans_of
 from .program import end_process as end_process
 from .program import main as main
@@ -73,7 +71,6 @@ from .slam_files import write_map_file as write_map_file
 from .slam_files import write_scans as write_scans
 from .slam_files import write_trajectory as write_trajectory
 from .slam_numbers import localization_errors as localization_errors
-from .slam_numbers import trajectory_errors as trajectory_errors
 from .slam_run import SlamRun as SlamRun
 from .slam_run import map_drive as map_drive
 from .table import Row as Row

@@ -22,9 +22,9 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deepmapping, geometry, io, metrics, registration_rgbd, simulation, viz
+from dpmjax import cli, deepmapping, io, metrics, registration_rgbd, simulation, viz
 from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
-from dpmjax.sequences import DepthSequence, FloatArray
+from dpmjax.sequences import DepthSequence
 
 _NUM_SIMULATED = 8
 # Names of the sets of poses, in the order of the picture.
@@ -87,7 +87,7 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> Num
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
-    before, after = (depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
+    before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     consistency = 1 - (found.misfit if found.kept == "fit" else found.start_misfit)
     verdict = f"kept: {METHODS[found.kept]}; the images agree to {consistency:.0%}"
     if after:
@@ -104,43 +104,12 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> Num
     }
 
 
-def depth_errors(sequence: DepthSequence, T_world_camera: FloatArray) -> dict[str, float]:
-    """Computes ATE, mean distance of map points, and the largest error of a turn between neighbours.
-
-    Args:
-        sequence: the images; their reference may be missing.
-        T_world_camera: (n, 4, 4) poses, metres.
-
-    Returns:
-        The numbers by name; empty without a reference.
-    """
-    from scipy.spatial.transform import Rotation
-
-    reference = sequence.T_world_camera
-    if reference is None:
-        return {}
-    count = len(sequence)
-    points, mask = sequence.points.reshape(count, -1, 3), sequence.mask.reshape(count, -1)
-    lever = _LEVER * geometry.typical_range(points, mask)
-    T_reference_world = np.asarray(metrics.align_poses(T_world_camera, reference, lever=lever))
-    aligned = T_reference_world @ T_world_camera
-    off = np.einsum("nij,nbj->nbi", aligned[:, :3, :3] - reference[:, :3, :3], points)
-    off += aligned[:, None, :3, 3] - reference[:, None, :3, 3]
-    turns = [Rotation.from_matrix(T[:, :3, :3]) for T in (T_world_camera, reference)]
-    steps = [turn[:-1].inv() * turn[1:] for turn in turns]
-    return {
-        "ate_m": float(metrics.absolute_trajectory_error(T_world_camera[:, :3, 3], reference[:, :3, 3])),
-        "point_distance_m": float(np.linalg.norm(off, axis=-1)[mask].mean()),
-        "largest_turn_error_deg": float(np.degrees((steps[1].inv() * steps[0]).magnitude().max())),
-    }
-
-
 def draw(run: Run, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
     assert found.start is not None
     panels = []
     for name, T_world_camera in {"start": found.start, "fit": found.fitted.T_world_scan}.items():
-        errors = depth_errors(sequence, T_world_camera)
+        errors = metrics.depth_errors(sequence, T_world_camera)
         ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
         panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))
     if sequence.T_world_camera is not None:

@@ -28,7 +28,7 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deepmapping, geometry, io, registration2d, simulation
+from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation
 from dpmjax.cli import map2d_results as results
 from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
 from dpmjax.sequences import FloatArray, ScanSequence
@@ -163,7 +163,7 @@ def map_numbers(
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
-            title(name): results.planar_errors(registered, candidate.poses) | candidate.score._asdict()
+            title(name): metrics.planar_errors(registered, candidate.poses) | candidate.score._asdict()
             for name, candidate in result.candidates.items()
         },
         "assessment": result.assessment._asdict(),
@@ -193,7 +193,7 @@ def measures_of(options: Map2dOptions, sequence: ScanSequence) -> Measure:
 
     def measure(poses: FloatArray) -> dict[str, float]:
         by_relations = {} if relations is None else results.relation_numbers(times, poses, relations)
-        return by_relations | ({} if corrected is None else results.corrected_numbers(times, poses, corrected))
+        return by_relations | ({} if corrected is None else metrics.corrected_errors(times, poses, corrected))
 
     # Files of another drive are refused before any long work.
     measure(np.zeros((len(sequence), 3)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dpmjax import deepmapping, geometry, metrics, registration2d, viz
+from dpmjax import deepmapping, metrics, registration2d, viz
 from dpmjax.cli.run import Run
 from dpmjax.sequences import FloatArray, Relations, ScanSequence
 
@@ -20,30 +20,6 @@ UNITS = ("m", "deg")
 _NUM_SPANS = 8
 # Least number of common scans of a recording and its corrected log.
 _MIN_COMMON = 10
-
-
-def planar_errors(sequence: ScanSequence, poses: FloatArray) -> dict[str, float]:
-    """Computes ATE, the largest error of a scan after the same alignment, and point distance, in the unit of the scans.
-
-    Args:
-        sequence: the scans.
-        poses: (n, 3) T_world_scan.
-
-    Returns:
-        The numbers by name; empty without a reference.
-    """
-    reference = sequence.reference_poses
-    if reference is None:
-        return {}
-    matrices = geometry.se2.to_matrix(poses), geometry.se2.to_matrix(reference)
-    distance = metrics.point_distance(sequence.points, sequence.mask, *matrices)
-    T_reference_world = np.asarray(metrics.align_rigid(poses[:, :2], reference[:, :2]))
-    off = poses[:, :2] @ T_reference_world[:2, :2].T + T_reference_world[:2, 2] - reference[:, :2]
-    return {
-        f"ate_{sequence.unit}": float(metrics.absolute_trajectory_error(poses[:, :2], reference[:, :2])),
-        f"worst_scan_{sequence.unit}": float(np.hypot(*off.T).max()),
-        f"point_distance_{sequence.unit}": float(distance),
-    }
 
 
 def ate_of(sequence: ScanSequence, unit: float) -> Callable[[FloatArray], float]:
@@ -59,7 +35,7 @@ def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArra
     reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {"success": None}
-    after, before = planar_errors(sequence, poses), planar_errors(sequence, start)
+    after, before = metrics.planar_errors(sequence, poses), metrics.planar_errors(sequence, start)
     # The paper's threshold is 20 pixels, 2 % of its world. The threshold of a real place is 2 % of the span of its
     # trajectory.
     threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
@@ -84,41 +60,6 @@ def relation_numbers(times: FloatArray, poses: FloatArray, relations: Relations)
         "relations_m": float(found.translation_m.mean()),
         "relations_deg": float(found.rotation_deg.mean()),
         "num_relations": int(found.is_used.sum()),
-    }
-
-
-def corrected_numbers(times: FloatArray, poses: FloatArray, corrected: ScanSequence) -> dict[str, float]:
-    """Computes the ATE at the common scans of a corrected log of the same drive, and errors of its relations.
-
-    The relations are the relative poses of successive scans of the corrected log.
-
-    Args:
-        times: of all scans.
-        poses: of all scans.
-        corrected: the corrected log.
-
-    Returns:
-        The numbers by name.
-
-    Raises:
-        ValueError: the corrected log has no poses with times, or few scans of the same times.
-    """
-    if corrected.reference_poses is None or corrected.times is None:
-        raise ValueError(f"{corrected.name}: has no corrected poses with times")
-    _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)
-    if len(mine) < _MIN_COMMON:
-        raise ValueError(
-            f"{corrected.name}: {len(mine)} scans have the time of a scan of the recording, not {_MIN_COMMON}"
-        )
-    reference, at = corrected.reference_poses[theirs], times[mine]
-    steps = metrics.relation_errors(
-        Relations(at[:-1], at[1:], geometry.se2.relative(reference[:-1], reference[1:])), at, poses[mine]
-    )
-    return {
-        "ate_corrected_m": float(metrics.absolute_trajectory_error(poses[mine, :2], reference[:, :2])),
-        "relations_corrected_m": float(steps.translation_m.mean()),
-        "relations_corrected_deg": float(steps.rotation_deg.mean()),
-        "num_corrected": len(mine),
     }
 
 

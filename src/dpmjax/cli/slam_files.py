@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
 from dpmjax.cli.run import write_poses, write_table
-from dpmjax.cli.slam_numbers import count_parts, distances_to_reference
+from dpmjax.cli.slam_numbers import count_parts
 from dpmjax.sequences import LidarSequence, counted
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
@@ -198,7 +198,7 @@ def draw_pictures(
 
 
 def _track(name: str, color: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> viz.Track:
-    errors = distances_to_reference(T_world_scan, reference)
+    errors = metrics.distances_to_reference(T_world_scan, reference)
     label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.3f} m"
     return viz.Track(T_world_scan[:, :3, 3], color, label)
 

@@ -78,55 +78,6 @@ UNSURE = {
 """Texts for scans that were not aligned with the scans before them, by status."""
 
 
-def trajectory_errors(T_world_scan: np.ndarray, reference: np.ndarray | None, suffix: str = "") -> Numbers:
-    """Returns ATE, RPE and KITTI's errors of a trajectory, at scans with a reference pose; none without two of them."""
-    if reference is None:
-        return {}
-    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
-    T_world_scan, reference = T_world_scan[has_reference], reference[has_reference]
-    if len(T_world_scan) < 2:
-        return {}
-    relative = metrics.relative_pose_error(T_world_scan, reference)
-    segments = metrics.segment_error(T_world_scan, reference)
-    return {
-        f"ate{suffix}_m": metrics.absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3]),
-        f"rpe{suffix}_m": relative.translation_rmse,
-        f"rpe{suffix}_deg": math.degrees(relative.rotation_rmse),
-        f"t_rel{suffix}_percent": segments.translation_percent,
-        f"r_rel{suffix}_deg_per_100m": segments.rotation_deg_per_100m,
-    }
-
-
-def reference_doubt(T_world_scan: np.ndarray, sequence: LidarSequence) -> str | None:
-    """Returns a doubt where the reference seems to be in another unit, or of inverted poses; None without a doubt."""
-    if sequence.T_world_lidar is None:
-        return None
-    T, reference = T_world_scan[sequence.has_reference], sequence.T_world_lidar[sequence.has_reference]
-    way_m, reference_m = (metrics.path_lengths(poses).max(initial=0.0) for poses in (T, reference))
-    if min(way_m, reference_m) < MIN_WAY_M:
-        return None
-    if not 1 / MAX_LENGTH_RATIO < reference_m / way_m < MAX_LENGTH_RATIO:
-        return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
-    references = reference, geometry.rigid.inverse(reference)
-    given, inverted = (metrics.relative_pose_error(T, poses).translation_rmse for poses in references)
-    if inverted < INVERTED_SHARE * given:
-        errors = f"RPE {given:.3g} m; with each pose inverted it would be {inverted:.3g} m"
-        return f"{errors}: does the reference map the world to the lidar, not the lidar to the world?"
-    return None
-
-
-def distances_to_reference(T_world_scan: np.ndarray, reference: np.ndarray | None) -> np.ndarray | None:
-    """Returns the distance of each scan to the reference after the best rigid alignment; NaN for scans without one."""
-    if reference is None:
-        return None
-    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
-    if not has_reference.any():
-        return None
-    T = metrics.align_rigid(T_world_scan[has_reference, :3, 3], reference[has_reference, :3, 3])
-    moved = T_world_scan[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
-    return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))
-
-
 def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
     """Returns the numbers of a map for `metrics.json`; the sequence has the scans that were placed."""
     T, reference = result.T_world_scan, sequence.T_world_lidar
@@ -135,13 +86,13 @@ def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
         "sequence": sequence.name,
         "num_scans": len(T),
         "path_m": float(metrics.path_lengths(T).max(initial=0.0)),
-        "reference_doubt": reference_doubt(T, sequence),
+        "reference_doubt": metrics.reference_doubt(T, sequence),
         "num_keyframes": len(result.keyframes),
         "num_new_keyframes": sum(report.is_keyframe for report in result.reports),
         "num_parts": count_parts(result.map),
         "num_loops": loops["accepted"],
-        **trajectory_errors(T, reference),
-        **trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
+        **metrics.trajectory_errors(T, reference),
+        **metrics.trajectory_errors(result.T_odometry_scan, reference, "_odometry"),
         "scan_statuses": dict(collections.Counter(report.status for report in result.reports)),
         "num_unknown_along": sum(report.is_unknown_along for report in result.reports),
         "loop_statuses": dict(loops),

@@ -15,6 +15,12 @@ from .poses import align_rigid as align_rigid
 from .poses import point_distance as point_distance
 from .poses import registration_recall as registration_recall
 from .poses import relative_pose_error as relative_pose_error
+from .sequences import corrected_errors as corrected_errors
+from .sequences import depth_errors as depth_errors
+from .sequences import distances_to_reference as distances_to_reference
+from .sequences import planar_errors as planar_errors
+from .sequences import reference_doubt as reference_doubt
+from .sequences import trajectory_errors as trajectory_errors
 from .statistics import Proportion as Proportion
 from .statistics import area_under_curve as area_under_curve
 from .statistics import brier_score as brier_score
