@@ -127,8 +127,8 @@ def trajectory_errors(T_world_scan: FloatArray, reference: FloatArray | None, su
     relative = relative_pose_error(T_world_scan, reference)
     segments = segment_error(T_world_scan, reference)
     return {
-        f"ate{suffix}_m": absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3]),
-        f"rpe{suffix}_m": relative.translation_rmse,
+        f"ate{suffix}_m": float(absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3])),
+        f"rpe{suffix}_m": float(relative.translation_rmse),
         f"rpe{suffix}_deg": math.degrees(relative.rotation_rmse),
         f"t_rel{suffix}_percent": segments.translation_percent,
         f"r_rel{suffix}_deg_per_100m": segments.rotation_deg_per_100m,
