@@ -227,17 +227,19 @@ def test_learned_folders_carry_poses_in_the_scans(tmp_path, clouds, poses):
     assert_same(open_lidar_sequence(tmp_path), clouds, poses)
 
 
-def _save_npz(path, points):
-    np.savez(path, points=points)
+FORMATS = {
+    ".bin": write_bin,
+    ".npy": np.save,
+    ".npz": lambda path, points: np.savez(path, points=points),
+    ".pcd": write_pcd,
+    ".ply": write_ply,
+}
 
 
-@pytest.mark.parametrize(
-    ("suffix", "write"),
-    [(".bin", write_bin), (".npy", np.save), (".npz", _save_npz), (".pcd", write_pcd), (".ply", write_ply)],
-)
-def test_plain_folders_in_natural_order(tmp_path, clouds, poses, suffix, write):
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_plain_folders_in_natural_order(tmp_path, clouds, poses, suffix):
     for index, cloud in enumerate(clouds):
-        write(tmp_path / f"scan_{index}{suffix}", cloud)
+        FORMATS[suffix](tmp_path / f"scan_{index}{suffix}", cloud)
     (tmp_path / "notes.md").write_text("hello")
     assert_same(open_lidar_sequence(tmp_path), clouds, None)
     (tmp_path / "poses.txt").write_text(rows(poses))
@@ -323,14 +325,11 @@ def test_other_columns_can_be_said(tmp_path, clouds):
     np.testing.assert_allclose(read_lidar_file(tmp_path / "0.bin", bin_columns=5), clouds[0][:15])
 
 
-@pytest.mark.parametrize(
-    ("suffix", "write"),
-    [(".bin", write_bin), (".npy", np.save), (".npz", _save_npz), (".pcd", write_pcd), (".ply", write_ply)],
-)
-def test_points_that_are_not_finite_are_left_out_of_every_format(tmp_path, clouds, suffix, write):
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_points_that_are_not_finite_are_left_out_of_every_format(tmp_path, clouds, suffix):
     holes = clouds[0].copy()
     holes[2], holes[5, 1], holes[7, 2] = np.nan, np.inf, -np.inf
-    write(tmp_path / f"0{suffix}", holes)
+    FORMATS[suffix](tmp_path / f"0{suffix}", holes)
     expected = np.delete(clouds[0], [2, 5, 7], axis=0)
     np.testing.assert_allclose(read_lidar_file(tmp_path / f"0{suffix}"), expected, rtol=1e-6)
 
@@ -404,11 +403,6 @@ def test_real_drives_are_opened(real_data, name):
     points = sequence.read_scan(len(sequence) - 1)
     assert points.dtype == np.float32
     assert len(points) > 3000
-
-
-def test_the_real_truncated_scan_is_named(real_data):
-    with pytest.raises(InputError, match=r"truncated\.bin.*truncated"):
-        read_lidar_file(real_data / "bad_input" / "truncated.bin")
 
 
 def test_a_damaged_npz_is_named(tmp_path, clouds, poses):

@@ -11,19 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import log_notes, natural_key
-from dpmjax.io.lidar_datasets import find_pose_file, is_drive, read_drive
-from dpmjax.io.lidar_file import check_size, columns_of_drive, read_point_times, read_timed_cloud, unit_note
+from dpmjax.io.lidar_datasets import DRIVES, find_pose_file, is_drive, open_drive
+from dpmjax.io.lidar_file import check_size, columns_of_drive, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, order_note
 from dpmjax.io.scan_bags import is_bag, open_lidar_bag
-from dpmjax.io.scan_names import folder_note
 from dpmjax.sequences import InputError, LidarSequence, Note, require
 
-_FORMATS = (
-    "a KITTI sequence (velodyne/, calib.txt), a KITTI raw or KITTI-360 drive (velodyne_points/data), a MulRan folder "
-    "(Ouster/), a KITTI-CARLA town (generated/frames), a folder of .bin .npy .npz .pcd .ply .las .laz scans, or a bag "
-    "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
-)
 _CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
 
 
@@ -60,7 +54,7 @@ def open_lidar_sequence(
     require(is_good, path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
     is_recording = is_bag(path) and not is_drive(path)
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
-    whole = _open_bag(path, topic, poses) if is_recording else _open_folder(_choose(path, sequence), poses, bin_columns)
+    whole = _open_bag(path, topic, poses) if is_recording else open_drive(_choose(path, sequence), poses, bin_columns)
     of_poses = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
     of_times = None if whole.times is None else order_note(whole.times, path)
     notes = (*whole.notes, *(note for note in (of_poses, of_times) if note is not None))
@@ -81,18 +75,6 @@ def _with_unit_doubt(sequence: LidarSequence) -> Callable[[int], NDArray[np.floa
         return points
 
     return read
-
-
-def _open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
-    """Opens one drive in files."""
-    drive = read_drive(path, poses)
-    files = drive.files
-    require(len(files) > 0, path, "a folder without scans", f"give {_FORMATS}")
-    columns, note = columns_of_drive(files, bin_columns)
-    notes = tuple(each for each in (folder_note(files[0].parent), *drive.notes, note) if each is not None)
-    sources, T, times = tuple(map(str, files)), drive.T_world_lidar, drive.times
-    read_scan, read_times = lambda i: read_timed_cloud(files[i], columns).points, lambda i: read_point_times(files[i])
-    return LidarSequence(drive.name, sources, read_scan, T, times, read_times, notes)
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
@@ -156,7 +138,7 @@ def _choose(path: Path, sequence: str | None) -> Path:
         found = f"no sequence {sequence}, it has {known or 'none'}"
         require(sequence in drives, path, found, "name one of those, or leave the name out")
         return drives[sequence]
-    require(len(drives) > 0, path, "a folder without scans", f"give {_FORMATS}")
+    require(len(drives) > 0, path, "a folder without scans", f"give {DRIVES}")
     require(len(drives) == 1, path, f"{len(drives)} sequences: {known}", "name one of them, or give its folder")
     return next(iter(drives.values()))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,11 +13,17 @@ import numpy as np
 
 from dpmjax.geometry import rigid
 from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
+from dpmjax.io.lidar_file import columns_of_drive, read_point_times, read_timed_cloud
 from dpmjax.io.poses import StampedPoses, check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, match_rows, matching_note, scan_times
-from dpmjax.io.scan_names import POSE_FILES, last_numbers, scan_files
-from dpmjax.sequences import FloatArray, InputError, Note, homogeneous, require
+from dpmjax.io.scan_names import POSE_FILES, folder_note, last_numbers, scan_files
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, homogeneous, require
 
+DRIVES = (
+    "a KITTI sequence (velodyne/, calib.txt), a KITTI raw or KITTI-360 drive (velodyne_points/data), a MulRan folder "
+    "(Ouster/), a KITTI-CARLA town (generated/frames), a folder of .bin .npy .npz .pcd .ply .las .laz scans, or a bag "
+    "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
+)
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
 _EARTH_RADIUS_M = 6378137.0
 # MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
@@ -26,19 +33,15 @@ _MULRAN_SLACK_S = 0.5
 _DATE = r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?"
 
 
-class Drive3D(NamedTuple):
-    """The files of a drive, one a scan in order, with poses and times where there are any.
+class SideData(NamedTuple):
+    """Poses and times of the scans of a drive, where there are any.
 
     Attributes:
-        name: name for titles.
-        files: the scans.
         T_world_lidar: (n, 4, 4), NaN for scans without a pose; or None.
         times: (n,) s, or None.
         notes: decisions about the files, and doubts.
     """
 
-    name: str
-    files: list[Path]
     T_world_lidar: FloatArray | None = None
     times: FloatArray | None = None
     notes: tuple[Note, ...] = ()
@@ -50,60 +53,56 @@ def find_pose_file(*homes: Path) -> Path | None:
 
 
 def read_plain_drive(
-    folder: Path, drive: Drive3D, poses: Path | None = None, in_camera: Sequence[Path] = ()
-) -> Drive3D:
-    """Adds the poses of a pose file, and times.txt, beside or above the scans.
+    folder: Path, files: list[Path], poses: Path | None = None, in_camera: Sequence[Path] = ()
+) -> SideData:
+    """Reads a pose file, and times.txt, beside or above the scans.
 
     Args:
         folder: folder of the drive; its scans may lie in a folder of it.
-        drive: name and scans.
+        files: the scans.
         poses: the pose file; None looks for the usual names in the folders. Poses that move as those of a camera come
             into the lidar's frame where a calib.txt with `Tr` lies beside.
         in_camera: KITTI's places of poses of its left camera, after poses_lidar.txt. They need `Tr` in calib.txt, and
             rows without times are matched by the numbers of the scans.
 
     Returns:
-        The drive.
+        Poses and times.
 
     Raises:
         InputError: broken files, or poses that match the scans neither by time nor by number.
     """
-    scans = drive.files[0].parent
+    scans = files[0].parent
     is_below = scans.name in ("data", "scans", "lidar", "velodyne")
     homes = [scans, scans.resolve().parent] if is_below else [scans]
     in_lidar = [home / "poses_lidar.txt" for home in homes]
     path = poses or next((file for file in (*in_lidar, *in_camera) if file.is_file()), find_pose_file(*homes))
-    times, notes = scan_times(homes, drive.files)
-    drive = drive._replace(times=times, notes=notes)
+    times, notes = scan_times(homes, files)
     if path is None:
-        return drive
+        return SideData(None, times, notes)
     found = read_stamped_poses(path)
     if path in in_camera:
         found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
     try:
         if in_camera and found.stamps is None:
-            found = found._replace(poses=match_rows(found.poses, drive.files, path))
-        T, pose_notes = match_reference(found, times, len(drive.files), path)
+            found = found._replace(poses=match_rows(found.poses, files, path))
+        T, pose_notes = match_reference(found, times, len(files), path)
     except InputError:
         log_notes(notes)  # times.txt may be the reason
         raise
     calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
     if calibration is not None and path not in in_camera and camera_note(T, path) is not None:
         T = _from_camera(T, calibration)
-    return drive._replace(T_world_lidar=T, notes=(*notes, *pose_notes))
+    return SideData(T, times, (*notes, *pose_notes))
 
 
-def _read_learned(folder: Path, drive: Drive3D) -> Drive3D:
-    """Adds the poses in N.npz: lidar_pcd, ego_rotation, ego_translation (DeepPointMap's published data).
+def _read_learned(folder: Path, files: list[Path]) -> SideData:
+    """Reads the poses in N.npz: lidar_pcd, ego_rotation, ego_translation (DeepPointMap's published data).
 
     Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
-
-    Returns:
-        The drive.
     """
     keys = ("ego_rotation", "ego_translation")
     poses: list[FloatArray | None] = []
-    for file in drive.files:
+    for file in files:
         try:
             table = load_arrays(file, keys)
         except InputError:  # The scan is damaged, too, and a warning names it when it is read.
@@ -111,39 +110,34 @@ def _read_learned(folder: Path, drive: Drive3D) -> Drive3D:
             continue
         parts = [table.get(key, np.zeros(0)) for key in keys]
         if [part.size for part in parts] != [9, 3] or any(part.dtype.kind not in "fiu" for part in parts):
-            return read_plain_drive(folder, drive)
+            return read_plain_drive(folder, files)
         poses.append(homogeneous(*(part.astype(np.float64).reshape(3, -1).squeeze() for part in parts)))
-    known = next((pose for pose in poses if pose is not None), np.full((4, 4), np.nan))
-    if np.isnan(known).all():
-        return drive
-    stacked = np.stack([known if pose is None else pose for pose in poses])
-    return drive._replace(T_world_lidar=check_poses(stacked, folder))
+    known = next((pose for pose in poses if pose is not None), None)
+    if known is None:
+        return SideData()
+    return SideData(check_poses(np.stack([known if pose is None else pose for pose in poses]), folder))
 
 
-def _read_kitti(folder: Path, drive: Drive3D) -> Drive3D:
-    """Adds poses and times of KITTI odometry.
+def _read_kitti(folder: Path, files: list[Path]) -> SideData:
+    """Reads poses and times of KITTI odometry.
 
     Poses of the left camera are searched in poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders
     up: of the folder as it was given, because it may be a link, and the poses lie beside the link.
-
-    Returns:
-        The drive.
     """
     given = Path(os.path.abspath(folder))
     above = given.parent.parent / "poses" / f"{given.name}.txt"
-    return read_plain_drive(folder, drive, in_camera=(folder / "poses.txt", above))
+    return read_plain_drive(folder, files, in_camera=(folder / "poses.txt", above))
 
 
-def _read_kitti_raw(folder: Path, drive: Drive3D) -> Drive3D:
-    """Adds poses and times of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
-    drive = drive._replace(times=_read_dates(folder / "velodyne_points" / "timestamps.txt", drive.files))
-    given = Path(os.path.abspath(folder))
+def _read_kitti_raw(folder: Path, files: list[Path]) -> SideData:
+    """Reads poses and times of KITTI raw, or of KITTI-360 below data_3d_raw/; the world is the first lidar frame."""
+    times = _read_dates(folder / "velodyne_points" / "timestamps.txt", files)
+    given, home = Path(os.path.abspath(folder)), folder / "oxts" / "data"
     if given.parent.name == "data_3d_raw":
-        return _with_kitti_360_poses(given.parent.parent, drive)
-    home = folder / "oxts" / "data"
+        return _read_kitti_360(given, files, times)
     records = sorted(home.glob("*.txt"), key=lambda record: natural_key(record.name))
     if not records:
-        return drive
+        return SideData(None, times)
     day = next((up for up in (folder, folder.resolve().parent) if (up / "calib_imu_to_velo.txt").is_file()), folder)
     advice = "put the calibration of the day (calib_imu_to_velo.txt) into the folder above"
     path = day / "calib_imu_to_velo.txt"
@@ -151,85 +145,74 @@ def _read_kitti_raw(folder: Path, drive: Drive3D) -> Drive3D:
     T_lidar_imu = check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), path)[0]
     T_world_imu = _poses_from_oxts(np.vstack([_first_row(record, 6) for record in records]), home)
     # A drive may lack scans that have a record: poses are matched by number.
-    poses = match_rows(T_world_imu @ rigid.inverse(T_lidar_imu), drive.files, home)
-    return drive._replace(T_world_lidar=rigid.inverse(poses[0]) @ poses)
+    poses = match_rows(T_world_imu @ rigid.inverse(T_lidar_imu), files, home)
+    return SideData(rigid.inverse(poses[0]) @ poses, times)
 
 
-def _with_kitti_360_poses(root: Path, drive: Drive3D) -> Drive3D:
-    """Adds the poses of KITTI-360: data_poses/DRIVE/poses.txt and calibration/ beside data_3d_raw/.
+def _read_kitti_360(folder: Path, files: list[Path], times: FloatArray | None) -> SideData:
+    """Reads the poses of KITTI-360: data_poses/DRIVE/poses.txt and calibration/ beside data_3d_raw/.
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
     after the last pose have no reference.
-
-    Returns:
-        The drive.
     """
-    path, calibration = root / "data_poses" / drive.name / "poses.txt", root / "calibration"
+    root = folder.parent.parent
+    path, calibration = root / "data_poses" / folder.name / "poses.txt", root / "calibration"
     if not path.is_file():
-        return drive
+        return SideData(None, times)
     rows = read_table(path, 13)  # frame and pose
-    cameras = calibration / "calib_cam_to_pose.txt"
+    cameras, lidar = calibration / "calib_cam_to_pose.txt", calibration / "calib_cam_to_velo.txt"
     T_imu_cam0 = from_rows(read_labelled(cameras, ("image_00",), 12, "take KITTI-360's calibration folder"), cameras)
-    lidar = calibration / "calib_cam_to_velo.txt"
     T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(from_rows(_first_row(lidar, 12), lidar))
-    numbers = np.array(last_numbers(drive.files), np.float64)
-    return _interpolate(drive, numbers, StampedPoses(T_world_lidar, rows[:, 0]), path, slack=0.0)
+    numbers = np.array(last_numbers(files), np.float64)
+    T, note = _interpolate(numbers, StampedPoses(T_world_lidar, rows[:, 0]), path, slack=0.0)
+    return SideData(T, times, (note,))
 
 
-def _read_carla(folder: Path, drive: Drive3D) -> Drive3D:
-    """Adds poses and times of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
+def _read_carla(folder: Path, files: list[Path]) -> SideData:
+    """Reads poses and times of KITTI-CARLA: TownNN/generated with frames/frame_NNNN.ply and full_poses_lidar.txt.
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
     during a turn.
-
-    Returns:
-        The drive.
     """
-    home = drive.files[0].parent.resolve().parent
-    drive = drive._replace(name=home.parent.name if home.name == "generated" else home.name)
-    path = drive.files[0].parent.parent / "full_poses_lidar.txt"
+    path = files[0].parent.parent / "full_poses_lidar.txt"
     if not path.is_file():
-        return drive
+        return SideData()
     rows = read_table(path, 13)  # pose and time
-    at = _CARLA_POSES_PER_FRAME * np.array(last_numbers(drive.files))
+    at = _CARLA_POSES_PER_FRAME * np.array(last_numbers(files))
     found = f"{len(rows)} rows for {len(at)} frames"
     require(at.max() < len(rows), path, found, f"give {_CARLA_POSES_PER_FRAME} rows a frame")
-    return drive._replace(T_world_lidar=from_rows(rows[at, :12], path), times=rows[at, 12])
+    return SideData(from_rows(rows[at, :12], path), rows[at, 12])
 
 
-def _read_mulran(folder: Path, drive: Drive3D) -> Drive3D:
-    """Adds poses and times of MulRan: Ouster/STAMP.bin (nanoseconds), and global_pose.csv of the car at 100 Hz.
+def _read_mulran(folder: Path, files: list[Path]) -> SideData:
+    """Reads poses and times of MulRan: Ouster/STAMP.bin (nanoseconds), and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame with a pose. Scans half a second or more outside of the poses have no reference.
-
-    Returns:
-        The drive.
     """
     from scipy.spatial.transform import Rotation
 
-    stamps = np.array(last_numbers(drive.files))
+    stamps = np.array(last_numbers(files))
     times, path = (stamps - stamps[0]).astype(np.float64) * 1e-9, folder / "global_pose.csv"
-    drive = drive._replace(times=times)
     if not path.is_file():
-        return drive
+        return SideData(None, times)
     rows = read_table(path, 13)  # stamp and pose
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
     R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
     poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    return _interpolate(drive, times, StampedPoses(poses, pose_times), path, slack=_MULRAN_SLACK_S)
+    T, note = _interpolate(times, StampedPoses(poses, pose_times), path, slack=_MULRAN_SLACK_S)
+    return SideData(T, times, (note,))
 
 
-def _interpolate(drive: Drive3D, wanted: FloatArray, found: StampedPoses, path: Path, slack: float) -> Drive3D:
-    """Adds interpolated poses, relative to the first, to the scans within `slack` of the stamps of the poses."""
+def _interpolate(wanted: FloatArray, found: StampedPoses, path: Path, slack: float) -> tuple[FloatArray, Note]:
+    """Interpolates poses, relative to the first, for the scans within `slack` of the stamps of the poses."""
     stamps, first = np.unique(np.asarray(found.stamps), return_index=True)
     kept = (wanted >= stamps[0] - slack) & (wanted <= stamps[-1] + slack)
     require(kept.any(), path, "no scan lies within the times of the poses", "give scans and poses of one drive")
     T = interpolate_poses(stamps, found.poses[first], wanted)
     # In the frame of the first, without the 1e6 m of national grids.
     T = np.where(kept[:, None, None], rigid.inverse(T[kept.argmax()]) @ T, np.nan)
-    how = "time" if slack else "the numbers of the frames"
-    return drive._replace(T_world_lidar=T, notes=(*drive.notes, matching_note(path, how, T)))
+    return T, matching_note(path, "time" if slack else "the numbers of the frames", T)
 
 
 def _first_row(path: Path, width: int) -> FloatArray:
@@ -313,7 +296,7 @@ class _Layout(NamedTuple):
 
     marker: str
     scans: str
-    read: Callable[[Path, Drive3D], Drive3D]
+    read: Callable[[Path, list[Path]], SideData]
 
 
 _LAYOUTS = (
@@ -339,24 +322,29 @@ def is_drive(path: Path) -> bool:
     return bool(layout.marker or scan_files(path / layout.scans))
 
 
-def read_drive(path: Path, poses: Path | None) -> Drive3D:
-    """Lists the drive in a folder.
+def open_drive(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
+    """Opens the drive in a folder.
 
     Args:
         path: the folder.
         poses: a pose file, which replaces that of the data set; or None.
+        bin_columns: number of values of a point in `.bin` files; None: inferred.
 
     Returns:
-        The drive; without files where the folder has no scans.
+        The drive.
 
     Raises:
-        InputError: broken files, or poses that do not match the scans.
+        InputError: no scans, broken files, or poses that do not match the scans.
     """
     layout = _layout_of(path)
-    drive = Drive3D(Path(os.path.abspath(path)).name, scan_files(path / layout.scans))
-    if not drive.files:
-        return drive
-    if poses is not None:
-        return read_plain_drive(path, drive, poses)
-    is_learned = layout.scans == "" and drive.files[0].suffix.lower() == ".npz"
-    return (_read_learned if is_learned else layout.read)(path, drive)
+    files = scan_files(path / layout.scans)
+    require(len(files) > 0, path, "a folder without scans", f"give {DRIVES}")
+    is_learned = layout.scans == "" and files[0].suffix.lower() == ".npz"
+    read = partial(read_plain_drive, poses=poses) if poses else _read_learned if is_learned else layout.read
+    T, times, notes = read(path, files)
+    columns, note = columns_of_drive(files, bin_columns)
+    notes = tuple(each for each in (folder_note(files[0].parent), *notes, note) if each is not None)
+    given, sources = Path(os.path.abspath(path)), tuple(map(str, files))
+    name = given.parent.name if given.name == "generated" else given.name
+    read_scan, read_times = lambda i: read_timed_cloud(files[i], columns).points, lambda i: read_point_times(files[i])
+    return LidarSequence(name, sources, read_scan, T, times, read_times, notes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +27,6 @@ _CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 # Largest height, roll and pitch of relations in the plane, metres and radians.
 _FLAT = 1e-3
-
-
-class Reference(NamedTuple):
-    """The reference poses of the scans.
-
-    Attributes:
-        T_world_lidar: (n, 4, 4); NaN for scans without one.
-        notes: method of the matching.
-    """
-
-    T_world_lidar: FloatArray
-    notes: tuple[Note, ...] = ()
 
 
 def match_rows(rows: NDArray[Any], files: Sequence[Path], path: Path) -> NDArray[Any]:
@@ -111,7 +99,9 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     return None if stamps is None else to_seconds(stamps), tuple(notes)
 
 
-def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path) -> Reference:
+def match_reference(
+    found: StampedPoses, times: FloatArray | None, num_scans: int, path: Path
+) -> tuple[FloatArray, tuple[Note, ...]]:
     """Matches scans with reference poses.
 
     If poses and scans have times, poses are interpolated at the times of the scans. The nearest pose must lie within
@@ -125,7 +115,7 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
         path: path of the poses, for messages.
 
     Returns:
-        The reference.
+        (n, 4, 4) T_world_lidar, NaN for scans without one; and notes on the matching.
 
     Raises:
         InputError: no times to match by, and another number of poses than of scans.
@@ -136,17 +126,17 @@ def match_reference(found: StampedPoses, times: FloatArray | None, num_scans: in
     if stamps is not None and _are_numbers(stamps, times, num_scans):
         T = np.full((num_scans, 4, 4), np.nan)
         T[stamps.astype(np.int64)] = found.poses
-        return Reference(T, (matching_note(path, "the numbers that are their stamps", T),))
+        return T, (matching_note(path, "the numbers that are their stamps", T),)
     reason, is_doubt = "the file has no times" if stamps is None else "the scans have no times", False
     if stamps is not None and times is not None:
         T, tolerance_s = _by_time(to_seconds(stamps), found.poses, times)
         if np.isfinite(T[:, 0, 0]).any():
-            return Reference(T, (matching_note(path, f"time, tolerance {tolerance_s:.3g} s", T),))
+            return T, (matching_note(path, f"time, tolerance {tolerance_s:.3g} s", T),)
         reason, is_doubt = "no scan has the time of a pose", True
     advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
     require(count == num_scans, path, f"{counted(count, 'pose')} for {num_scans} scans, and {reason}", advice)
     note = Note(f"{path}: {reason}; poses are matched by their order", is_doubt=True)
-    return Reference(found.poses, (note,) if is_doubt else ())
+    return found.poses, (note,) if is_doubt else ()
 
 
 def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:

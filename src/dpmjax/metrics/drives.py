@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from dpmjax.geometry import rigid, se2
-from dpmjax.metrics.poses import checked_pose_pair, checked_poses, rotation_angle
+from dpmjax.metrics.poses import checked_poses, rotation_angle
 from dpmjax.sequences import Relations
 from dpmjax.types import AnyArray
 
@@ -58,7 +58,7 @@ def segment_error(
     Raises:
         ValueError: the shapes differ or are not (n, 4, 4), or a number is not finite, or `stride` is below 1.
     """
-    estimated, reference = checked_pose_pair(estimated=estimated, reference=reference)
+    estimated, reference = checked_poses(estimated=estimated, reference=reference)
     if stride < 1 or estimated.shape[1:] != (4, 4):
         raise ValueError(f"expected poses (n, 4, 4) and a stride from 1, got {estimated.shape} and {stride}")
     way, lengths = path_lengths(reference), np.asarray(lengths_m, np.float64)[:, None]
@@ -170,7 +170,7 @@ def find_revisits(
     Raises:
         ValueError: the shape is not (n, 4, 4), or a number is not finite.
     """
-    poses = checked_poses("T_world_scan", T_world_scan)
+    (poses,) = checked_poses(T_world_scan=T_world_scan)
     positions, forward, path = poses[:, :3, 3], poses[:, :3, 0], path_lengths(poses)
     is_revisit, is_opposite = np.zeros(len(poses), bool), np.zeros(len(poses), bool)
     tree = KDTree(positions)
@@ -206,7 +206,7 @@ def loop_recall(
     Raises:
         ValueError: the shapes are not (n, 4, 4) and (m, 2), or an end is no scan.
     """
-    path = path_lengths(checked_poses("T_world_scan", T_world_scan))
+    path = path_lengths(*checked_poses(T_world_scan=T_world_scan))
     ends = np.asarray(newer_ends, np.int64)
     if ends.ndim != 2 or ends.shape[1] != 2 or (ends.size and not 0 <= ends.min() <= ends.max() < len(path)):
         raise ValueError(f"newer_ends: expected shape (m, 2) and scans from 0 to {len(path) - 1}, got {ends.shape}")

@@ -73,7 +73,7 @@ def align_rigid(
         ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, a number is not finite, or no position is
             there.
     """
-    return best_motion(*checked_positions(estimated, reference, mask))
+    return best_motion(*_checked_positions(estimated, reference, mask))
 
 
 def align_poses(
@@ -96,7 +96,7 @@ def align_poses(
         ValueError: the shapes differ, or a number is not finite.
     """
     xp = namespace_of(T_estimated, T_reference)
-    poses = checked_pose_pair(xp, T_estimated=T_estimated, T_reference=T_reference)
+    poses = checked_poses(xp, T_estimated=T_estimated, T_reference=T_reference)
     first_estimated, first_reference = (T[:1, :3, 3] for T in poses)
     arms = (lever * xp.concatenate([-xp.eye(3), xp.eye(3)])).astype(poses[0].dtype)
     ends = [_transform(_moved(T, -T[:1, :3, 3]), xp.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses]
@@ -123,7 +123,7 @@ def absolute_trajectory_error(
         ValueError: the shapes differ, are not (n, 2) or (n, 3) with n >= 1, a number is not finite, or no position is
             there.
     """
-    estimated, reference, weights = checked_positions(estimated, reference, mask)
+    estimated, reference, weights = _checked_positions(estimated, reference, mask)
     # Near the origin: float32 at map coordinates of 5e6 m would lose half a metre at every operation.
     first = namespace_of(weights).argmax(weights)
     estimated, reference = estimated - estimated[first], reference - reference[first]
@@ -152,7 +152,7 @@ def relative_pose_error(
             [1, n - 1].
     """
     xp = namespace_of(estimated, reference)
-    estimated, reference = checked_pose_pair(xp, estimated=estimated, reference=reference)
+    estimated, reference = checked_poses(xp, estimated=estimated, reference=reference)
     if not 1 <= delta < len(estimated):
         raise ValueError(f"delta: expected 1 <= delta < {len(estimated)}, the number of poses, got {delta}")
     moved, true = (_motion_between(T[:-delta], T[delta:]) for T in (estimated, reference))
@@ -184,14 +184,11 @@ def point_distance(
         ValueError: the shapes do not match, a number is not finite, or no point is valid.
     """
     xp = namespace_of(points, mask, T_estimated, T_reference)
-    estimated, reference = checked_pose_pair(xp, T_estimated=T_estimated, T_reference=T_reference)
+    estimated, reference = checked_poses(xp, T_estimated=T_estimated, T_reference=T_reference)
     points = as_floats("points", points, xp)
     dim = estimated.shape[1] - 1
-    if points.ndim != 3 or points.shape[0] != len(estimated) or points.shape[2] != dim:
-        raise ValueError(f"points: expected shape ({len(estimated)}, b, {dim}), got {points.shape}")
-    mask = as_mask("mask", mask, points.shape[:2], xp)
-    if not is_traced(mask) and not np.asarray(mask).any():
-        raise ValueError("mask: expected at least one valid point, got none")
+    require_shape("points", points, (len(estimated), *points.shape[1:2], dim))
+    mask = valid_mask(mask, points.shape[:2], xp)
     points = xp.where(mask[..., None], points, 0)
     require_finite("points", points)
     if xp is not np:
@@ -227,8 +224,7 @@ def registration_recall(
     """
     estimated, true = np.asarray(T_estimated, np.float64), np.asarray(T_true, np.float64)
     for name, value in (("T_estimated", estimated), ("T_true", true)):
-        if value.ndim != 3 or value.shape[1:] != (4, 4) or len(value) != len(true):
-            raise ValueError(f"{name}: expected shape ({len(true)}, 4, 4), got {value.shape}")
+        require_shape(name, value, (len(true), 4, 4))
     translation = np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1)
     difference = np.swapaxes(true[:, :3, :3], 1, 2) @ estimated[:, :3, :3]
     rotation = np.degrees(rotation_angle(difference))
@@ -276,37 +272,17 @@ def rotation_angle(R: Any) -> Any:
     return xp.arctan2(sin, cos)
 
 
-def checked_positions(estimated: AnyArray, reference: AnyArray, mask: AnyArray | None) -> tuple[Any, Any, Any]:
-    """Returns positions, and a weight for each pair: 1, or 0 where it is masked."""
-    xp = namespace_of(estimated, reference, mask)
-    estimated, reference = as_floats("estimated", estimated, xp), as_floats("reference", reference, xp)
-    if estimated.ndim != 2 or estimated.shape[0] < 1 or estimated.shape[1] not in (2, 3):
-        raise ValueError(f"estimated: expected positions of shape (n, 2) or (n, 3), n >= 1, got {estimated.shape}")
-    _require_same_shape("reference", reference, estimated)
-    is_valid = as_mask("mask", mask, estimated.shape[:1], xp)
-    if not is_traced(is_valid) and not np.asarray(is_valid).any():
-        raise ValueError("mask: expected at least one valid position, got none")
-    estimated, reference = (xp.where(is_valid[:, None], value, 0) for value in (estimated, reference))
-    require_finite("estimated", estimated)
-    require_finite("reference", reference)
-    return estimated, reference, is_valid.astype(estimated.dtype)
-
-
-def checked_poses(name: str, value: AnyArray, xp: ModuleType = np) -> Any:
-    """Returns poses as floats; a ValueError names an argument that is not (n, 3, 3) or (n, 4, 4), or not finite."""
-    array = as_floats(name, value, xp)
-    if array.ndim != 3 or array.shape[0] < 1 or array.shape[1:] not in ((3, 3), (4, 4)):
-        raise ValueError(f"{name}: expected poses of shape (n, 3, 3) or (n, 4, 4), n >= 1, got {array.shape}")
-    require_finite(name, array)
-    return array
-
-
-def checked_pose_pair(xp: ModuleType = np, **poses: AnyArray) -> tuple[Any, Any]:
-    """Returns estimated and reference poses as `checked_poses` does, and checks that they have one shape."""
-    (first, estimated), (second, reference) = poses.items()
-    estimated, reference = checked_poses(first, estimated, xp), checked_poses(second, reference, xp)
-    _require_same_shape(second, reference, estimated)
-    return estimated, reference
+def checked_poses(xp: ModuleType = np, **poses: AnyArray) -> list[Any]:
+    """Returns poses (n, 3, 3) or (n, 4, 4) as floats, all of one shape; a ValueError names a bad argument."""
+    arrays: list[Any] = []
+    for name, value in poses.items():
+        array = as_floats(name, value, xp)
+        if array.ndim != 3 or array.shape[0] < 1 or array.shape[1:] not in ((3, 3), (4, 4)):
+            raise ValueError(f"{name}: expected poses of shape (n, 3, 3) or (n, 4, 4), n >= 1, got {array.shape}")
+        require_shape(name, array, arrays[0].shape if arrays else array.shape)
+        require_finite(name, array)
+        arrays.append(array)
+    return arrays
 
 
 def as_floats(name: str, value: AnyArray, xp: ModuleType) -> Any:
@@ -314,19 +290,37 @@ def as_floats(name: str, value: AnyArray, xp: ModuleType) -> Any:
     return np.asarray(value, np.float64) if xp is np else as_float(name, value)
 
 
+def require_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
+    """Raises a ValueError for another shape."""
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+
+
 def require_finite(name: str, array: Any) -> None:
     """Raises a ValueError that names the first row with a number that is not finite."""
-    if not is_traced(array) and not np.isfinite(array).all():
+    if not isinstance(array, jax.core.Tracer) and not np.isfinite(array).all():
         row = int(np.argmin(np.isfinite(array).reshape(len(array), -1).all(axis=1)))
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in row {row}")
 
 
-def is_traced(array: Any) -> bool:
-    """Returns True for an array whose numbers are traced."""
-    return isinstance(array, jax.core.Tracer)
+def valid_mask(mask: AnyArray | None, shape: tuple[int, ...], xp: ModuleType) -> Any:
+    """Returns the mask; a ValueError where nothing is valid."""
+    is_valid = as_mask("mask", mask, shape, xp)
+    if not isinstance(is_valid, jax.core.Tracer) and not np.asarray(is_valid).any():
+        raise ValueError("mask: expected at least one valid point, got none")
+    return is_valid
 
 
-def _require_same_shape(name: str, array: AnyArray, other: AnyArray) -> None:
-    """Raises a ValueError where two arrays have different shapes."""
-    if array.shape != other.shape:
-        raise ValueError(f"{name}: expected shape {other.shape} like the estimated, got {array.shape}")
+def _checked_positions(estimated: AnyArray, reference: AnyArray, mask: AnyArray | None) -> tuple[Any, Any, Any]:
+    """Returns positions, and a weight for each pair: 1, or 0 where it is masked."""
+    xp = namespace_of(estimated, reference, mask)
+    pair = {"estimated": as_floats("estimated", estimated, xp), "reference": as_floats("reference", reference, xp)}
+    shape = pair["estimated"].shape
+    if len(shape) != 2 or shape[0] < 1 or shape[1] not in (2, 3):
+        raise ValueError(f"estimated: expected positions of shape (n, 2) or (n, 3), n >= 1, got {shape}")
+    require_shape("reference", pair["reference"], shape)
+    is_valid = valid_mask(mask, shape[:1], xp)
+    for name, values in pair.items():
+        pair[name] = xp.where(is_valid[:, None], values, 0)
+        require_finite(name, pair[name])
+    return pair["estimated"], pair["reference"], is_valid.astype(pair["estimated"].dtype)

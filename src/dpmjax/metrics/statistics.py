@@ -103,9 +103,8 @@ def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, "
     if min(len(positive), len(negative)) == 0:
         return float("nan")
     # Mann and Whitney's U counts the pairs in which the positive example scores higher.
-    return float(
-        stats.mannwhitneyu(positive, negative, method="asymptotic").statistic / (len(positive) * len(negative))
-    )
+    num_pairs = len(positive) * len(negative)
+    return float(stats.mannwhitneyu(positive, negative, method="asymptotic").statistic / num_pairs)
 
 
 def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"]) -> float:
