@@ -43,8 +43,7 @@ NUM_THREADS = 2
 class EvidenceWeights:
     """Logistic model of P(right within 2 m and 5 degrees) of one motion, by shares of the points of both scans.
 
-    Fitted by `python -m experiments.dpm_calibrate --evidence` on simulated scenes, dense
-    and sparse, in and out of doors.
+    Fitted by `python -m experiments.dpm_calibrate --evidence` on simulated scenes, dense and sparse, also indoors.
     Points of each scan are compared with the opposite scan, and are visible where that scan has measurements. Walls are
     all surfaces that are not level.
 
