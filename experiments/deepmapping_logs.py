@@ -22,7 +22,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli
+from dpmjax import cli, io, metrics
 from dpmjax.geometry import se2
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES
 from dpmjax.simulation import scan_world, simulate_odometry
@@ -81,12 +81,12 @@ def main(options: LogOptions, run: cli.Run) -> cli.Row:
         folder.mkdir(parents=True, exist_ok=True)
         if isinstance(path, int):
             path = write_corridor_log(run / log, path)
-        code = map_log(path, folder, init, corrected.get(name_drive(path)), options)
+        code = map_log(path, folder, init, options)
         if run.is_stopped:
             return None
         if code not in (0, cli.EXIT_BAD_INPUT):
             raise RuntimeError(f"{log} from {init}: the run ended with exit code {code}")
-        return row_of({} if code else cli.load_json(folder / cli.METRICS))
+        return row_of({} if code else measure_run(folder, path, corrected.get(name_drive(path))))
 
     cases = [{"log": name, "init": init} for name, init in itertools.product(by_name, options.inits)]
     rows = cli.fill_table(run, cases, work)
@@ -112,15 +112,29 @@ def name_drive(log: Path) -> str:
     return log.name.split(".")[0]
 
 
-def map_log(log: Path, folder: Path, init: str, corrected: Path | None, options: LogOptions) -> int:
+def map_log(log: Path, folder: Path, init: str, options: LogOptions) -> int:
     """Maps a log in a process with a peak memory of its own; returns its exit code, 2 where it lacks odometry."""
     command = [sys.executable, "-m", "dpmjax", "map2d", str(log), "-o", str(folder), "--force"]
     command += ["--init", init, "--seed", str(options.seed)]
     command += [] if options.steps is None else ["--steps", str(options.steps)]
-    relations = log.with_name(name_drive(log) + ".relations")
-    command += ["--relations", str(relations)] if relations.exists() else []
-    command += [] if corrected in (None, log) else ["--corrected", str(corrected)]
     return subprocess.run(command).returncode
+
+
+def measure_run(folder: Path, log: Path, corrected: Path | None) -> cli.Row:
+    """Returns the numbers of a run, with errors of its start and its end against hand-checked relations of the log and
+    against a corrected log.
+    """
+    numbers = cli.load_json(folder / cli.METRICS)
+    relations = log.with_name(name_drive(log) + ".relations")
+    for name, suffix in (("start", "_initial"), ("trajectory", "")):
+        times, poses = np.loadtxt(folder / f"{name}_tum.txt")[:, 0], np.load(folder / f"{name}.npy")
+        if relations.exists():
+            errors = metrics.relation_errors(io.read_relations(relations), times, poses)
+            numbers[f"relations{suffix}_m"] = float(errors.translation_m.mean())
+            numbers[f"relations{suffix}_deg"] = float(errors.rotation_deg.mean())
+        if corrected not in (None, log):
+            numbers[f"ate_corrected{suffix}_m"] = metrics.corrected_ate(times, poses, io.read_sequence(corrected))
+    return numbers
 
 
 def row_of(numbers: cli.Row) -> cli.Row:

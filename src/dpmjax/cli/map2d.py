@@ -33,9 +33,6 @@ from dpmjax.cli import map2d_results as results
 from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
 from dpmjax.sequences import FloatArray, ScanSequence
 
-# Computes numbers, by name, of the poses of all scans.
-Measure = Callable[[FloatArray], Numbers]
-
 # Scans of a recording in metres that lie this far apart are registered.
 _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
@@ -64,10 +61,6 @@ class Map2dOptions(ScanOptions, RunOptions):
     """Stop after N steps, rounded up to whole calls of the compiled program; without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S")] = None
     """Stop the fit after S seconds of run time, compile time not counted."""
-    relations: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Hand-checked relations of a log, to measure the result by."""
-    corrected: Annotated[Path | None, arg(metavar="LOG")] = None
-    """A log of the same drive with corrected poses, to measure the result by at scans of the same time."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
     """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
     crowd: an office in which people walk about."""
@@ -91,13 +84,14 @@ def main(options: Map2dOptions, run: Run) -> Numbers:
     """Registers planar scans and writes the results."""
     sequence = read_scans(options)
     start = starting_poses(options, sequence)
-    measure = measures_of(options, sequence)
     run.open(sequence.notes)
     run.say(f"{sequence.name}: {len(sequence)} scans of {sequence.points.shape[1]} beams")
     recorder = cli.FitRecorder(run, sequence.unit, max_s=math.inf if options.seconds is None else options.seconds)
     result = register_sequence(sequence, start, options, recorder, run)
-    numbers = {**map_numbers(sequence, result, options, measure), **recorder.numbers}
-    cli.write_poses(run.path, result.poses, times=sequence.times, unit=sequence.unit)
+    numbers = {**map_numbers(sequence, result, options), **recorder.numbers}
+    start_poses = result.recording.between(result.candidates[result.start].poses)
+    for name, poses in (("trajectory", result.poses), ("start", start_poses)):
+        cli.write_poses(run.path, poses, name, times=sequence.times, unit=sequence.unit)
     run.write_numbers(numbers)  # also where a picture fails
     registered = sequence.take(result.recording.chosen)
     limits = results.draw_map(run, registered, result, numbers)
@@ -142,9 +136,7 @@ def register_sequence(
         )
 
 
-def map_numbers(
-    sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions, measure: Measure
-) -> Numbers:
+def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
     registered = sequence.take(result.recording.chosen)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
@@ -158,8 +150,6 @@ def map_numbers(
         "num_scans": len(sequence),
         "num_registered": len(registered),
         **results.before_and_after(registered, start, kept),
-        **cli.named_initial(measure(result.recording.between(start))),
-        **measure(result.poses),
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
@@ -168,36 +158,6 @@ def map_numbers(
         },
         "assessment": result.assessment._asdict(),
     }
-
-
-def measures_of(options: Map2dOptions, sequence: ScanSequence) -> Measure:
-    """Reads further references of the scans.
-
-    Args:
-        options: options of the run.
-        sequence: all scans.
-
-    Returns:
-        A function of the poses of all scans; it returns the numbers by name.
-
-    Raises:
-        ValueError: a file does not belong to the scans.
-    """
-    relations = None if options.relations is None else io.read_relations(options.relations)
-    corrected = None if options.corrected is None else io.read_sequence(options.corrected)
-    if relations is None and corrected is None:
-        return lambda _poses: {}
-    times = sequence.times
-    if times is None:
-        raise ValueError(f"{sequence.name}: its scans have no times, which relations and a corrected log need")
-
-    def measure(poses: FloatArray) -> dict[str, float]:
-        by_relations = {} if relations is None else results.relation_numbers(times, poses, relations)
-        return by_relations | ({} if corrected is None else metrics.corrected_errors(times, poses, corrected))
-
-    # Files of another drive are refused before any long work.
-    measure(np.zeros((len(sequence), 3)))
-    return measure
 
 
 def read_scans(options: Map2dOptions) -> ScanSequence:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dpmjax import deepmapping, metrics, registration2d, viz
 from dpmjax.cli.run import Run
-from dpmjax.sequences import FloatArray, Relations, ScanSequence
+from dpmjax.sequences import FloatArray, ScanSequence
 
 if TYPE_CHECKING:
     from dpmjax.types import ScanSet
@@ -53,16 +53,6 @@ def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
     return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
 
 
-def relation_numbers(times: FloatArray, poses: FloatArray, relations: Relations) -> dict[str, float]:
-    """Computes the mean errors of the poses of all scans against hand-checked relations."""
-    found = metrics.relation_errors(relations, times, poses)
-    return {
-        "relations_m": float(found.translation_m.mean()),
-        "relations_deg": float(found.rotation_deg.mean()),
-        "num_relations": int(found.is_used.sum()),
-    }
-
-
 def verdict(assessment: Mapping[str, Any]) -> str:
     """Returns whether the map can be trusted, why, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
@@ -97,14 +87,6 @@ def report(unit: str, numbers: Mapping[str, Any]) -> str:
         lines.append(f"{mark} {name:{width}}{ate}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
     why = "chosen without the reference" if has_ate else "no reference was given"
     lines.append(f"kept: {numbers['kept']} ({why}; docs/guides/scans_2d.md explains both scores)")
-    if "num_relations" in numbers:
-        kinds = (f"{numbers[f'relations_initial_{kind}']:.3g} -> {numbers[f'relations_{kind}']:.3g}" for kind in UNITS)
-        lines.append(f"mean error of {numbers['num_relations']} hand-checked relations: {' m, '.join(kinds)} degrees")
-    if "num_corrected" in numbers:
-        before, after = numbers["ate_corrected_initial_m"], numbers["ate_corrected_m"]
-        lines.append(f"ATE at {numbers['num_corrected']} scans of the corrected log: {before:.3g} -> {after:.3g} m")
-        steps = numbers["relations_corrected_m"], numbers["relations_corrected_deg"]
-        lines.append("mean error from each of these scans to the next: {:.3g} m, {:.3g} degrees".format(*steps))
     return "\n".join(lines)
 
 

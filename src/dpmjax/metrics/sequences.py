@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpmjax import geometry
-from dpmjax.metrics.drives import path_lengths, relation_errors, segment_error
+from dpmjax.metrics.drives import path_lengths, segment_error
 from dpmjax.metrics.poses import (
     absolute_trajectory_error,
     align_poses,
@@ -16,7 +16,7 @@ from dpmjax.metrics.poses import (
     point_distance,
     relative_pose_error,
 )
-from dpmjax.sequences import DepthSequence, FloatArray, LidarSequence, Relations, ScanSequence
+from dpmjax.sequences import DepthSequence, FloatArray, LidarSequence, ScanSequence
 
 # Least number of common scans of a recording and its corrected log.
 _MIN_COMMON = 10
@@ -52,18 +52,16 @@ def planar_errors(sequence: ScanSequence, poses: FloatArray) -> dict[str, float]
     }
 
 
-def corrected_errors(times: FloatArray, poses: FloatArray, corrected: ScanSequence) -> dict[str, float]:
-    """Computes the ATE at the common scans of a corrected log of the same drive, and errors of its relations.
-
-    The relations are the relative poses of successive scans of the corrected log.
+def corrected_ate(times: FloatArray, poses: FloatArray, corrected: ScanSequence) -> float:
+    """Computes the ATE of planar scans at the common scans of a corrected log of the same drive.
 
     Args:
-        times: of all scans.
-        poses: of all scans.
+        times: of all scans, seconds.
+        poses: (n, 3) T_world_scan of all scans, metres.
         corrected: the corrected log.
 
     Returns:
-        The numbers by name.
+        The ATE, metres.
 
     Raises:
         ValueError: the corrected log has no poses with times, or few scans of the same times.
@@ -72,19 +70,9 @@ def corrected_errors(times: FloatArray, poses: FloatArray, corrected: ScanSequen
         raise ValueError(f"{corrected.name}: has no corrected poses with times")
     _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)
     if len(mine) < _MIN_COMMON:
-        raise ValueError(
-            f"{corrected.name}: {len(mine)} scans have the time of a scan of the recording, not {_MIN_COMMON}"
-        )
-    reference, at = corrected.reference_poses[theirs], times[mine]
-    steps = relation_errors(
-        Relations(at[:-1], at[1:], geometry.se2.relative(reference[:-1], reference[1:])), at, poses[mine]
-    )
-    return {
-        "ate_corrected_m": float(absolute_trajectory_error(poses[mine, :2], reference[:, :2])),
-        "relations_corrected_m": float(steps.translation_m.mean()),
-        "relations_corrected_deg": float(steps.rotation_deg.mean()),
-        "num_corrected": len(mine),
-    }
+        found = f"{len(mine)} scans have the time of a scan of the recording, not {_MIN_COMMON}"
+        raise ValueError(f"{corrected.name}: {found}")
+    return float(absolute_trajectory_error(poses[mine, :2], corrected.reference_poses[theirs, :2]))
 
 
 def depth_errors(sequence: DepthSequence, T_world_camera: FloatArray) -> dict[str, float]:
