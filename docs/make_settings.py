@@ -15,7 +15,7 @@ import textwrap
 from dataclasses import MISSING, Field, fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 from dpmjax.cli.program import COMMANDS
 from dpmjax.cli.run import RunOptions
@@ -188,7 +188,7 @@ def value_text(value: Any) -> str:
 def command_text(name: str) -> str:
     """Returns the table of a subcommand's own options; empty where it has none."""
     common = options_of(RunOptions)
-    config = importlib.import_module(f"dpmjax.cli.{name}").Config
+    config = get_type_hints(importlib.import_module(f"dpmjax.cli.{name}").main)["options"]
     return options_text(f"dpmjax {name}", [row for row in options_of(config) if row not in common])
 
 
