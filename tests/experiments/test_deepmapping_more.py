@@ -113,7 +113,7 @@ def test_relocalization_tells_known_from_right_and_mapped(tmp_path, monkeypatch)
     monkeypatch.setattr(deepmapping_relocalize, "NUM_STEPS", 20)
     monkeypatch.setattr(deepmapping_relocalize.dm, "preset", lambda name, of=preset: with_steps(of(name), 20))
     out = tmp_path / "out"
-    assert run(deepmapping_relocalize, "--stride-px", 64, "-o", out) == 0
+    assert run(deepmapping_relocalize, "--stride-px", 160, "-o", out) == 0
     metrics, places = load_json(out / "metrics.json"), np.load(out / "places.npz")
     known, mapped, right = places["is_known"], places["is_mapped"], places["errors_px"] < 20.0
     assert metrics["share_of_mapped_known"] == known[mapped].mean()
