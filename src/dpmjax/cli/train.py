@@ -160,6 +160,7 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     if records is None:
         return {}
     numbers = {**training_numbers(trained, records), "num_scans": len(store.table), "bad_scans": store.bad}
+    numbers["seed"] = options.seed
     ended = evaluate_and_calibrate(options, trained, records, numbers, chosen_sources(options, sources))
     numbers |= ended.numbers
     numbers = {"verdict": train_files.verdict(numbers), **numbers}
