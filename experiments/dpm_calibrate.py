@@ -48,9 +48,9 @@ AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
 BEAMS = {16: simulation.VLP16, 32: simulation.HDL32E, 64: simulation.OS1_64}
 # Scans of each town, and of another town beside, that pairs are made of.
 NUM_SCANS, NUM_OTHER_SCANS = 36, 12
-TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (cli.FAR_M, np.inf))
-AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0), (cli.FAR_M, np.inf))
-CHECKED_BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (cli.FAR_M, np.inf))
+TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (dpm.FAR_M, np.inf))
+AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0), (dpm.FAR_M, np.inf))
+CHECKED_BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (dpm.FAR_M, np.inf))
 # Far from the seeds of the towns of training, also of its held-out one, and apart from each other.
 FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_CHECKED, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_200_000, 3_500_000
 FIRST_SCENE = 6_500_000
@@ -111,8 +111,8 @@ def main(options: CalibrateOptions, run: cli.Run) -> cli.Row:
     matches = measure_towns(run, model, options.seed)
     if run.is_stopped:
         return {"verdict": f"stopped after {len(pairs)} registrations and {len(matches)} matches: nothing is fitted"}
-    calibration, numbers, held_out = cli.fit_confidence(pairs)
-    overlap, overlap_numbers, held_out["overlap"] = cli.fit_overlap(matches)
+    calibration, numbers, held_out = dpm.fit_confidence(pairs)
+    overlap, overlap_numbers, held_out["overlap"] = dpm.fit_overlap(matches)
     numbers |= overlap_numbers
     note = f"Confidence calibrated on {NUM_TOWNS} towns and {NUM_AMBIGUOUS} ambiguous places, {len(pairs)} pairs; "
     note += f"overlap fitted on {NUM_OVERLAP_TOWNS} towns, {len(matches)} pairs"
@@ -134,7 +134,7 @@ def calibrate_on_drives(options: CalibrateOptions, run: cli.Run, model: dpm.Mode
     """Calibrates on the drives of the user."""
     drives = [source() for source in cli.find_sources(options.data, [])]
     run.open()
-    calibrated, numbers = cli.calibrate(model, cli.measure_drives(model, drives, options.seed, on_pair=run.check_stop))
+    calibrated, numbers = dpm.calibrate(model, dpm.measure_drives(model, drives, options.seed, on_pair=run.check_stop))
     note = f"Confidence and overlap calibrated on {', '.join(options.data)}"
     save_model(calibrated, run / MODEL, card=f"{card_of(options.model)} {note}.".strip())
     return {"model": options.model, **numbers, "verdict": note}
@@ -158,21 +158,21 @@ def open_place(place: int, kind: str, beams: int) -> LidarSequence:
 
 
 def measure_places(
-    run: cli.Run, model: dpm.Model, places: Sequence[cli.Row], bands_m: cli.Bands, num_pairs: int, seed: int
+    run: cli.Run, model: dpm.Model, places: Sequence[cli.Row], bands_m: dpm.Bands, num_pairs: int, seed: int
 ) -> list[cli.Row]:
     """Registers pairs of each place and band of distances; a row for each pair, fewer where a place has fewer."""
 
     @lru_cache(maxsize=1)
     def read(place: int, kind: str, beams: int) -> list[dpm.ScanPair]:
         bands = bands_m if kind in AMBIGUOUS else TOWN_BANDS_M
-        return list(cli.draw_calibration_pairs(open_place(place, kind, beams), bands, num_pairs, seed))
+        return list(dpm.draw_calibration_pairs(open_place(place, kind, beams), bands, num_pairs, seed))
 
     def work(place: int, kind: str, beams: int, pair: int) -> cli.Row:
         pairs = read(place, kind, beams)
         if pair >= len(pairs):
             return {}
-        row = cli.measure_pair(model, pairs[pair])
-        return row | {"is_end": kind in AMBIGUOUS and row["distance_m"] >= cli.FAR_M}
+        row = dpm.measure_pair(model, pairs[pair])
+        return row | {"is_end": kind in AMBIGUOUS and row["distance_m"] >= dpm.FAR_M}
 
     cases = [{**place, "pair": number} for place in places for number in range(num_pairs * len(bands_m))]
     return [row for row in cli.fill_table(run, cases, work, "pairs.csv") if row["is_right"] is not None]
@@ -187,7 +187,7 @@ def measure_towns(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
         for number, num in ((place, NUM_SCANS), (place + 1, NUM_OTHER_SCANS)):
             drive = simulation.simulate_drive(number, length_m=TOWN_LENGTH_M)
             drives.append(drive.take(np.unique(np.linspace(0, len(drive) - 1, num).astype(int))))
-        found = cli.measure_overlap(model, drives, NUM_OVERLAP_PAIRS, seed)
+        found = dpm.measure_overlap(model, drives, NUM_OVERLAP_PAIRS, seed)
         if found is None:
             raise ValueError(f"{drives[0].name}: no pairs of scans with overlap, or none without")
         return found
@@ -227,7 +227,7 @@ def rate_pairs(calibration: dpm.Calibration, pairs: Sequence[cli.Row]) -> list[c
     """Returns a row for each pair matched as scans and as clouds: whether it is right, sure, and wrong though sure."""
     rated = []
     for row, match in itertools.product(pairs, ("scans", "clouds")):
-        confidence = cli.rate_pair(calibration, row, of_clouds=match == "clouds")
+        confidence = dpm.rate_pair(calibration, row, of_clouds=match == "clouds")
         right, sure = row["is_right" if match == "scans" else "is_right_of_clouds"], confidence >= SURE
         answers = {"confidence": confidence, "right": right, "sure": sure, "wrong_if_sure": not right if sure else None}
         near = sure and right if row["distance_m"] <= NEAR_M else None

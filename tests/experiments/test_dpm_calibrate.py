@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax import cli, deeppointmap, simulation
+from dpmjax import deeppointmap, simulation
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.deeppointmap import (
     CLOUD_FEATURES,
@@ -143,7 +143,7 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
 @pytest.mark.slow
 def test_half_of_the_overlap_pairs_of_drives_overlap(weights) -> None:
     drives = [toy.drive(1), toy.drive(2)]
-    row = cli.measure_overlap(dpmjax.load_model(weights), drives, 32, 0)
+    row = deeppointmap.measure_overlap(dpmjax.load_model(weights), drives, 32, 0)
     assert sum(row["is_overlap"]) == 16
     assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))
 

@@ -1,14 +1,3 @@
-from .calibrate import FAR_M as FAR_M
-from .calibrate import Bands as Bands
-from .calibrate import HeldOut as HeldOut
-from .calibrate import calibrate as calibrate
-from .calibrate import draw_calibration_pairs as draw_calibration_pairs
-from .calibrate import fit_confidence as fit_confidence
-from .calibrate import fit_overlap as fit_overlap
-from .calibrate import measure_drives as measure_drives
-from .calibrate import measure_overlap as measure_overlap
-from .calibrate import measure_pair as measure_pair
-from .calibrate import rate_pair as rate_pair
 from .drives import DriveOptions as DriveOptions
 from .drives import ScanReader as ScanReader
 from .drives import Source as Source

@@ -268,8 +268,8 @@ def calibrate(
     """Returns the model with regressions of confidence and overlap, and their numbers on held-out places."""
     with tqdm(desc="calibrate confidence (then overlap, about 2 min)", unit=" pairs", dynamic_ncols=True) as bar:
         on_pair = lambda: (on_wait(), bar.update(1))  # noqa: E731
-        measured = cli.measure_drives(model, [source() for source in sources], seed, on_pair=on_pair)
-    calibrated, numbers = cli.calibrate(model, measured)
+        measured = deeppointmap.measure_drives(model, [source() for source in sources], seed, on_pair=on_pair)
+    calibrated, numbers = deeppointmap.calibrate(model, measured)
     if calibrated.config.calibration is None:
         print("the confidence is not calibrated: all registrations of the data are right, or all are wrong")
     if calibrated.config.overlap is None:

@@ -1,3 +1,15 @@
+from .calibration import FAR_M as FAR_M
+from .calibration import Bands as Bands
+from .calibration import HeldOut as HeldOut
+from .calibration import MeasuredDrives as MeasuredDrives
+from .calibration import calibrate as calibrate
+from .calibration import draw_calibration_pairs as draw_calibration_pairs
+from .calibration import fit_confidence as fit_confidence
+from .calibration import fit_overlap as fit_overlap
+from .calibration import measure_drives as measure_drives
+from .calibration import measure_overlap as measure_overlap
+from .calibration import measure_pair as measure_pair
+from .calibration import rate_pair as rate_pair
 from .confidence import CLOUD_FEATURES as CLOUD_FEATURES
 from .confidence import ELEMENT_FEATURES as ELEMENT_FEATURES
 from .confidence import OVERLAP_FEATURES as OVERLAP_FEATURES

@@ -13,8 +13,35 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dpmjax import deeppointmap as dpm
 from dpmjax import metrics
+from dpmjax.deeppointmap.confidence import (
+    CLOUD_FEATURES,
+    ELEMENT_FEATURES,
+    OVERLAP_FEATURES,
+    SCAN_FEATURES,
+    WEAK_FEATURES,
+    Calibration,
+    LogisticModel,
+    MatchEvidence,
+    calibrated_probability,
+    fit_logistic,
+    logistic_probability,
+    lookalike_share,
+)
+from dpmjax.deeppointmap.encoding import encode
+from dpmjax.deeppointmap.evaluation_pairs import (
+    ScanPair,
+    draw_rows_apart,
+    read_scan_pairs,
+    scan_distances,
+    split_places,
+)
+from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, evidence_pairs, overlap_pairs
+from dpmjax.deeppointmap.scan_evaluation import encode_turned, register_in_stages
+from dpmjax.deeppointmap.scan_registration import register_clouds
+from dpmjax.deeppointmap.training.overlap_stage import draw_overlap_pairs, why_no_overlap
+from dpmjax.deeppointmap.training.sampling import ScanTable
 from dpmjax.sequences import LidarSequence
 
 Row = dict[str, Any]
@@ -25,10 +52,10 @@ HeldOut = tuple[np.ndarray, np.ndarray]
 
 # Features of each kind of evidence; a row of a pair has a column for each, named `column_of(kind, feature)`.
 KINDS = {
-    "of_clouds": dpm.CLOUD_FEATURES,
-    "of_elements": dpm.ELEMENT_FEATURES,
-    "of_scans": dpm.SCAN_FEATURES,
-    "of_weak_scans": dpm.WEAK_FEATURES,
+    "of_clouds": CLOUD_FEATURES,
+    "of_elements": ELEMENT_FEATURES,
+    "of_scans": SCAN_FEATURES,
+    "of_weak_scans": WEAK_FEATURES,
 }
 OF_CLOUDS = ("of_clouds", "of_elements")
 HAVE_LOOKALIKES = ("of_elements", "of_scans")
@@ -57,7 +84,7 @@ class Examples(NamedTuple):
 
 def draw_calibration_pairs(
     drive: LidarSequence, bands_m: Bands, num_pairs: int, seed: int, *, anchors: Int[np.ndarray, " a"] | None = None
-) -> Iterator[dpm.ScanPair]:
+) -> Iterator[ScanPair]:
     """Reads random pairs of each band of distances, fewer than `num_pairs` where the drive has fewer.
 
     Args:
@@ -70,15 +97,15 @@ def draw_calibration_pairs(
     Yields:
         The pairs.
     """
-    distances = dpm.scan_distances(drive)
+    distances = scan_distances(drive)
     if anchors is not None:
         distances[np.setdiff1d(np.arange(len(drive)), anchors)] = np.nan
     for number, (low, high) in enumerate(bands_m):
-        drawn = dpm.draw_rows_apart(distances, low, high, num_pairs, np.random.default_rng([PAIR_STREAM, number, seed]))
-        yield from dpm.read_scan_pairs(drive, drawn, seed=seed)
+        drawn = draw_rows_apart(distances, low, high, num_pairs, np.random.default_rng([PAIR_STREAM, number, seed]))
+        yield from read_scan_pairs(drive, drawn, seed=seed)
 
 
-def measure_pair(model: dpm.Model, pair: dpm.ScanPair) -> Row:
+def measure_pair(model: Model, pair: ScanPair) -> Row:
     """Registers a pair as scans, and as clouds of surface elements.
 
     Args:
@@ -90,9 +117,9 @@ def measure_pair(model: dpm.Model, pair: dpm.ScanPair) -> Row:
         where none does, and the true distance, metres.
     """
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
-    result = dpm.register_in_stages(model, pair)
-    clouds = [dpm.encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
-    T_of_clouds, of_clouds = dpm.register_clouds(model, *clouds)
+    result = register_in_stages(model, pair)
+    clouds = [encode(model, points, num_elements=num_elements) for points in (pair.source, pair.target)]
+    T_of_clouds, of_clouds = register_clouds(model, *clouds)
     motions = np.stack([T_of_clouds, result.verified])
     is_right = metrics.registration_recall(motions, np.stack([pair.T_target_source] * 2)).is_right
     row: Row = {
@@ -125,7 +152,7 @@ def features_of(row: Row, kind: str) -> list[float] | None:
 
 
 def measure_overlap(
-    model: dpm.Model,
+    model: Model,
     drives: Sequence[LidarSequence],
     num_pairs: int,
     seed: int,
@@ -147,27 +174,27 @@ def measure_overlap(
     """
     starts = np.cumsum([0, *(len(drive) for drive in drives)])
     poses = np.concatenate([np.asarray(drive.T_world_lidar) for drive in drives])
-    table = dpm.ScanTable(poses, np.repeat(np.arange(len(drives)), np.diff(starts)))
+    table = ScanTable(poses, np.repeat(np.arange(len(drives)), np.diff(starts)))
     allowed = None if anchors is None else np.concatenate([rows + s for rows, s in zip(anchors, starts, strict=False)])
-    if dpm.why_no_overlap(table) is not None or (allowed is not None and len(allowed) == 0):
+    if why_no_overlap(table) is not None or (allowed is not None and len(allowed) == 0):
         return None
     rng = np.random.default_rng([OVERLAP_STREAM, seed])
-    pairs = dpm.draw_overlap_pairs(table, num_pairs, rng, anchors=allowed)
+    pairs = draw_overlap_pairs(table, num_pairs, rng, anchors=allowed)
     rows, places = np.unique(pairs, return_inverse=True)
     clouds = []
     for number, drive in enumerate(drives):
         own = rows[table.scene[rows] == number] - starts[number]
-        clouds += [cloud.described for cloud in dpm.encode_turned(model, drive, own, rng=rng)]
+        clouds += [cloud.described for cloud in encode_turned(model, drive, own, rng=rng)]
     sides = [[clouds[place] for place in side] for side in places.reshape(pairs.shape).T]
     apart_m = np.linalg.norm(np.diff(table.positions[pairs], axis=1)[:, 0], axis=1)
     is_one_drive = table.scene[pairs[:, 0]] == table.scene[pairs[:, 1]]
     found: Row = {
-        "evidence": np.asarray(dpm.evidence_pairs(model, *sides), float).tolist(),
-        "is_overlap": (is_one_drive & (apart_m < dpm.OVERLAP_M)).tolist(),
+        "evidence": np.asarray(evidence_pairs(model, *sides), float).tolist(),
+        "is_overlap": (is_one_drive & (apart_m < OVERLAP_M)).tolist(),
     }
     if "overlap" in model.config.trained:
         by_head = replace(model, config=replace(model.config, overlap=None))
-        found["head"] = np.asarray(dpm.overlap_pairs(by_head, *sides), float).tolist()
+        found["head"] = np.asarray(overlap_pairs(by_head, *sides), float).tolist()
     return found
 
 
@@ -188,7 +215,7 @@ class MeasuredDrives(NamedTuple):
 
 
 def measure_drives(
-    model: dpm.Model,
+    model: Model,
     drives: Sequence[LidarSequence],
     seed: int,
     *,
@@ -207,7 +234,7 @@ def measure_drives(
     """
     drives = [drive.take(drive.has_reference) for drive in drives]
     drives = [drive.take(slice(None, None, -(-len(drive) // MAX_SCANS))) for drive in drives]
-    splits = [dpm.split_places(drive) for drive in drives]
+    splits = [split_places(drive) for drive in drives]
     of_training = [drive.take(split.training) for drive, split in zip(drives, splits, strict=True)]
 
     def numbers(num_pairs: int) -> int:
@@ -230,7 +257,7 @@ def measure_drives(
     )
 
 
-def calibrate(model: dpm.Model, measured: MeasuredDrives) -> tuple[dpm.Model, Row]:
+def calibrate(model: Model, measured: MeasuredDrives) -> tuple[Model, Row]:
     """Fits the regressions of overlap and confidence on the drives of a user.
 
     Args:
@@ -245,14 +272,14 @@ def calibrate(model: dpm.Model, measured: MeasuredDrives) -> tuple[dpm.Model, Ro
     if measured.overlap is not None:
         labels = np.asarray(measured.overlap["is_overlap"])
         features = np.asarray(measured.overlap["evidence"])
-        overlap = dpm.fit_logistic(dpm.OVERLAP_FEATURES, features, labels)
+        overlap = fit_logistic(OVERLAP_FEATURES, features, labels)
         numbers["num_overlap_pairs"] = len(labels)
         if (tested := measured.tested_overlap) is not None:
             numbers |= overlap_numbers(overlap, tested)
     return replace(model, config=replace(model.config, calibration=calibration, overlap=overlap)), numbers
 
 
-def overlap_numbers(fitted: dpm.LogisticModel, tested: Row) -> Row:
+def overlap_numbers(fitted: LogisticModel, tested: Row) -> Row:
     """Computes the AUC and the Brier score of the regression, and of the head where it is trained.
 
     Args:
@@ -263,7 +290,7 @@ def overlap_numbers(fitted: dpm.LogisticModel, tested: Row) -> Row:
         The numbers.
     """
     labels = np.asarray(tested["is_overlap"])
-    found = {"overlap": dpm.logistic_probability(fitted, np.asarray(tested["evidence"]))}
+    found = {"overlap": logistic_probability(fitted, np.asarray(tested["evidence"]))}
     if "head" in tested:
         found["head"] = np.asarray(tested["head"])
     numbers: Row = {"num_tested_overlap_pairs": len(labels)}
@@ -275,7 +302,7 @@ def overlap_numbers(fitted: dpm.LogisticModel, tested: Row) -> Row:
 
 def fit_confidence(
     rows: Sequence[Row], tested: Sequence[Row] | None = None
-) -> tuple[dpm.Calibration | None, Row, dict[str, HeldOut]]:
+) -> tuple[Calibration | None, Row, dict[str, HeldOut]]:
     """Fits the calibration of the confidence.
 
     Each regression is fitted on the pairs that it rates: scans on those whose walls hold all directions.
@@ -290,7 +317,7 @@ def fit_confidence(
         registrations of scans or clouds are right, or all are wrong.
     """
     numbers: Row = {"num_pairs": len(rows)}
-    models: dict[str, dpm.LogisticModel] = {}
+    models: dict[str, LogisticModel] = {}
     held_out: dict[str, HeldOut] = {}
     for kind, names in KINDS.items():
         examples = _examples(rows, kind)
@@ -307,7 +334,7 @@ def fit_confidence(
                 f"calibration_error_{kind}": metrics.expected_calibration_error(*found),
             }
     is_whole = {"of_clouds", "of_scans"} <= models.keys()
-    return dpm.Calibration(**models) if is_whole else None, numbers, held_out
+    return Calibration(**models) if is_whole else None, numbers, held_out
 
 
 def _examples(rows: Sequence[Row], kind: str) -> Examples:
@@ -324,7 +351,7 @@ def _examples(rows: Sequence[Row], kind: str) -> Examples:
     label = "is_right_of_clouds" if kind in OF_CLOUDS else "is_right"
     is_right = np.array([row[label] for row in chosen], bool)
     place = np.array([row["place"] for row in chosen], int)
-    return Examples(place, features, is_right, np.asarray(dpm.lookalike_share(gaps)))
+    return Examples(place, features, is_right, np.asarray(lookalike_share(gaps)))
 
 
 def lookalike_gap(row: Row, kind: str) -> float:
@@ -333,29 +360,29 @@ def lookalike_gap(row: Row, kind: str) -> float:
     return np.inf if gap is None else gap
 
 
-def rate_pair(calibration: dpm.Calibration, row: Row, *, of_clouds: bool) -> float:
+def rate_pair(calibration: Calibration, row: Row, *, of_clouds: bool) -> float:
     """Returns the calibrated confidence of a pair, matched as clouds of surface elements or as scans."""
     kinds = ("of_elements",) if of_clouds else ("of_scans", "of_weak_scans")
     features = {kind: features_of(row, kind) for kind in kinds}
     known = {kind: np.asarray(values) for kind, values in features.items() if values is not None}
-    evidence = dpm.MatchEvidence(np.asarray(features_of(row, "of_clouds")), None)
+    evidence = MatchEvidence(np.asarray(features_of(row, "of_clouds")), None)
     evidence = evidence._replace(**known, lookalike_gap=lookalike_gap(row, kinds[0]))
-    return float(dpm.calibrated_probability(calibration, evidence))
+    return float(calibrated_probability(calibration, evidence))
 
 
-def fit_overlap(rows: Sequence[Row]) -> tuple[dpm.LogisticModel, Row, HeldOut]:
+def fit_overlap(rows: Sequence[Row]) -> tuple[LogisticModel, Row, HeldOut]:
     """Fits the regression of overlap.
 
     Args:
-        rows: pairs, each with its `place`, `is_overlap` and `dpm.OVERLAP_FEATURES`.
+        rows: pairs, each with its `place`, `is_overlap` and `OVERLAP_FEATURES`.
 
     Returns:
         The regression, its numbers, and the probability of the pairs of each place by a fit without it.
     """
-    features = np.array([[row[name] for name in dpm.OVERLAP_FEATURES] for row in rows], float)
+    features = np.array([[row[name] for name in OVERLAP_FEATURES] for row in rows], float)
     places, is_overlap = (np.array([row[name] for row in rows]) for name in ("place", "is_overlap"))
     examples = Examples(places, features, is_overlap, np.ones(len(places)))
-    fitted, found = fit_held_out(dpm.OVERLAP_FEATURES, examples)
+    fitted, found = fit_held_out(OVERLAP_FEATURES, examples)
     numbers: Row = {
         "num_overlap_pairs": len(places),
         "auc_overlap": metrics.area_under_curve(*found),
@@ -367,7 +394,7 @@ def fit_overlap(rows: Sequence[Row]) -> tuple[dpm.LogisticModel, Row, HeldOut]:
 
 def fit_held_out(
     names: tuple[str, ...], examples: Examples, tested: Examples | None = None
-) -> tuple[dpm.LogisticModel, HeldOut]:
+) -> tuple[LogisticModel, HeldOut]:
     """Fits a regression on all places, and predicts examples of places that their fit has not seen.
 
     Args:
@@ -379,12 +406,12 @@ def fit_held_out(
         The regression, and the probabilities and the labels of the tested examples.
     """
     place, features, labels, shares = examples
-    fitted = dpm.fit_logistic(names, features, labels, shares)
+    fitted = fit_logistic(names, features, labels, shares)
     if tested is not None:
-        return fitted, (tested.shares * dpm.logistic_probability(fitted, tested.features), tested.is_right)
+        return fitted, (tested.shares * logistic_probability(fitted, tested.features), tested.is_right)
     found = np.empty(len(place))
     for one in np.unique(place):
         part = place == one
-        without = dpm.fit_logistic(names, features[~part], labels[~part], shares[~part])
-        found[part] = shares[part] * dpm.logistic_probability(without, features[part])
+        without = fit_logistic(names, features[~part], labels[~part], shares[~part])
+        found[part] = shares[part] * logistic_probability(without, features[part])
     return fitted, (found, labels)

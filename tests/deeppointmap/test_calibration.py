@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli.calibrate import KINDS, MeasuredDrives, calibrate, column_of, fit_confidence, measure_overlap
 from dpmjax.deeppointmap import OVERLAP_FEATURES
+from dpmjax.deeppointmap.calibration import KINDS, MeasuredDrives, calibrate, column_of, fit_confidence, measure_overlap
 from tests.deeppointmap import toy
 
 
