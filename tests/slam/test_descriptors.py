@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dpmjax import load_model
-from dpmjax.cli.slam import Config, slam_methods
+from dpmjax.cli.slam import SlamOptions, slam_methods
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
 from dpmjax.metrics import absolute_trajectory_error
@@ -354,10 +354,11 @@ def test_the_head_predicts_overlap_where_it_is_trained(caplog) -> None:
 
 def test_options_of_one_method_are_refused_with_the_other(as_user) -> None:
     with pytest.raises(ValueError, match="--odometry"):
-        Config(preset="paper", odometry="network")
+        SlamOptions(preset="paper", odometry="network")
     with pytest.raises(ValueError, match="--max-rmse"):
-        Config(max_rmse=2.5)
-    assert slam_methods(Config(preset="paper", max_rmse=2.5)).config.descriptors == DescriptorConfig(max_rmse_m=2.5)
+        SlamOptions(max_rmse=2.5)
+    given = slam_methods(SlamOptions(preset="paper", max_rmse=2.5))
+    assert given.config.descriptors == DescriptorConfig(max_rmse_m=2.5)
 
 
 def test_submaps_are_in_the_frame_of_their_first_keyframe() -> None:
