@@ -54,7 +54,7 @@ def kinds(monkeypatch) -> list[str | None]:
         )
         of_elements = np.concatenate([of_clouds, rng.normal(size=len(ELEMENT_FEATURES) - 4) + is_right])
         motions.append((T, MatchEvidence(of_clouds, None, of_elements=of_elements)))
-        return StagedRegistration(T, T, T, evidence, 0.0)
+        return StagedRegistration(T, T, T, evidence, 0.5, 0.0)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
     monkeypatch.setattr(deeppointmap, "encode", lambda model, points, num_elements: points)

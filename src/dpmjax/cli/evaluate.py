@@ -28,7 +28,6 @@ from tyro.conf import Positional, arg
 from dpmjax import cli, deeppointmap, metrics, simulation, viz, weights
 from dpmjax.sequences import LidarSequence
 
-NAME = "evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 2
 FIRST_TOWN = 5_000_000
@@ -137,11 +136,9 @@ class EvaluationPairs:
 
 def registration_row(model: deeppointmap.Model, pair: deeppointmap.ScanPair) -> cli.Row:
     """Returns errors after each stage, confidence and seconds of the registration of a pair."""
-    found, calibration = deeppointmap.register_in_stages(model, pair), model.config.calibration
+    found = deeppointmap.register_in_stages(model, pair)
     motions = found.descriptors, found.verified, found.refined
-    row: cli.Row = {"confidence": float(found.evidence.of_clouds[1])}
-    if calibration is not None:
-        row["confidence"] = float(deeppointmap.calibrated_probability(calibration, found.evidence))
+    row: cli.Row = {"confidence": found.confidence}
     for stage, T_target_source in zip(STAGES, motions, strict=True):
         row |= motion_errors(stage, T_target_source, pair)
     return row | {"pair_s": found.seconds}

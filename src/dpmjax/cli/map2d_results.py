@@ -15,7 +15,6 @@ from dpmjax.sequences import FloatArray, ScanSequence
 if TYPE_CHECKING:
     from dpmjax.types import ScanSet
 
-UNITS = ("m", "deg")
 # Largest number of printed spans of uncertain scans.
 _NUM_SPANS = 8
 # Least number of common scans of a recording and its corrected log.

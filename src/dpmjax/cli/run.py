@@ -137,7 +137,7 @@ class Run:
             ValueError: OUT holds something, and neither --resume nor --force is given; there is nothing to resume; the
                 resumed run had other options; or --force would remove an input.
         """
-        self._name, self._options, self._started = name, options, time.perf_counter()
+        self._options, self._started = options, time.perf_counter()
         self._handler: logging.Handler | None = None
         self._lock: int | None = None
         self._signals: list[int] = []

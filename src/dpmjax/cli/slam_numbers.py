@@ -13,12 +13,6 @@ from dpmjax import geometry, metrics, slam
 from dpmjax.cli.run import Numbers
 from dpmjax.sequences import LidarSequence, counted
 
-MAX_LENGTH_RATIO, MIN_WAY_M = 30.0, 1.0
-"""Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres."""
-
-INVERTED_SHARE = 0.2
-"""Share of the error of the reference, below which the error of its inverse makes the reference doubtful."""
-
 
 class LocalizationErrors(NamedTuple):
     """Errors of n scans against the reference.

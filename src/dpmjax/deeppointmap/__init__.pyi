@@ -61,11 +61,9 @@ from .prepared_scans import PreparedScan as PreparedScan
 from .prepared_scans import prepare_scan as prepare_scan
 from .scan_evaluation import NO_OVERLAP_M as NO_OVERLAP_M
 from .scan_evaluation import OverlapEvaluation as OverlapEvaluation
-from .scan_evaluation import ScanEvaluation as ScanEvaluation
 from .scan_evaluation import StagedRegistration as StagedRegistration
 from .scan_evaluation import encode_turned as encode_turned
 from .scan_evaluation import evaluate_overlap as evaluate_overlap
-from .scan_evaluation import evaluate_scan_pairs as evaluate_scan_pairs
 from .scan_evaluation import overlap_candidates as overlap_candidates
 from .scan_evaluation import register_in_stages as register_in_stages
 from .scan_registration import distinct_motions as distinct_motions

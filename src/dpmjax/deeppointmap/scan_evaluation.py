@@ -8,7 +8,7 @@ evaluation.refined.recall
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -25,10 +25,9 @@ from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, overlap_pairs
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
 from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.metrics.drives import path_lengths
-from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.metrics.statistics import area_under_curve, brier_score
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import DescriptorCloud, Pose, Poses
+from dpmjax.types import DescriptorCloud, Pose
 
 # Scans between `OVERLAP_M` and this apart may see the same place; the evaluation leaves them out.
 NO_OVERLAP_M = 40.0
@@ -47,6 +46,7 @@ class StagedRegistration(NamedTuple):
         verified: motion under which the scans agree best.
         refined: verified motion after the final alignment.
         evidence: features of the confidence of the verified motion.
+        confidence: a probability where the model is calibrated, else the mean score of the pairs of descriptors.
         seconds: seconds of all stages.
     """
 
@@ -54,28 +54,8 @@ class StagedRegistration(NamedTuple):
     verified: Pose
     refined: Pose
     evidence: MatchEvidence
+    confidence: float
     seconds: float
-
-
-class ScanEvaluation(NamedTuple):
-    """Results of a model on pairs of scans.
-
-    Attributes:
-        descriptors: errors of the network alone.
-        verified: errors after the verification by the scans.
-        refined: errors after the final alignment.
-        confidence: confidence of each registration; a probability where the model is calibrated, else the mean score of
-            the pairs of descriptors.
-        T_target_source: refined motions.
-        seconds: seconds of each registration.
-    """
-
-    descriptors: RegistrationRecall
-    verified: RegistrationRecall
-    refined: RegistrationRecall
-    confidence: Float[np.ndarray, " p"]
-    T_target_source: Poses
-    seconds: Float[np.ndarray, " p"]
 
 
 def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
@@ -98,44 +78,14 @@ def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
     motions = distinct_motions(hypotheses)
     verified = choose_motion(source, target, motions, settings)
     refined = refine_motion(source, target, verified, settings)
+    evidence = gather_evidence(hypotheses, verified.row, verified.verification)
     return StagedRegistration(
         descriptors=motions[0],
         verified=verified.T_target_source,
         refined=refined.T_target_source,
-        evidence=gather_evidence(hypotheses, verified.row, verified.verification),
+        evidence=evidence,
+        confidence=_confidence(model, evidence),
         seconds=time.perf_counter() - begun,
-    )
-
-
-def evaluate_scan_pairs(model: Model, pairs: Iterable[ScanPair]) -> ScanEvaluation:
-    """Registers pairs of scans and compares the motions with the true ones.
-
-    Args:
-        model: encoder and decoder.
-        pairs: such as `read_scan_pairs` yields; the first one is registered twice, so that no time is that of a
-            compilation.
-
-    Returns:
-        Errors, confidence and seconds; right is within 2 m and 5 degrees.
-    """
-    found: list[StagedRegistration] = []
-    true = []
-    for pair in pairs:
-        if not found:
-            register_in_stages(model, pair)
-        found.append(register_in_stages(model, pair))
-        true.append(pair.T_target_source)
-
-    def errors(motions: list[Pose]) -> RegistrationRecall:
-        return registration_recall(np.reshape(motions, (-1, 4, 4)), np.reshape(true, (-1, 4, 4)))
-
-    return ScanEvaluation(
-        descriptors=errors([result.descriptors for result in found]),
-        verified=errors([result.verified for result in found]),
-        refined=errors([result.refined for result in found]),
-        confidence=np.array([_confidence(model, result.evidence) for result in found]),
-        T_target_source=np.reshape([result.refined for result in found], (-1, 4, 4)),
-        seconds=np.array([result.seconds for result in found]),
     )
 
 
