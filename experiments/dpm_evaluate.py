@@ -73,7 +73,7 @@ def main(options: PairOptions, run: cli.Run) -> cli.Row:
         raise ValueError(f"--clouds: expected from {low} to {high} elements a scan, got {options.clouds}")
     towns = cli.evaluation_towns(options.num_towns, options.town_length_m)
     drives = cli.open_evaluation_drives(options.paths, towns)
-    pairs = cli.EvaluationPairs(drives, options.pairs, options.seed)
+    pairs = cli.PairReader(drives, options.pairs, options.seed)
     no_kiss = "left out by --no-kiss" if options.no_kiss else cli.why_not_importable("kiss_matcher")
     matchers: dict[str, Matcher] = {"search": partial(search_alone, config=model.config.verification)}
     matchers |= {} if no_kiss else {"kiss": kiss_matcher}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.cli.map2d_results import spans_of, verdict
+from dpmjax.cli.map2d_results import spans_of, trust_verdict
 from dpmjax.geometry import se2
 from dpmjax.metrics import corrected_ate, planar_errors
 from dpmjax.simulation import simulate_sequence
@@ -39,7 +39,7 @@ def test_the_worst_scan_is_the_farthest_from_its_reference() -> None:
 def test_the_verdict_names_the_uncertain_scans_and_the_fault() -> None:
     assessment = {"is_trusted": False, "weakest_connection": 0.3, "contradiction": 0.01}
     assessment |= {"uncertain_scans": [3, 4, 5, 9], "fault": "the scans are mirrored"}
-    text = verdict(assessment)
+    text = trust_verdict(assessment)
     assert "DO NOT TRUST" in text
     assert "uncertain where 4 scans are" in text
     assert text.endswith("3-5, 9")

@@ -7,7 +7,7 @@ from .drives import keep_scans as keep_scans
 from .drives import open_drive as open_drive
 from .drives import with_reference_only as with_reference_only
 from .evaluate import FIRST_TOWN as FIRST_TOWN
-from .evaluate import EvaluationPairs as EvaluationPairs
+from .evaluate import PairReader as PairReader
 from .evaluate import draw_evaluation as draw_evaluation
 from .evaluate import evaluation_towns as evaluation_towns
 from .evaluate import fill_overlap as fill_overlap

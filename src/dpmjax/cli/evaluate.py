@@ -62,7 +62,7 @@ def main(options: EvaluateOptions, run: cli.Run) -> cli.Row:
     model = weights.load_model(options.weights)
     kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
     drives = open_evaluation_drives(options.data, evaluation_towns(options.num_towns, TOWN_LENGTH_M, kinds))
-    pairs = EvaluationPairs(drives, options.pairs, options.seed)
+    pairs = PairReader(drives, options.pairs, options.seed)
     run.open()
 
     def work(drive: str, band: str, pair: int) -> cli.Row:
@@ -104,7 +104,7 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> 
     return drives
 
 
-class EvaluationPairs:
+class PairReader:
     """Random pairs of scans of some drives, by the name of the drive, the band of distances and a number.
 
     Attributes:
@@ -206,7 +206,7 @@ def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.R
 
 
 def draw_evaluation(
-    run: cli.Run, model: deeppointmap.Model, pairs: EvaluationPairs, rows: Sequence[cli.Row], title: str
+    run: cli.Run, model: deeppointmap.Model, pairs: PairReader, rows: Sequence[cli.Row], title: str
 ) -> None:
     """Draws reliability.png, and failures.png: wrong registrations of overlapping pairs of the highest confidence."""
     confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))

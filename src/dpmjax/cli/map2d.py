@@ -146,7 +146,7 @@ def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, 
 
     return {
         "status": "done" if result.assessment.is_trusted else "uncertain",
-        "verdict": results.verdict(result.assessment._asdict()),
+        "verdict": results.trust_verdict(result.assessment._asdict()),
         "num_scans": len(sequence),
         "num_registered": len(registered),
         **results.before_and_after(registered, start, kept),

@@ -52,7 +52,7 @@ def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
     return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
 
 
-def verdict(assessment: Mapping[str, Any]) -> str:
+def trust_verdict(assessment: Mapping[str, Any]) -> str:
     """Returns whether the map can be trusted, why, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]

@@ -99,7 +99,7 @@ def main(options: SlamOptions, run: Run) -> Numbers:
         "compile_s": mapped.compile_s,
     }
     if result.reports:
-        numbers |= write_results(run, drive, numbers)
+        numbers |= write_map_results(run, drive, numbers)
     if mapped.failure is not None:
         run.write_numbers({**numbers, "status": "interrupted"})
         raise mapped.failure
@@ -142,7 +142,7 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
     return slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
 
 
-def write_results(run: Run, drive: MappedDrive, numbers: Numbers) -> Numbers:
+def write_map_results(run: Run, drive: MappedDrive, numbers: Numbers) -> Numbers:
     """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
     sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
     files.write_trajectory(run.path, result.T_world_scan, sequence.times)

@@ -163,8 +163,8 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     numbers["seed"] = options.seed
     ended = evaluate_and_calibrate(options, trained, records, numbers, chosen_sources(options, sources))
     numbers |= ended.numbers
-    numbers = {"verdict": train_files.verdict(numbers), **numbers}
-    train_files.write_results(records, trained, ended, numbers, origin=origin_of(options))
+    numbers = {"verdict": train_files.training_verdict(numbers), **numbers}
+    train_files.write_training(records, trained, ended, numbers, origin=origin_of(options))
     return numbers
 
 
@@ -262,7 +262,7 @@ def without_impossible_stage(
     return replace(settings, stages=("registration",))
 
 
-def calibrate(
+def calibrate_on_sources(
     model: deeppointmap.Model, sources: Sequence[cli.Source], seed: int, on_wait: Callable[[], object]
 ) -> tuple[deeppointmap.Model, Numbers]:
     """Returns the model with regressions of confidence and overlap, and their numbers on held-out places."""
@@ -323,7 +323,7 @@ def evaluate_and_calibrate(
     if options.calibrate and not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
         train_files.write_model(run / train_files.MODEL, model, {**numbers, **measured}, origin=origin_of(options))
-        model, calibration = calibrate(model, sources, options.seed, run.check_stop)
+        model, calibration = calibrate_on_sources(model, sources, options.seed, run.check_stop)
     return train_files.Ended(model, evaluation, {**measured, "calibration": calibration})
 
 

@@ -32,7 +32,7 @@ class Ended(NamedTuple):
     numbers: Numbers
 
 
-def write_results(
+def write_training(
     records: Records, trained: deeppointmap.Trained, ended: Ended, metrics: Numbers, *, origin: str
 ) -> None:
     """Writes all files of a run; numbers first, so that they are written even if a picture fails."""
@@ -100,7 +100,7 @@ def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppoint
     viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), run / "matches.png")
 
 
-def verdict(numbers: Numbers) -> str:
+def training_verdict(numbers: Numbers) -> str:
     """Returns the recall, the overlap, and the scans that were left out."""
     at = "" if numbers["best_step"] is None else f" (best, after step {numbers['best_step']})"
     text = f"ended after step {numbers['steps']}{at}; not evaluated"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.files import log_notes, natural_key
-from dpmjax.io.lidar_datasets import DRIVES, find_pose_file, is_drive, open_drive
+from dpmjax.io.lidar_datasets import DRIVES, find_pose_file, is_drive, open_folder
 from dpmjax.io.lidar_file import check_size, columns_of_drive, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, order_note
@@ -54,7 +54,7 @@ def open_lidar_sequence(
     require(is_good, path, f"bin_columns is {bin_columns}", "a point has x, y and z at least")
     is_recording = is_bag(path) and not is_drive(path)
     require(topic is None or is_recording or not path.exists(), path, "no bag of ROS", "leave the topic out")
-    whole = _open_bag(path, topic, poses) if is_recording else open_drive(_choose(path, sequence), poses, bin_columns)
+    whole = _open_bag(path, topic, poses) if is_recording else open_folder(_choose(path, sequence), poses, bin_columns)
     of_poses = None if whole.T_world_lidar is None else camera_note(whole.T_world_lidar, poses or path)
     of_times = None if whole.times is None else order_note(whole.times, path)
     notes = (*whole.notes, *(note for note in (of_poses, of_times) if note is not None))

@@ -322,7 +322,7 @@ def is_drive(path: Path) -> bool:
     return bool(layout.marker or scan_files(path / layout.scans))
 
 
-def open_drive(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
+def open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
     """Opens the drive in a folder.
 
     Args:

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.checks import as_float, as_mask, runs_on_host
+from dpmjax.checks import as_float, as_mask, require_shape, runs_on_host
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
 from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
@@ -288,12 +288,6 @@ def checked_poses(xp: ModuleType = np, **poses: AnyArray) -> list[Any]:
 def as_floats(name: str, value: AnyArray, xp: ModuleType) -> Any:
     """Returns an array of NumPy as float64, an array of JAX in its dtype."""
     return np.asarray(value, np.float64) if xp is np else as_float(name, value)
-
-
-def require_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
-    """Raises a ValueError for another shape."""
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
 
 
 def require_finite(name: str, array: Any) -> None:
