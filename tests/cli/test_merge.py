@@ -126,8 +126,3 @@ def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, maps, weights, me
     assert message in errors
     assert errors.count("\n") == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_help_shows_examples(capsys) -> None:
-    assert run("--help") == EXIT_OK
-    assert "dpmjax merge monday/map.npz tuesday/map.npz -o both" in capsys.readouterr().out

@@ -92,11 +92,6 @@ def table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def test_help_shows_examples(capsys) -> None:
-    assert run("--help") == 0
-    assert "dpmjax slam path/to/drive -o out" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
