@@ -208,11 +208,15 @@ def test_values_of_every_kind_are_read():
     assert parse("--world", "1") == replace(ToyOptions(), world=1)
 
 
+def test_a_check_of_the_options_says_what_it_expects():
+    with pytest.raises(ValueError, match="^--steps: expected at least 1, got 0$"):
+        parse("a", "-n", "0")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("a -n x", "--steps: .*'x'"),
-        ("a -n 0", "--steps: expected at least 1, got 0"),
         ("a --device tpu", "'tpu' for argument '--device'. Expected one of .*'cpu'"),
         ("a --seconds", "Missing value for argument '--seconds'"),
         ("a --second 3", "Unrecognized options: --second, 3"),

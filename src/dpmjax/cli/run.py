@@ -406,6 +406,9 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
     rows = (row[2:].strip("│ ") for row in re.sub("\x1b[^m]*m", "", box.getvalue()).splitlines()[1:])
     is_text = lambda row: bool(row.strip(" ─-"))  # noqa: E731
     message = " ".join(itertools.takewhile(is_text, itertools.dropwhile(lambda row: not is_text(row), rows)))
+    own = f"Error parsing {options_type.__name__}: "
+    if message.startswith(own):  # a check of the options themselves
+        raise ValueError(message.removeprefix(own))
     raise ValueError(f"{message.rstrip('.') or 'wrong options'}; --help describes the options")
 
 
