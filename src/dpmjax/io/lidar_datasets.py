@@ -99,6 +99,9 @@ def _read_learned(folder: Path, files: list[Path]) -> SideData:
     """Reads the poses in N.npz: lidar_pcd, ego_rotation, ego_translation (DeepPointMap's published data).
 
     Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
+
+    Returns:
+        Poses, times and notes; none where the files are missing.
     """
     keys = ("ego_rotation", "ego_translation")
     poses: list[FloatArray | None] = []
@@ -123,6 +126,9 @@ def _read_kitti(folder: Path, files: list[Path]) -> SideData:
 
     Poses of the left camera are searched in poses.txt beside velodyne/ (SemanticKITTI) and in poses/NN.txt two folders
     up: of the folder as it was given, because it may be a link, and the poses lie beside the link.
+
+    Returns:
+        Poses, times and notes; none where the files are missing.
     """
     given = Path(os.path.abspath(folder))
     above = given.parent.parent / "poses" / f"{given.name}.txt"
@@ -154,6 +160,9 @@ def _read_kitti_360(folder: Path, files: list[Path], times: FloatArray | None) -
 
     The data set has no poses where the car stands; poses of such scans are interpolated. Scans before the first and
     after the last pose have no reference.
+
+    Returns:
+        Poses, times and notes; none where the files are missing.
     """
     root = folder.parent.parent
     path, calibration = root / "data_poses" / folder.name / "poses.txt", root / "calibration"
@@ -173,6 +182,9 @@ def _read_carla(folder: Path, files: list[Path]) -> SideData:
 
     Frame i has pose 100 i; a row of poses has 12 numbers and a time. Frames are not corrected for the motion of the car
     during a turn.
+
+    Returns:
+        Poses, times and notes; none where the files are missing.
     """
     path = files[0].parent.parent / "full_poses_lidar.txt"
     if not path.is_file():
@@ -188,6 +200,9 @@ def _read_mulran(folder: Path, files: list[Path]) -> SideData:
     """Reads poses and times of MulRan: Ouster/STAMP.bin (nanoseconds), and global_pose.csv of the car at 100 Hz.
 
     The world is the first lidar frame with a pose. Scans half a second or more outside of the poses have no reference.
+
+    Returns:
+        Poses, times and notes; none where the files are missing.
     """
     from scipy.spatial.transform import Rotation
 
