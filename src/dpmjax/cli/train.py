@@ -322,6 +322,7 @@ def evaluate_and_calibrate(
     evaluation, measured = (None, {}) if run.is_stopped else evaluate(trained, records)
     if options.calibrate and not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
+        run.write_numbers({**numbers, **measured, "status": "interrupted"})
         train_files.write_model(run / train_files.MODEL, model, {**numbers, **measured}, origin=origin_of(options))
         model, calibration = calibrate_on_sources(model, sources, options.seed, run.check_stop)
     return train_files.Ended(model, evaluation, {**measured, "calibration": calibration})
