@@ -82,15 +82,6 @@ def test_points_of_a_line_or_of_one_place_are_no_plane() -> None:
         assert np.isfinite(found.normals).all()
 
 
-def test_elements_are_compiled_once_and_batched() -> None:
-    pyramids = [build_pyramid(plane(noise=noise), None, CONFIG) for noise in (0.01, 0.02)]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *pyramids)
-    batched = jax.jit(jax.vmap(lambda pyramid: pyramid_elements(pyramid, 96)))(stacked)
-    for row, pyramid in enumerate(pyramids):
-        expected = pyramid_elements(pyramid, 96)
-        jax.tree.map(lambda a, b, row=row: np.testing.assert_allclose(a, b[row], atol=1e-4), expected, batched)
-
-
 @pytest.mark.parametrize("num", [0, 97])
 def test_more_elements_than_points_are_refused(num: int) -> None:
     with pytest.raises(ValueError, match="num_elements: expected from 1 to 96"):

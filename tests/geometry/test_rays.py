@@ -23,17 +23,6 @@ def test_samples_lie_on_their_segments(dim: int, is_shared: bool) -> None:
             np.testing.assert_allclose(samples[beam, i], expected, **ROUNDING)
 
 
-def test_factors_zero_and_one_are_the_ends() -> None:
-    origin, points = np.array([1, 2], np.float32), np.array([[3, 5], [0.5, -1]], np.float32)
-    samples = np.asarray(sample_free_space(origin, points, np.array([0, 1], np.float32)))
-    np.testing.assert_array_equal(samples[:, 0], np.stack([origin, origin]))
-    np.testing.assert_array_equal(samples[:, 1], points)
-
-
-def test_no_beams_give_no_samples() -> None:
-    assert sample_free_space(jnp.zeros(2), jnp.zeros((0, 2)), jnp.ones(3)).shape == (0, 3, 2)
-
-
 def test_wrong_shapes_are_named(as_user) -> None:
     with pytest.raises(ValueError, match="^origin: expected shape"):
         sample_free_space(jnp.zeros(3), jnp.zeros((4, 2)), jnp.ones(3))

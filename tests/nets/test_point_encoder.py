@@ -13,9 +13,8 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import ray_directions, to_ray_frame
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid_on_host
 from dpmjax.nets import DecoderConfig, EncoderConfig
-from dpmjax.nets.point_encoder import NeighbourhoodMaximum
 from dpmjax.types import PointPyramid
-from tests.tolerances import ACCUMULATED, ROUNDING
+from tests.tolerances import ROUNDING
 
 CONFIG = ModelConfig(
     pyramid=PyramidConfig((PyramidStage(24, (0.3, 0.5), 6), PyramidStage(6, (1.0,), 3)), 1),
@@ -41,30 +40,12 @@ def pyramid_of(cloud: np.ndarray, capacity: int | None = None, config: ModelConf
     return jax.device_put(build_pyramid_on_host(front, np.arange(capacity) < len(cloud), config.pyramid))
 
 
-def norm(x: np.ndarray, scale: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * scale + bias
-
-
 def poisoned(pyramid: PointPyramid) -> PointPyramid:
     """The same with NaN wherever nothing is."""
     levels = tuple(
         level.replace(positions=jnp.where(level.mask[:, None], level.positions, jnp.nan)) for level in pyramid.levels
     )
     return pyramid.replace(levels=levels)
-
-
-@pytest.mark.slow
-def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
-    rng = np.random.default_rng(0)
-    features, offsets, neighbours = rng.normal(size=(9, 5)), rng.normal(size=(6, 4, 3)), rng.integers(0, 9, (6, 4))
-    inputs = (*(jnp.asarray(x, jnp.float32) for x in (features, offsets)), neighbours)
-    module = NeighbourhoodMaximum(7)
-    params = module.init(jax.random.key(0), *inputs)["params"]
-    params = {name: jnp.asarray(rng.normal(size=value.shape), jnp.float32) for name, value in params.items()}
-    rows = np.concatenate([features[neighbours], offsets], axis=-1)
-    rows = norm(rows @ params["kernel"] + params["bias"], params["norm_scale"], params["norm_bias"])
-    expected = np.maximum(rows, 0).max(axis=1)
-    np.testing.assert_allclose(module.apply({"params": params}, *inputs), expected, **ACCUMULATED)
 
 
 @pytest.mark.slow
@@ -115,17 +96,6 @@ def test_gradient_is_finite_in_degenerate_clouds_too(model: Model) -> None:
         gradient = gradient_of(model, poisoned(pyramid_of(cloud, capacity=30)))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert any(leaf.any() for leaf in jax.tree.leaves(gradient.params["encoder"]["stage_0"]))
-
-
-def test_vmap_equals_a_loop_and_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
-    pyramids = [pyramid_of(points(seed)) for seed in (6, 7)]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pyramids)
-    found = jax.device_get(jax.vmap(encode_pyramid, (None, 0))(model, batch))
-    first = jax.device_get(encode_pyramid(model, pyramids[0]))
-    with assert_compiles_nothing():
-        second = jax.device_get(encode_pyramid(model, pyramids[1]))
-    for i, cloud in enumerate((first, second)):
-        np.testing.assert_allclose(found.features[i], cloud.features, **ACCUMULATED)
 
 
 def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
