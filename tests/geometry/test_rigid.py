@@ -80,15 +80,6 @@ def test_inverse_undoes_a_motion(dim: int) -> None:
     np.testing.assert_allclose(rigid.inverse(single), np.linalg.inv(T), **ROUNDING)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_composed_motions_move_points_one_after_the_other(dim: int) -> None:
-    T_a_b, T_b_c = (random_motions(seed, 5, dim).astype(np.float32) for seed in (9, 10))
-    points = np.random.default_rng(11).normal(size=(5, 7, dim)).astype(np.float32)
-    expected = rigid.transform_points(T_a_b, rigid.transform_points(T_b_c, points))
-    np.testing.assert_allclose(rigid.transform_points(rigid.compose(T_a_b, T_b_c), points), expected, **ROUNDING)
-    assert rigid.compose(T_a_b[:, None], T_b_c).shape == (5, 5, dim + 1, dim + 1)
-
-
 def test_wrong_matrix_size_is_named(as_user) -> None:
     with pytest.raises(ValueError, match="T_a_b: expected shape"):
         rigid.transform_points(jnp.eye(4), jnp.ones((5, 2)))

@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model import Model, encode_pyramid, init_model, model_shapes
 from dpmjax.deeppointmap.model_config import ModelConfig
@@ -61,14 +58,6 @@ def test_padded_equals_unpadded(model: Model) -> None:
     np.testing.assert_allclose(found.positions[:19], expected.positions, **ROUNDING)
     assert not found.features[19:].any()
     assert not found.positions[19:].any()
-
-
-def test_descriptors_stand_on_sampled_points_in_metres(model: Model) -> None:
-    cloud = points(2)
-    found = encode_pyramid(model, pyramid_of(cloud))
-    assert found.positions.shape == (CONFIG.num_descriptors, 3)
-    distances = np.linalg.norm(np.asarray(found.positions)[:, None] - 60 * cloud[None], axis=-1)
-    np.testing.assert_allclose(distances.min(axis=1), 0, atol=1e-5)
 
 
 def test_order_of_neighbours_changes_nothing(model: Model) -> None:
@@ -129,22 +118,6 @@ def test_wrong_pyramids_and_widths_are_named(as_user, model: Model) -> None:
         EncoderConfig(compute_dtype="float16")
     with pytest.raises(ValueError, match="^decoder.input_channels: expected the encoder's output_channels 128, got 64"):
         ModelConfig(decoder=DecoderConfig(input_channels=64))
-
-
-@pytest.mark.slow
-def test_frames_of_points_do_not_see_a_turn_about_the_vertical() -> None:
-    config = replace(CONFIG, encoder=replace(CONFIG.encoder, frame="local"))
-    model = init_model(jax.random.key(0), config)
-    pyramid = pyramid_of(points(5))
-    turn = Rotation.from_euler("z", 130, degrees=True).as_matrix().astype(np.float32)
-    turned = pyramid.replace(
-        levels=tuple(level.replace(positions=level.positions @ turn.T) for level in pyramid.levels)
-    )
-    before, after = encode_pyramid(model, pyramid), encode_pyramid(model, turned)
-    np.testing.assert_allclose(after.features, before.features, atol=1e-4)
-    np.testing.assert_allclose(after.positions, before.positions @ turn.T, atol=1e-4)
-    in_lidar_frame = encode_pyramid(init_model(jax.random.key(0), CONFIG), turned).features
-    assert np.abs(in_lidar_frame - before.features).max() > 0.1
 
 
 def test_direction_along_the_ray_is_x() -> None:
