@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import pickle
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -175,9 +174,7 @@ def test_converter_converts(model: Model, tmp_path: Path) -> None:
     assert read_card(tmp_path / "b.safetensors") == "copy"
 
 
-def test_converter_tells_bad_input_in_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "dpmjax.weights", str(tmp_path / "no.pth"), str(tmp_path / "x.safetensors")]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 2
-    assert result.stderr.strip().count("\n") == 0
-    assert "no.pth: no such file" in result.stderr
+def test_converter_tells_bad_input_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "no.pth"), str(tmp_path / "x.safetensors")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no.pth: no such file" in line

@@ -26,8 +26,7 @@ from tests.tolerances import ACCUMULATED
 
 
 @pytest.mark.slow
-def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
-    model = init_model(jax.random.key(0), toy.MODEL)
+def test_each_scan_of_an_evaluation_is_encoded_in_its_row(model) -> None:
     pairs = draw_evaluation_pairs([toy.drive(num_scans=4)], 2, toy.MODEL)
     clouds = evaluate_registration(model, pairs).clouds
     for row, pyramid in enumerate(pairs.pyramids):
@@ -38,8 +37,7 @@ def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
 
 
 @pytest.mark.slow
-def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(assert_compiles_nothing) -> None:
-    model = init_model(jax.random.key(0), toy.MODEL)
+def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(model, assert_compiles_nothing) -> None:
     kinds = (PairKind(2.0, 10.0), PairKind(2.0, 10.0, num_scans=3))
     few, many = (
         draw_evaluation_pairs([toy.drive(num_scans=num_scans)], num_pairs, toy.MODEL, kinds=kinds)

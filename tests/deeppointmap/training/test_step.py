@@ -177,7 +177,6 @@ def test_devices_share_the_anchors_of_an_epoch(maker) -> None:
     num = len(toy.store().table)
     alone = [maker._anchor(step, 0) for step in range(num)]
     assert sorted(alone) == list(range(num))
-    # Two devices share the scans of an epoch, so that it takes half the steps.
     assert [both._anchor(step, number) for step in range(num // 2) for number in range(2)] == alone
 
 
