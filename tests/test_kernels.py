@@ -91,7 +91,8 @@ def test_jit_and_vmap_are_the_call(kernel: Kernel, assert_compiles_nothing) -> N
 def test_padding_and_points_without_a_place_change_nothing(kernel: Kernel) -> None:
     arrays, program = example(kernel), compiled(kernel)
     expected = kernel.call(**arrays)
-    assert_close(program(padded(kernel, arrays)), expected)
+    for hidden in (np.nan, 0.5):
+        assert_close(program(padded(kernel, arrays, hidden=hidden)), expected)
     for point in (np.nan, np.inf, -np.inf, 1e19) if kernel.points else ():
         assert_close(program(padded(kernel, arrays, point)), expected)
 
