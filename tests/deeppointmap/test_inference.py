@@ -42,16 +42,6 @@ def test_a_motion_that_only_the_scans_suggest_has_no_inliers(model, scans) -> No
     assert np.isinf(match.rmse)
 
 
-def test_a_scan_on_itself_does_not_move_where_offsets_are_zero(model, scans) -> None:
-    decoder = {
-        **model.params["decoder"],
-        "offset_head": jax.tree.map(np.zeros_like, model.params["decoder"]["offset_head"]),
-    }
-    match = dpmjax.register(model.replace(params={**model.params, "decoder": decoder}), scans[0], scans[0])
-    np.testing.assert_allclose(match.T_target_source, np.eye(4), atol=1e-4)
-    assert match.rmse < 1e-3
-
-
 def test_points_that_are_not_there_change_nothing(model, scans) -> None:
     padded = np.concatenate([scans[0], np.full((7, 3), np.nan, np.float32)])
     mask = np.arange(len(padded)) < len(scans[0])

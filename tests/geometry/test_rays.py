@@ -16,11 +16,9 @@ def test_samples_lie_on_their_segments(dim: int, is_shared: bool) -> None:
     origin, points = rng.normal(size=dim).astype(np.float32), rng.normal(size=(7, dim)).astype(np.float32)
     factors = rng.uniform(size=4 if is_shared else (7, 4)).astype(np.float32)
     samples = np.asarray(sample_free_space(origin, points, factors))
-    for beam in range(7):
-        for i in range(4):
-            factor = factors[i] if is_shared else factors[beam, i]
-            expected = (1 - factor) * origin + factor * points[beam]
-            np.testing.assert_allclose(samples[beam, i], expected, **ROUNDING)
+    for beam, i in np.ndindex(7, 4):
+        factor = factors[i] if is_shared else factors[beam, i]
+        np.testing.assert_allclose(samples[beam, i], (1 - factor) * origin + factor * points[beam], **ROUNDING)
 
 
 def test_wrong_shapes_are_named(as_user) -> None:

@@ -33,7 +33,7 @@ def rotations(turn: np.ndarray) -> np.ndarray:
     """The rotation matrices of rotation vectors, or of headings."""
     if turn.shape[-1] == 3:
         return Rotation.from_rotvec(turn).as_matrix()
-    return Rotation.from_euler("z", turn[..., 0]).as_matrix()[..., :2, :2]
+    return Rotation.from_rotvec(turn * [0.0, 0.0, 1.0]).as_matrix()[..., :2, :2]
 
 
 def mean_rotation(turn: np.ndarray) -> np.ndarray:
