@@ -71,6 +71,17 @@ def test_motion_is_the_best_one_of_its_inliers() -> None:
     np.testing.assert_allclose(match.rmse, np.sqrt(np.mean(np.sum(residuals**2, axis=1))), rtol=1e-3)
 
 
+def test_one_far_outlier_is_dropped_in_rounds() -> None:
+    source, target, similarity = clouds(2)
+    target[0] += np.float32(100)
+    match = match_clouds(source, target, similarity, config=MatchConfig(pair_ratio=1.0))
+    moved = np.asarray(rigid.transform_points(T, source[match.source_indices]))
+    is_wrong = np.linalg.norm(moved - target[match.target_indices], axis=1) > 1
+    assert is_wrong.sum() == 2
+    assert not np.any(np.asarray(match.is_inlier)[is_wrong])
+    np.testing.assert_allclose(match.T_target_source, T, atol=5e-4)
+
+
 def test_offsets_of_both_directions_move_points_onto_each_other() -> None:
     # Eq. 1 and 2: each descriptor lies up to a metre from its partner, and the offsets tell exactly where.
     rng = np.random.default_rng(3)
