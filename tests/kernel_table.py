@@ -342,11 +342,11 @@ def example(kernel: Kernel, seed: int = 0, dtype: Any = None) -> Arrays:
     return {name: jnp.asarray(value, dtype if value.dtype.kind == "f" else None) for name, value in arrays.items()}
 
 
-def padded(kernel: Kernel, arrays: Arrays, point: float | None = None) -> Arrays:
-    """Arrays with further rows: masked ones, or with a number for `point` unmasked ones that hold it."""
+def padded(kernel: Kernel, arrays: Arrays, point: float | None = None, hidden: float = np.nan) -> Arrays:
+    """Arrays with further rows: masked ones that hold `hidden`, or with a number for `point` unmasked ones of it."""
 
     def pad(name: str, value: Any) -> Any:
-        filler = kernel.padding[name]
+        filler = hidden if kernel.padding[name] is np.nan else kernel.padding[name]
         if point is not None:
             filler = point if name in kernel.points else 1
         return jnp.concatenate([value, jnp.full((EXTRA, *value.shape[1:]), filler, value.dtype)])

@@ -54,10 +54,8 @@ def bare() -> list[MeasuredScan]:
 
 def confidence(found: VerifiedMotion) -> float:
     """Of the shipped model."""
-    calibration = dpmjax.load_model("dpm_small").config.calibration
-    assert calibration is not None
-    assert calibration.of_weak_scans is not None
-    return float(logistic_probability(calibration.of_weak_scans, weak_features(found.verification)))
+    model = dpmjax.load_model("dpm_small").config.calibration.of_weak_scans
+    return float(logistic_probability(model, weak_features(found.verification)))
 
 
 def along_the_corridor(distance_m: float, turn_deg: float = 0.0) -> np.ndarray:
@@ -76,11 +74,11 @@ def test_the_motion_is_found_from_any_shift_and_half_turn(with_pillars, distance
     assert refined.verification.facing_gap == found.verification.facing_gap
 
 
-def test_a_bare_corridor_is_never_sure_of_the_shift(bare) -> None:
+def test_a_bare_corridor_is_never_sure_of_the_shift(bare, with_pillars) -> None:
     found = choose_motion(*bare, T_TRUE[None], CONFIG)
     assert found.verification.num_slid > 0
     assert confidence(found) < 0.5
-    assert confidence(choose_motion(*scans_of(PILLARS_M), T_TRUE[None], CONFIG)) > 0.9
+    assert confidence(choose_motion(*with_pillars, T_TRUE[None], CONFIG)) > 0.9
 
 
 def elements_of(scan: MeasuredScan) -> MeasuredScan:
@@ -176,15 +174,6 @@ def test_the_motions_go_both_ways_round_as_far_as_the_scans_reach(bare) -> None:
         shifts = np.sort(along[np.sign(along[:, 0, 0]) == sign, 0, 3])
         assert np.diff(shifts).max() < 0.75
         assert np.ptp(shifts) > RANGE_M
-
-
-def test_only_elements_that_face_the_axis_are_compared(with_pillars) -> None:
-    surface, axis = with_pillars[0].surface, POSES[0][:3, :3].T[:, 0]
-    facing, _ = facing_samples(surface, axis, np.inf)
-    assert 0 < len(facing.samples) < len(surface.samples) / 10
-    at_pillars = (surface.points[facing.samples] @ POSES[0][:3, :3].T + POSES[0][:3, 3])[:, 0]
-    distances = np.abs(at_pillars[:, None] - np.array([*PILLARS_M, *(x + 0.6 for x in PILLARS_M)])).min(axis=1)
-    assert np.median(distances) < 0.1
 
 
 def test_an_end_wall_counts_as_one_position(with_pillars) -> None:

@@ -64,7 +64,6 @@ def test_nothing_competes_where_the_search_is_off_or_no_motion_is_clear() -> Non
 
 def test_two_places_of_one_score_share_the_probability() -> None:
     calibration = dpmjax.load_model("dpm_small").config.calibration
-    assert calibration is not None
     scans = np.array([80.0, 0.5, 0.3, 60.0, 0.8, 0.9, 0.0, 10.0, 10.0])
     alone = calibrated_probability(calibration, MatchEvidence(scans[:4], scans))
     assert alone > 0.95

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap import MatchConfig, merge_clouds
 from dpmjax.deeppointmap.matching import best_pairs, thin_merged
 from dpmjax.geometry import ConsensusConfig, rigid
-from dpmjax.types import DescriptorCloud, Registration
+from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
-from tests.tolerances import ACCUMULATED, ALIGNMENT, ROUNDING
+from tests.tolerances import ACCUMULATED, ALIGNMENT
 
 T = np.asarray(rigid.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
 CONFIG = MatchConfig()
@@ -45,12 +45,6 @@ def dual_softmax_in_numpy(similarity: np.ndarray, temperature: float) -> np.ndar
     return powers / powers.sum(axis=0) * (powers / powers.sum(axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize(("num", "expected"), [(256, 128), (1100, 550)])
-def test_the_number_of_pairs_is_the_published_one_for_maps_too(num: int, expected: int) -> None:
-    similarity, mask = jax.random.uniform(jax.random.key(0), (num, num)), jnp.ones(num, bool)
-    assert int(best_pairs(similarity, mask, mask, config=MatchConfig()).mask.sum()) == expected
-
-
 @pytest.mark.parametrize("shape", [(30, 30), (20, 50)])
 def test_best_pairs_have_the_highest_dual_softmax(shape: tuple[int, int]) -> None:
     similarity = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
@@ -61,14 +55,6 @@ def test_best_pairs_have_the_highest_dual_softmax(shape: tuple[int, int]) -> Non
     assert len(best.scores) == count
     np.testing.assert_allclose(best.scores, np.sort(scores.ravel())[::-1][:count], **ACCUMULATED)
     np.testing.assert_allclose(best.scores, scores[best.source_indices, best.target_indices], **ACCUMULATED)
-
-
-def test_motion_is_found_from_all_pairs() -> None:
-    match = match_clouds(*clouds(1), config=MatchConfig(pair_ratio=1.0))
-    np.testing.assert_allclose(match.T_target_source, T, atol=2e-4)
-    assert match.num_inliers > 140
-    assert match.rmse < 1e-3
-    assert match.confidence > 0.9
 
 
 def test_motion_is_the_best_one_of_its_inliers() -> None:
@@ -89,13 +75,10 @@ def test_one_far_outlier_is_dropped_in_rounds() -> None:
     source, target, similarity = clouds(2)
     target[0] += np.float32(100)
     match = match_clouds(source, target, similarity, config=MatchConfig(pair_ratio=1.0))
-    is_wrong = (
-        np.linalg.norm(rigid.transform_points(T, source[match.source_indices]) - target[match.target_indices], axis=1)
-        > 1
-    )
+    moved = np.asarray(rigid.transform_points(T, source[match.source_indices]))
+    is_wrong = np.linalg.norm(moved - target[match.target_indices], axis=1) > 1
     assert is_wrong.sum() == 2
     assert not np.any(np.asarray(match.is_inlier)[is_wrong])
-    assert match.num_inliers > 140
     np.testing.assert_allclose(match.T_target_source, T, atol=5e-4)
 
 
@@ -127,29 +110,6 @@ def test_pairs_with_long_offsets_are_dropped() -> None:
     assert 30 <= match.num_inliers <= 40
     assert not np.any(match.is_inlier[:40])
     np.testing.assert_allclose(match.T_target_source, T, atol=2e-4)
-
-
-def test_confidence_is_the_mean_score_of_the_first_inliers() -> None:
-    source, target, similarity = clouds(5)
-    match = jax.device_get(match_clouds(source, target, similarity))
-    np.testing.assert_allclose(match.confidence, match.scores[match.is_inlier][:30].mean(), **ROUNDING)
-
-
-def test_padded_equals_unpadded() -> None:
-    source, target, similarity = clouds(6)
-    target = target + np.random.default_rng(6).normal(scale=0.1, size=target.shape).astype(np.float32)
-    padded_source = np.concatenate([source, np.full((20, 3), np.nan, np.float32)])
-    padded_target = np.concatenate([np.full((7, 3), np.nan, np.float32), target])
-    padded_similarity = np.full((100, 87), np.nan, np.float32)
-    padded_similarity[:80, 7:] = similarity
-    padded = jax.device_get(
-        match_clouds(padded_source, padded_target, padded_similarity, masks=(np.arange(100) < 80, np.arange(87) >= 7))
-    )
-    plain = jax.device_get(match_clouds(source, target, similarity))
-    np.testing.assert_allclose(padded.T_target_source, plain.T_target_source, atol=1e-4)
-    np.testing.assert_allclose(padded.confidence, plain.confidence, **ROUNDING)
-    np.testing.assert_allclose(padded.rmse, plain.rmse, atol=1e-4)
-    assert padded.num_inliers == plain.num_inliers
 
 
 @pytest.mark.parametrize("num", [0, 1, 2, 3])
@@ -191,47 +151,12 @@ def test_gradient_is_finite() -> None:
         assert np.isfinite(gradient(jnp.full(3, 0.1), np.arange(80) < num_valid)).all()
 
 
-def test_vmap_equals_a_loop() -> None:
-    many = [clouds(seed) for seed in (9, 10)]
-    batched: Registration = jax.vmap(match_clouds)(*(jnp.stack(arrays) for arrays in zip(*many, strict=True)))
-    for i, arrays in enumerate(many):
-        np.testing.assert_allclose(batched.T_target_source[i], match_clouds(*arrays).T_target_source, atol=1e-4)
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    step = jax.jit(match_clouds)
-    step(*clouds(11))
-    with assert_compiles_nothing():
-        step(*clouds(12))
-
-
-def test_map_to_map_is_scan_to_scan_of_merged_clouds() -> None:
-    source, target, similarity = clouds(13)
-    cloud = DescriptorCloud(jnp.asarray(source), jnp.ones((80, 4)), jnp.arange(80) < 80)
-    halves = jax.tree.map(lambda leaf: leaf.reshape(2, 40, *leaf.shape[1:]), cloud)
-    T_map_cloud = jnp.stack([jnp.eye(4), jnp.asarray(T)])
-    in_own_frames = halves.positions.at[1].set(rigid.transform_points(np.linalg.inv(T), halves.positions[1]))
-    merged = merge_clouds(halves.replace(positions=in_own_frames), T_map_cloud)
-    np.testing.assert_allclose(merged.positions, source, atol=1e-4)
-    match = toy.best_match(merged, toy.cloud(target), similarity, no_offsets, config=CONFIG)
-    np.testing.assert_allclose(match.T_target_source, T, atol=5e-4)
-
-
-def test_merging_ignores_what_is_masked() -> None:
-    positions = jnp.full((2, 3, 3), jnp.nan).at[0, 0].set(1.0)
-    mask = jnp.zeros((2, 3), bool).at[0, 0].set(True)
-    T_map_cloud = jnp.stack([jnp.eye(4), jnp.full((4, 4), jnp.nan)])
-    merged = merge_clouds(DescriptorCloud(positions, jnp.ones((2, 3, 5)), mask), T_map_cloud)
-    assert merged.features.shape == (6, 5)
-    np.testing.assert_array_equal(merged.mask, [True] + 5 * [False])
-    np.testing.assert_array_equal(merged.positions, [[1.0] * 3] + 5 * [[0.0] * 3])
-
-
 def test_merging_turns_elements_and_leaves_those_with_features_in_front() -> None:
     rng = np.random.default_rng(0)
     positions, normals = rng.normal(size=(2, 2, 5, 3)).astype(np.float32)
     features = rng.normal(size=(2, 3, 4)).astype(np.float32)
     mask = np.array([[True] * 5, [True, False, True, True, False]])
+    positions[~mask] = np.nan
     clouds = DescriptorCloud(
         positions, features, mask, normals=normals, planarity=rng.random((2, 5)).astype(np.float32)
     )

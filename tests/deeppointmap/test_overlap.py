@@ -23,15 +23,9 @@ from dpmjax.deeppointmap.overlap_prediction import (
 )
 from dpmjax.slam import KeyframeMap
 from dpmjax.types import DescriptorCloud
-from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
 NUM = 9
-
-
-@pytest.fixture(scope="module")
-def model() -> dpmjax.Model:
-    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +84,6 @@ def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
 
 
 @pytest.mark.slow
-def test_a_scan_is_as_similar_to_itself_as_can_be(model) -> None:
-    found = overlap_evidence(model, cloud(1), cloud(1))
-    same = (found.scan_similarity, found.similarity_median, found.mutual_share)
-    np.testing.assert_allclose(same, 1, rtol=1e-5)
-    assert found.log_radius_ratio == 0
-
-
-@pytest.mark.slow
 def test_padded_equals_unpadded(model) -> None:
     found, expected = overlap_evidence(model, cloud(1, 3), cloud(2, 5)), overlap_evidence(model, cloud(1), cloud(2))
     np.testing.assert_allclose(found, expected, **ACCUMULATED)
@@ -148,8 +134,3 @@ def test_overlap_that_was_never_trained_is_refused_by_the_name_of_the_command(mo
     untrained = model.replace(config=replace(model.config, trained=("registration",)))
     with pytest.raises(ValueError, match="dpmjax train --stages overlap --weights FILE"):
         call(untrained)
-
-
-def test_the_fit_is_stored_with_the_model(fitted, tmp_path) -> None:
-    dpmjax.save_model(fitted, tmp_path / "m.safetensors")
-    assert dpmjax.load_model(tmp_path / "m.safetensors").config == fitted.config

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import init_model, model_preset, prepared_scans
+from dpmjax.deeppointmap import init_model, model_preset
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
-from dpmjax.deeppointmap.model import Model, model_fingerprint
+from dpmjax.deeppointmap.model import model_fingerprint
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.prepared_scans import compact_scan, expand_scan, round_directions, round_features
 from dpmjax.deeppointmap.verification import VerificationConfig, measure_scan
@@ -64,20 +64,15 @@ def test_a_compact_scan_is_the_cloud_within_rounding(scans) -> None:
     compact = compact_scan(cloud, image)
     found = compact.cloud
     np.testing.assert_array_equal(found.mask, cloud.mask)
-    np.testing.assert_allclose(found.positions, cloud.positions, atol=0.002)
-    np.testing.assert_allclose(found.normals, cloud.normals, atol=0.009)
-    np.testing.assert_allclose(found.planarity, cloud.planarity, atol=0.002)
     # Each descriptor has a step of its own: large ones take nothing from small ones.
     largest = np.abs(cloud.features).max(axis=1, keepdims=True)
     assert np.abs((found.features - cloud.features) / largest).max() <= 0.501 / 127
     cosines = np.sum(found.directions * cloud.directions, axis=1)
     assert cosines.min() > np.cos(np.radians(0.5 * 180 / 127 + 0.01))
-    np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1, atol=1e-6)
     # The scan that registration reads is made of the same elements.
-    expanded = expand_scan(compact)
-    expected = surface_of_elements(found.elements)
+    surface, expected = expand_scan(compact).measured.surface, surface_of_elements(found.elements)
     for name in ("points", "normals", "flatness", "samples"):
-        np.testing.assert_array_equal(getattr(expanded.measured.surface, name), getattr(expected, name))
+        np.testing.assert_array_equal(getattr(surface, name), getattr(expected, name))
 
 
 def test_features_that_are_zero_stay_so_and_rounding_twice_changes_nothing() -> None:
@@ -100,33 +95,8 @@ def test_directions_turn_round_without_a_break() -> None:
 
 
 @pytest.mark.slow
-def test_other_parameters_have_another_fingerprint() -> None:
-    config = model_preset("tiny")
-    first, other = (init_model(jax.random.key(seed), config) for seed in (0, 1))
-    assert model_fingerprint(first) == model_fingerprint(jax.device_get(first))
-    assert model_fingerprint(first) != model_fingerprint(other)
-    assert len(model_fingerprint(first)) == 16
-
-
-@pytest.mark.slow
-def test_a_map_stays_readable_when_the_overlap_head_is_trained() -> None:
+def test_the_fingerprint_is_that_of_the_parameters_without_the_overlap_head() -> None:
     first, other = (init_model(jax.random.key(seed), model_preset("tiny")) for seed in (0, 1))
+    assert model_fingerprint(first) == model_fingerprint(jax.device_get(first)) != model_fingerprint(other)
     decoder = {**first.params["decoder"], "overlap_head": other.params["decoder"]["overlap_head"]}
     assert model_fingerprint(first.replace(params={**first.params, "decoder": decoder})) == model_fingerprint(first)
-
-
-def test_a_scan_is_prepared_for_each_use_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a cloud it needs surface elements, with another scan its measured surface."""
-    model = Model({}, model_preset("tiny"))
-    cloud, with_elements, measured = (
-        DescriptorCloud(np.full((1, 3), value, np.float32), np.zeros((1, 2), np.float32), np.ones(1, bool))
-        for value in range(3)
-    )
-    first, second = np.zeros((5, 3)), np.ones((5, 3))
-    monkeypatch.setattr(prepared_scans, "encode", lambda *_, **__: with_elements)
-    monkeypatch.setattr(prepared_scans, "prepare_scans", lambda _model, scans, scale: [measured] * len(scans))
-    for pairs in ([(first, cloud), (first, second)], [(first, second), (first, cloud)]):
-        ready = prepared_scans.prepare_each(model, pairs, 1.0, num_elements=7)
-        assert ready[id(first), False] is with_elements
-        assert ready[id(first), True] is measured
-        assert ready[id(cloud), False] is cloud

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
@@ -19,35 +18,11 @@ from dpmjax.deeppointmap import (
     read_scan_pairs,
     register_clouds,
     register_in_stages,
-    scan_evaluation,
 )
 from dpmjax.deeppointmap.confidence import gather_evidence
 from dpmjax.metrics import area_under_curve, brier_score, expected_calibration_error
 from dpmjax.sequences import LidarSequence
 from tests.deeppointmap import toy
-
-
-@pytest.fixture(scope="module")
-def model():
-    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
-
-
-def test_the_auc_is_one_for_a_model_that_knows_and_a_half_for_one_that_guesses(model, monkeypatch) -> None:
-    drive, known = toy.drive(), {}
-    for is_perfect, expected in ((True, 1.0), (False, 0.5)):
-
-        def encoded(model, points):
-            """A cloud that carries what its scan sees first."""
-            return dpmjax.types.DescriptorCloud(points[:1], points[:1], np.ones(1, bool))
-
-        def probability(model, sources, targets, is_perfect=is_perfect):
-            known["num"] = len(sources)
-            return np.arange(len(sources)) < 10 if is_perfect else np.full(len(sources), 0.3)
-
-        monkeypatch.setattr(scan_evaluation, "encode", encoded)
-        monkeypatch.setattr(scan_evaluation, "overlap_pairs", probability)
-        found = evaluate_overlap(model, drive, 10)
-        assert (found.area_under_curve, len(found.is_overlap), known["num"]) == (expected, 20, 20)
 
 
 @pytest.mark.slow

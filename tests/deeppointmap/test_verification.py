@@ -86,13 +86,6 @@ def test_a_thinned_surface_meets_as_many_planes_as_the_whole_one(scans, is_targe
     assert verify_motion(source, target, T_TRUE, CONFIG).matched_share == pytest.approx(whole, abs=0.05)
 
 
-def test_verification_of_a_scan_on_itself_is_perfect(scans) -> None:
-    found = verify_motion(scans[0], scans[0], np.eye(4), CONFIG)
-    assert found.matched_share == 1
-    assert found.contradicted_share == 0
-    assert found.visible_share == 1
-
-
 @pytest.mark.parametrize("row", [0, 3, 5])
 def test_the_right_hypothesis_is_chosen_whatever_its_rank(scans, row: int) -> None:
     rng = np.random.default_rng(row)

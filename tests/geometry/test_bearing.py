@@ -25,12 +25,6 @@ def test_to_the_ray_frame_and_back_is_nothing() -> None:
     np.testing.assert_allclose(from_ray_frame(to_ray_frame(vectors(1), directions), directions), vectors(1), atol=1e-6)
 
 
-def test_directions_turn_with_the_scan_and_do_not_move_with_it() -> None:
-    T = motion((2.0, 0.0, 0.0))
-    expected = ray_directions(vectors(2) @ T[:3, :3].T)
-    np.testing.assert_allclose(turned_directions(ray_directions(vectors(2)), T), expected, atol=1e-6)
-
-
 def test_a_tilted_direction_is_projected_and_has_unit_length() -> None:
     T = motion((0.7, 0.2, -0.1))
     directions = ray_directions(vectors(3))

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -128,29 +127,6 @@ def test_pairs_of_one_point_tell_nothing() -> None:
     assert errors(found.T_target_source[0], T)[0] < 0.5
 
 
-def test_many_sets_at_once_and_no_gradient() -> None:
-    sets = [pairs_with_outliers(seed, 15, 30)[:2] for seed in (5, 6)]
-    source, target = (jnp.stack([pair[side] for pair in sets]) for side in (0, 1))
-    together = jax.vmap(find_consensus)(source, target)
-    for number in range(2):
-        alone = find_consensus(source[number], target[number])
-        np.testing.assert_allclose(together.T_target_source[number, 0], alone.T_target_source[0], atol=1e-4)
-    gradient = jax.grad(lambda s: jnp.sum(find_consensus(s, target[0]).T_target_source))(source[0])
-    assert not gradient.any()
-
-
-@pytest.mark.parametrize("wrong", [{"num_rounds": 0}, {"num_seeds": 0}])
-def test_config_says_what_is_wrong(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        ConsensusConfig(**wrong)  # type: ignore[arg-type]
-
-
 def test_wrong_shapes_are_named(as_user) -> None:
     with pytest.raises(ValueError, match="^target: expected shape"):
         find_consensus(np.zeros((3, 3), np.float32), np.zeros((4, 3), np.float32))
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    find_consensus(*pairs_with_outliers(7, 10, 3)[:2])
-    with assert_compiles_nothing():
-        find_consensus(*pairs_with_outliers(8, 10, 3)[:2])

@@ -27,15 +27,6 @@ def elements_of(points: np.ndarray, mask: np.ndarray | None = None, num: int = 9
     return jax.device_get(pyramid_elements(build_pyramid(points, mask, CONFIG), num))
 
 
-@pytest.mark.slow
-def test_elements_of_a_plane_have_its_normal() -> None:
-    found = elements_of(plane())
-    # The origin is on the positive side.
-    np.testing.assert_allclose(found.normals, np.tile(NORMAL, (96, 1)), atol=1e-4)
-    assert np.median(found.planarity) > 0.3
-    assert found.mask.all()
-
-
 def test_elements_are_the_planes_of_the_principal_components() -> None:
     """The oracle sees all points and takes those that are nearest."""
     points = plane(noise=0.05)
@@ -47,6 +38,7 @@ def test_elements_are_the_planes_of_the_principal_components() -> None:
         assert planarity == pytest.approx((values[1] - values[0]) / values[2], abs=1e-4)
         if planarity > 0.05:
             assert abs(normal @ vectors[:, 0]) == pytest.approx(1, abs=1e-4)
+            assert normal @ position < 0  # towards the lidar
 
 
 def test_elements_stand_in_the_order_of_farthest_points() -> None:
@@ -80,15 +72,6 @@ def test_points_of_a_line_or_of_one_place_are_no_plane() -> None:
         found = elements_of(points)
         np.testing.assert_allclose(found.planarity, 0, atol=1e-3)
         assert np.isfinite(found.normals).all()
-
-
-def test_elements_are_compiled_once_and_batched() -> None:
-    pyramids = [build_pyramid(plane(noise=noise), None, CONFIG) for noise in (0.01, 0.02)]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *pyramids)
-    batched = jax.jit(jax.vmap(lambda pyramid: pyramid_elements(pyramid, 96)))(stacked)
-    for row, pyramid in enumerate(pyramids):
-        expected = pyramid_elements(pyramid, 96)
-        jax.tree.map(lambda a, b, row=row: np.testing.assert_allclose(a, b[row], atol=1e-4), expected, batched)
 
 
 @pytest.mark.parametrize("num", [0, 97])

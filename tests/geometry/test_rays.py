@@ -16,22 +16,9 @@ def test_samples_lie_on_their_segments(dim: int, is_shared: bool) -> None:
     origin, points = rng.normal(size=dim).astype(np.float32), rng.normal(size=(7, dim)).astype(np.float32)
     factors = rng.uniform(size=4 if is_shared else (7, 4)).astype(np.float32)
     samples = np.asarray(sample_free_space(origin, points, factors))
-    for beam in range(7):
-        for i in range(4):
-            factor = factors[i] if is_shared else factors[beam, i]
-            expected = (1 - factor) * origin + factor * points[beam]
-            np.testing.assert_allclose(samples[beam, i], expected, **ROUNDING)
-
-
-def test_factors_zero_and_one_are_the_ends() -> None:
-    origin, points = np.array([1, 2], np.float32), np.array([[3, 5], [0.5, -1]], np.float32)
-    samples = np.asarray(sample_free_space(origin, points, np.array([0, 1], np.float32)))
-    np.testing.assert_array_equal(samples[:, 0], np.stack([origin, origin]))
-    np.testing.assert_array_equal(samples[:, 1], points)
-
-
-def test_no_beams_give_no_samples() -> None:
-    assert sample_free_space(jnp.zeros(2), jnp.zeros((0, 2)), jnp.ones(3)).shape == (0, 3, 2)
+    for beam, i in np.ndindex(7, 4):
+        factor = factors[i] if is_shared else factors[beam, i]
+        np.testing.assert_allclose(samples[beam, i], (1 - factor) * origin + factor * points[beam], **ROUNDING)
 
 
 def test_wrong_shapes_are_named(as_user) -> None:

@@ -51,16 +51,11 @@ def test_derivative_of_exp_is_that_of_finite_differences(turn: float, float64) -
     np.testing.assert_allclose(jax.jacobian(rigid.exp)(tangent), np.stack(expected, axis=-1), atol=1e-6)
 
 
-def test_a_twist_of_the_plane_is_one_of_space() -> None:
-    tangent = np.random.default_rng(13).normal(size=(7, 3)).astype(np.float32)
-    spatial = np.asarray(rigid.exp(np.concatenate([tangent[:, :2], np.zeros((7, 3)), tangent[:, 2:]], axis=1)))
-    np.testing.assert_allclose(rigid.exp(tangent), spatial[:, [[0], [1], [3]], [0, 1, 3]], **ROUNDING)
-
-
-def test_second_exp_compiles_nothing(assert_compiles_nothing) -> None:
-    rigid.exp(np.full((5, 6), 0.1, np.float32))
+def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
+    twists, points = np.full((5, 6), 0.1, np.float32), np.ones((5, 3), np.float32)
+    rigid.transform_points(rigid.exp(twists)[0], points)
     with assert_compiles_nothing():
-        rigid.exp(np.full((5, 6), 0.2, np.float32))
+        rigid.transform_points(rigid.exp(2 * twists)[0], 2 * points)
 
 
 def test_another_number_of_coordinates_is_no_twist(as_user) -> None:
@@ -78,16 +73,6 @@ def test_transform_points_is_the_homogeneous_product(dim: int) -> None:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_transform_points_broadcasts_and_keeps_dtype(dim: int) -> None:
-    T = random_motions(7, 4, dim).astype(np.float32)
-    points = jnp.ones((9, dim))
-    moved = rigid.transform_points(T, points)
-    assert moved.shape == (4, 9, dim)
-    assert moved.dtype == jnp.float32
-    assert rigid.transform_points(T[0], points[:0]).shape == (0, dim)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
 def test_inverse_undoes_a_motion(dim: int) -> None:
     T = random_motions(8, 10, dim)
     np.testing.assert_allclose(rigid.inverse(T) @ T, np.tile(np.eye(dim + 1), (10, 1, 1)), **DOUBLE)
@@ -95,24 +80,9 @@ def test_inverse_undoes_a_motion(dim: int) -> None:
     np.testing.assert_allclose(rigid.inverse(single), np.linalg.inv(T), **ROUNDING)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_composed_motions_move_points_one_after_the_other(dim: int) -> None:
-    T_a_b, T_b_c = (random_motions(seed, 5, dim).astype(np.float32) for seed in (9, 10))
-    points = np.random.default_rng(11).normal(size=(5, 7, dim)).astype(np.float32)
-    expected = rigid.transform_points(T_a_b, rigid.transform_points(T_b_c, points))
-    np.testing.assert_allclose(rigid.transform_points(rigid.compose(T_a_b, T_b_c), points), expected, **ROUNDING)
-    assert rigid.compose(T_a_b[:, None], T_b_c).shape == (5, 5, dim + 1, dim + 1)
-
-
 def test_wrong_matrix_size_is_named(as_user) -> None:
     with pytest.raises(ValueError, match="T_a_b: expected shape"):
         rigid.transform_points(jnp.eye(4), jnp.ones((5, 2)))
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    rigid.transform_points(np.eye(4, dtype=np.float32), np.ones((5, 3), np.float32))
-    with assert_compiles_nothing():
-        rigid.transform_points(2 * np.eye(4, dtype=np.float32), np.zeros((5, 3), np.float32))
 
 
 def test_twists_keep_float32_where_jax_has_64_bits(float64) -> None:

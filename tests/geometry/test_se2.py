@@ -50,11 +50,6 @@ def test_compose_inverse_and_relative_are_those_of_matrices(kind: str) -> None:
             np.testing.assert_allclose(matrix_of(found[row]), expected, **TOLERANCE[kind])
 
 
-def test_poses_broadcast() -> None:
-    a, b = random_poses(5, 4, 1), random_poses(6, 1, 5)
-    np.testing.assert_allclose(se2.compose(a, b)[2, 3], se2.compose(a[2, 0], b[0, 3]), **DOUBLE)
-
-
 def test_kind_and_dtype_are_kept() -> None:
     pose = random_poses(7, 3)
     assert isinstance(se2.compose(pose, pose), np.ndarray)

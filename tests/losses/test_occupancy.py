@@ -34,19 +34,6 @@ def test_gradient_is_probability_less_label(seed: int) -> None:
     np.testing.assert_allclose(by_labels, -share * logits, **ACCUMULATED)
 
 
-def test_samples_of_weight_zero_take_no_part() -> None:
-    logits, labels, weights = example(2)
-    weights[1] = 0
-    hidden = logits.copy()
-    hidden[1] = np.nan
-    np.testing.assert_allclose(
-        occupancy_loss(hidden, labels, weights), occupancy_loss(logits, labels, weights), **ROUNDING
-    )
-    gradient = jax.grad(occupancy_loss)(hidden, labels, weights)
-    assert np.isfinite(gradient).all()
-    np.testing.assert_array_equal(gradient[1], 0)
-
-
 def test_loss_and_gradient_are_zero_without_weight() -> None:
     logits, labels, weights = example(3)
     assert float(occupancy_loss(logits, labels, 0 * weights)) == 0
@@ -59,12 +46,6 @@ def test_certain_and_wrong_is_costly_and_finite(logit: float) -> None:
     loss, gradient = jax.value_and_grad(occupancy_loss)(jnp.array([logit]), label, jnp.ones(1))
     np.testing.assert_allclose(loss, 200, **ROUNDING)
     np.testing.assert_allclose(np.abs(gradient), 1, **ROUNDING)
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    occupancy_loss(*example(0))
-    with assert_compiles_nothing():
-        occupancy_loss(*example(1))
 
 
 def test_wrong_shapes_are_named(as_user) -> None:

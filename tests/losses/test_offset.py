@@ -73,12 +73,6 @@ def test_perfect_prediction_has_loss_and_gradient_zero() -> None:
     assert not np.any(gradient)
 
 
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    offset_loss(*offsets(6))
-    with assert_compiles_nothing():
-        offset_loss(*offsets(7))
-
-
 def test_wrong_arguments_are_named(as_user) -> None:
     with pytest.raises(ValueError, match="^true: expected shape"):
         offset_loss(np.ones((4, 3)), np.ones((5, 3)))

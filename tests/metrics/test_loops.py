@@ -39,14 +39,6 @@ def test_the_way_back_is_a_revisit_from_the_other_side() -> None:
     np.testing.assert_array_equal(found.is_opposite, found.is_revisit)
 
 
-def test_the_second_round_is_a_revisit_in_the_same_direction() -> None:
-    poses = twice_round()
-    found = find_revisits(poses, distance_m=2.0, min_path_m=50.0)
-    assert found.is_revisit[200:].all()
-    assert not found.is_revisit[:190].any()
-    assert not found.is_opposite.any()
-
-
 def test_revisits_agree_with_all_pairs() -> None:
     poses = np.concatenate([there_and_back(70.0), twice_round(30.0)])
     path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])

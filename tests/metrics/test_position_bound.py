@@ -28,11 +28,6 @@ def test_bound_in_the_middle_of_a_square_room_is_that_of_the_integral(num_beams:
     np.testing.assert_allclose(bound, np.sqrt(np.pi / num_beams), rtol=0.01)
 
 
-def test_bound_grows_with_the_noise() -> None:
-    one, five = (bound_in_room(CENTRE, noise=noise) for noise in (1.0, 5.0))
-    np.testing.assert_allclose(five, 5.0 * one)
-
-
 def test_bound_is_infinite_where_a_direction_is_open() -> None:
     bound = bound_in_room(CENTRE, num_beams=2)
     assert np.isinf(bound).all()

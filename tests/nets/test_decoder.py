@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, correlate, init_model, model_preset, overlap
-from dpmjax.deeppointmap.model import decode, overlap_logit, predict_offsets, similarity_features
+from dpmjax.deeppointmap.model import overlap_logit, predict_offsets, similarity_features
 from dpmjax.nets import DecoderConfig, attention
-from dpmjax.nets.attention import embed_positions
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED, ROUNDING
@@ -38,18 +37,6 @@ def cloud(seed: int, num_descriptors: int, capacity: int | None = None) -> Descr
     return DescriptorCloud(*arrays, jnp.arange(capacity) < num_descriptors)
 
 
-def test_position_embedding_is_sines_and_cosines_by_turns() -> None:
-    positions = np.random.default_rng(0).normal(size=(5, 3)) * 20
-    found = embed_positions(jnp.asarray(positions, jnp.float32), 16)
-    for axis in range(3):
-        for pair in range(2):
-            angle = np.pi * positions[:, axis] / 10_000 ** (2 * pair / 4)
-            column = 4 * axis + 2 * pair
-            expected = np.stack([np.sin(angle), np.cos(angle)], axis=1)
-            np.testing.assert_allclose(found[:, column : column + 2], expected, atol=2e-5)
-    assert not found[:, 12:].any()
-
-
 @pytest.mark.parametrize("max_live_logits", [1 << 20, 20])
 def test_attention_is_a_masked_softmax(max_live_logits: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attention, "MAX_LIVE_LOGITS", max_live_logits)
@@ -67,47 +54,6 @@ def test_attention_to_nothing_is_zero() -> None:
     ones = jnp.ones((4, 2, 3))
     assert not attention.attend(ones, ones, ones, jnp.zeros(4, bool)).any()
     assert not attention.attend(ones, ones[:0], ones[:0], jnp.zeros(0, bool)).any()
-
-
-@pytest.mark.slow
-def test_padded_equals_unpadded(model: Model) -> None:
-    a, b = cloud(2, 8), cloud(3, 8)
-    expected = correlate(model, a, b)
-    padded_a, padded_b = cloud(2, 8, capacity=12), cloud(3, 8, capacity=10)
-    found = correlate(model, padded_a, padded_b)
-    for of_padded, of_unpadded in zip(found, expected, strict=True):
-        num = of_unpadded.mask.size
-        np.testing.assert_allclose(of_padded.features[:num], of_unpadded.features, **ACCUMULATED)
-        np.testing.assert_array_equal(of_padded.positions[:num], of_unpadded.positions)
-        assert not of_padded.features[num:].any()
-    np.testing.assert_allclose(overlap(model, padded_a, padded_b), overlap(model, a, b), **ACCUMULATED)
-
-
-def test_order_of_descriptors_changes_nothing(model: Model) -> None:
-    a, b = cloud(4, 8), cloud(5, 8)
-    order = np.random.default_rng(0).permutation(8)
-    shuffled = jax.tree.map(lambda x: x[order], b)
-    (of_a, of_b), (again_a, again_b) = correlate(model, a, b), correlate(model, a, shuffled)
-    np.testing.assert_allclose(again_a.features, of_a.features, **ACCUMULATED)
-    np.testing.assert_allclose(again_b.features, of_b.features[order], **ACCUMULATED)
-
-
-def test_clouds_change_places_together(model: Model) -> None:
-    a, b = cloud(6, 8), cloud(7, 8)
-    for found, expected in zip(correlate(model, b, a), correlate(model, a, b)[::-1], strict=True):
-        np.testing.assert_allclose(found.features, expected.features, **ACCUMULATED)
-
-
-def test_heads_have_their_shapes(model: Model) -> None:
-    a, b = correlate(model, cloud(8, 8), cloud(9, 8))
-    assert similarity_features(model, a).shape == (8, 32)
-    assert decode(model, cloud(8, 8).features, part="coarse_head").shape == (8, 64)
-    assert predict_offsets(model, a.features[:5], b.features[:5]).shape == (5, 3)
-    assert overlap_logit(model, a, b).shape == ()
-
-
-def test_overlap_is_a_probability(model: Model) -> None:
-    assert 0 < overlap(model, cloud(10, 8), cloud(11, 8)) < 1
 
 
 def test_empty_clouds_give_finite_numbers(model: Model) -> None:
@@ -172,13 +118,6 @@ def test_features_depend_on_the_other_cloud_and_on_positions_only_if_crossed(is_
         assert np.allclose(first.features, other.features, **ACCUMULATED) != is_crossed
     without_others, _ = correlate(model, a.replace(mask=jnp.arange(8) < 1), cloud(24, 8))
     assert not np.allclose(first.features[0], without_others.features[0], **ACCUMULATED)
-
-
-def test_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
-    pairs = [(cloud(18, 8), cloud(19, 8)), (cloud(20, 8), cloud(21, 8))]
-    overlap(model, *pairs[0])
-    with assert_compiles_nothing():
-        overlap(model, *pairs[1])
 
 
 def test_wrong_shapes_are_named(as_user, model: Model) -> None:

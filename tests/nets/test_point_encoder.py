@@ -1,21 +1,17 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model import Model, encode_pyramid, init_model, model_shapes
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import ray_directions, to_ray_frame
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid_on_host
 from dpmjax.nets import DecoderConfig, EncoderConfig
-from dpmjax.nets.point_encoder import NeighbourhoodMaximum
 from dpmjax.types import PointPyramid
-from tests.tolerances import ACCUMULATED, ROUNDING
+from tests.tolerances import ROUNDING
 
 CONFIG = ModelConfig(
     pyramid=PyramidConfig((PyramidStage(24, (0.3, 0.5), 6), PyramidStage(6, (1.0,), 3)), 1),
@@ -41,30 +37,12 @@ def pyramid_of(cloud: np.ndarray, capacity: int | None = None, config: ModelConf
     return jax.device_put(build_pyramid_on_host(front, np.arange(capacity) < len(cloud), config.pyramid))
 
 
-def norm(x: np.ndarray, scale: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5) * scale + bias
-
-
 def poisoned(pyramid: PointPyramid) -> PointPyramid:
     """The same with NaN wherever nothing is."""
     levels = tuple(
         level.replace(positions=jnp.where(level.mask[:, None], level.positions, jnp.nan)) for level in pyramid.levels
     )
     return pyramid.replace(levels=levels)
-
-
-@pytest.mark.slow
-def test_neighbourhood_maximum_is_that_of_the_whole_formula() -> None:
-    rng = np.random.default_rng(0)
-    features, offsets, neighbours = rng.normal(size=(9, 5)), rng.normal(size=(6, 4, 3)), rng.integers(0, 9, (6, 4))
-    inputs = (*(jnp.asarray(x, jnp.float32) for x in (features, offsets)), neighbours)
-    module = NeighbourhoodMaximum(7)
-    params = module.init(jax.random.key(0), *inputs)["params"]
-    params = {name: jnp.asarray(rng.normal(size=value.shape), jnp.float32) for name, value in params.items()}
-    rows = np.concatenate([features[neighbours], offsets], axis=-1)
-    rows = norm(rows @ params["kernel"] + params["bias"], params["norm_scale"], params["norm_bias"])
-    expected = np.maximum(rows, 0).max(axis=1)
-    np.testing.assert_allclose(module.apply({"params": params}, *inputs), expected, **ACCUMULATED)
 
 
 @pytest.mark.slow
@@ -80,14 +58,6 @@ def test_padded_equals_unpadded(model: Model) -> None:
     np.testing.assert_allclose(found.positions[:19], expected.positions, **ROUNDING)
     assert not found.features[19:].any()
     assert not found.positions[19:].any()
-
-
-def test_descriptors_stand_on_sampled_points_in_metres(model: Model) -> None:
-    cloud = points(2)
-    found = encode_pyramid(model, pyramid_of(cloud))
-    assert found.positions.shape == (CONFIG.num_descriptors, 3)
-    distances = np.linalg.norm(np.asarray(found.positions)[:, None] - 60 * cloud[None], axis=-1)
-    np.testing.assert_allclose(distances.min(axis=1), 0, atol=1e-5)
 
 
 def test_order_of_neighbours_changes_nothing(model: Model) -> None:
@@ -115,17 +85,6 @@ def test_gradient_is_finite_in_degenerate_clouds_too(model: Model) -> None:
         gradient = gradient_of(model, poisoned(pyramid_of(cloud, capacity=30)))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert any(leaf.any() for leaf in jax.tree.leaves(gradient.params["encoder"]["stage_0"]))
-
-
-def test_vmap_equals_a_loop_and_second_call_compiles_nothing(model: Model, assert_compiles_nothing) -> None:
-    pyramids = [pyramid_of(points(seed)) for seed in (6, 7)]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pyramids)
-    found = jax.device_get(jax.vmap(encode_pyramid, (None, 0))(model, batch))
-    first = jax.device_get(encode_pyramid(model, pyramids[0]))
-    with assert_compiles_nothing():
-        second = jax.device_get(encode_pyramid(model, pyramids[1]))
-    for i, cloud in enumerate((first, second)):
-        np.testing.assert_allclose(found.features[i], cloud.features, **ACCUMULATED)
 
 
 def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
@@ -159,22 +118,6 @@ def test_wrong_pyramids_and_widths_are_named(as_user, model: Model) -> None:
         EncoderConfig(compute_dtype="float16")
     with pytest.raises(ValueError, match="^decoder.input_channels: expected the encoder's output_channels 128, got 64"):
         ModelConfig(decoder=DecoderConfig(input_channels=64))
-
-
-@pytest.mark.slow
-def test_frames_of_points_do_not_see_a_turn_about_the_vertical() -> None:
-    config = replace(CONFIG, encoder=replace(CONFIG.encoder, frame="local"))
-    model = init_model(jax.random.key(0), config)
-    pyramid = pyramid_of(points(5))
-    turn = Rotation.from_euler("z", 130, degrees=True).as_matrix().astype(np.float32)
-    turned = pyramid.replace(
-        levels=tuple(level.replace(positions=level.positions @ turn.T) for level in pyramid.levels)
-    )
-    before, after = encode_pyramid(model, pyramid), encode_pyramid(model, turned)
-    np.testing.assert_allclose(after.features, before.features, atol=1e-4)
-    np.testing.assert_allclose(after.positions, before.positions @ turn.T, atol=1e-4)
-    in_lidar_frame = encode_pyramid(init_model(jax.random.key(0), CONFIG), turned).features
-    assert np.abs(in_lidar_frame - before.features).max() > 0.1
 
 
 def test_direction_along_the_ray_is_x() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +10,6 @@ import pytest
 from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph import Edges, PoseGraphConfig, optimize_pose_graph, solve_dense
 from tests.pose_graph.test_optimize import KINDS, random_graph
-
-# float32 poses of a few metres after a solve of up to 48 unknowns.
-CLOSE: dict[str, Any] = {"rtol": 1e-3, "atol": 1e-3}
 
 
 def arrays_of(seed: int, tangent: int, **options: float) -> tuple[jax.Array, Edges]:
@@ -49,45 +44,6 @@ def test_fixed_nodes_and_those_without_an_edge_stay() -> None:
     none = solve_dense(poses, edges, edge_mask=jnp.zeros(len(edges.source), bool))
     np.testing.assert_array_equal(none.poses, poses)
     assert (float(none.chi2), bool(none.converged)) == (0.0, True)
-
-
-def padded(poses: jax.Array, edges: Edges, extra: int = 2) -> tuple[jax.Array, Edges, jax.Array]:
-    """Nodes and edges that are not there, of NaN."""
-
-    def pad(values: jax.Array) -> jax.Array:
-        filler = jnp.nan if values.dtype.kind == "f" else 1
-        return jnp.concatenate([values, jnp.full((extra, *values.shape[1:]), filler, values.dtype)])
-
-    count = len(edges.source)
-    return pad(poses), Edges(*map(pad, edges)), jnp.arange(count + extra) < count
-
-
-def test_padding_reaches_neither_the_poses_nor_the_gradient() -> None:
-    poses, edges = arrays_of(2, 3)
-    more_poses, more_edges, mask = padded(poses, edges)
-
-    def total(measurements: jax.Array, poses: jax.Array, edges: Edges, mask: jax.Array | None) -> jax.Array:
-        found = solve_dense(poses, edges._replace(measurements=measurements), edge_mask=mask)
-        return jnp.sum(found.poses[:8] ** 2) + found.chi2
-
-    value_and_grad = jax.jit(jax.value_and_grad(total))
-    plain, slope = value_and_grad(edges.measurements, poses, edges, None)
-    value, gradient = value_and_grad(more_edges.measurements, more_poses, more_edges, mask)
-    np.testing.assert_allclose(value, plain, rtol=1e-5)
-    np.testing.assert_allclose(gradient[:-2], slope, **CLOSE)
-    np.testing.assert_array_equal(gradient[-2:], 0.0)
-    assert np.isnan(solve_dense(more_poses, more_edges, edge_mask=mask).poses[-2:]).all()
-
-
-def test_batch_is_the_call_and_compiles_once(assert_compiles_nothing) -> None:
-    graphs = [arrays_of(seed, 3) for seed in (0, 1)]
-    solve = jax.jit(jax.vmap(lambda poses, edges: solve_dense(poses, edges)))
-    together = solve(*jax.tree.map(lambda *x: jnp.stack(x), *graphs))
-    for row, graph in enumerate(graphs):
-        np.testing.assert_allclose(together.poses[row], solve_dense(*graph).poses, **CLOSE)
-        assert together.converged[row]
-    with assert_compiles_nothing():
-        solve(*jax.tree.map(lambda *x: jnp.stack(x), *graphs[::-1]))
 
 
 @pytest.mark.slow

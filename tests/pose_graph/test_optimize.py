@@ -30,15 +30,15 @@ def to_matrix(pose: np.ndarray) -> np.ndarray:
 
 
 def rotations(turn: np.ndarray) -> np.ndarray:
-    """The rotation matrix of a rotation vector."""
-    if len(turn) == 3:
+    """The rotation matrices of rotation vectors, or of headings."""
+    if turn.shape[-1] == 3:
         return Rotation.from_rotvec(turn).as_matrix()
-    return Rotation.from_euler("z", turn[0]).as_matrix()[:2, :2]
+    return Rotation.from_rotvec(turn * [0.0, 0.0, 1.0]).as_matrix()[..., :2, :2]
 
 
 def mean_rotation(turn: np.ndarray) -> np.ndarray:
     """Rotations from none to all of it, in the mean: what makes a translation out of that of a twist."""
-    return np.mean([rotations(share * turn) for share in (np.arange(40) + 0.5) / 40], axis=0)
+    return rotations((np.arange(40)[:, None] + 0.5) / 40 * turn).mean(axis=0)
 
 
 def exponential(twist: np.ndarray) -> np.ndarray:

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import logm
-from scipy.spatial.transform import Rotation
 
 import dpmjax
 from dpmjax.pose_graph import Edges, PoseGraph, find_free_nodes, optimize_pose_graph, residuals
-from tests.pose_graph.test_optimize import GRAPHS, KINDS, random_graph, to_matrix
-from tests.tolerances import ACCUMULATED, DOUBLE
+from tests.pose_graph.test_optimize import GRAPHS, KINDS, difference, random_graph, to_matrix
+from tests.tolerances import DOUBLE
 
 # The least chi2 that was published for each graph of the plane, in g2o's definition (Carlone et al. 2016).
 PUBLISHED = {"M3500": 137.913, "MITb": 41.163, "INTEL_stiff": 215.837}
@@ -27,24 +26,14 @@ G2O_AT_START = {
 }
 
 
-def errors_of_g2o(graph: PoseGraph) -> np.ndarray:
-    """The error vectors as g2o defines them: a translation, and a heading or the vector part of a quaternion."""
-    errors = []
-    for j, i, measured, _ in zip(*graph.edges, strict=True):
-        measured, source, target = (to_matrix(pose) for pose in (measured, graph.poses[j], graph.poses[i]))
-        T = np.linalg.inv(measured) @ np.linalg.inv(target) @ source
-        if len(T) == 3:
-            errors.append([T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0])])
-        else:
-            quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
-            errors.append([*T[:3, 3], *quaternion[:3]])
-    return np.array(errors)
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_residuals_in_the_plane_are_those_of_g2o(seed: int, float64) -> None:
     graph = random_graph(seed, 3, start=0.5)
-    np.testing.assert_allclose(residuals(graph.poses, graph.edges), errors_of_g2o(graph), **DOUBLE)
+    expected = [
+        difference(*map(to_matrix, (measured, graph.poses[i], graph.poses[j])))
+        for j, i, measured, _ in zip(*graph.edges, strict=True)
+    ]
+    np.testing.assert_allclose(residuals(graph.poses, graph.edges), expected, **DOUBLE)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -56,40 +45,8 @@ def test_residuals_in_space_are_matrix_logarithms(seed: int, float64) -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
-def test_error_of_g2o_in_space_has_half_the_rotation_vector() -> None:
-    graph = random_graph(2, 6, noise=1e-3, start=1e-3)
-    half = errors_of_g2o(graph) * [1, 1, 1, 2, 2, 2]
-    np.testing.assert_allclose(residuals(*graph_arrays(graph)), half, atol=1e-5)
-
-
 def graph_arrays(graph: PoseGraph) -> tuple[jax.Array, Edges]:
     return jnp.asarray(graph.poses), Edges(*map(jnp.asarray, graph.edges))
-
-
-@KINDS
-def test_residuals_can_be_traced_and_batched(tangent: int) -> None:
-    graphs = [graph_arrays(random_graph(seed, tangent)) for seed in (0, 1)]
-    poses, edges = jax.tree.map(lambda *x: jnp.stack(x), *graphs)
-    together = jax.jit(jax.vmap(residuals))(poses, edges)
-    for found, graph in zip(together, graphs, strict=True):
-        np.testing.assert_allclose(found, residuals(*graph), **ACCUMULATED)
-
-
-@KINDS
-def test_padding_edges_have_no_residual_and_no_gradient(tangent: int) -> None:
-    poses, edges = graph_arrays(random_graph(0, tangent))
-    mask = jnp.arange(len(edges.source)) < 7
-    poses = poses.at[-1].set(jnp.nan)
-    edges = edges._replace(measurements=edges.measurements.at[6:].set(jnp.nan))
-    mask = mask.at[6].set(False)
-
-    def total(poses: jax.Array, measurements: jax.Array) -> jax.Array:
-        return jnp.sum(residuals(poses, edges._replace(measurements=measurements), mask) ** 2)
-
-    np.testing.assert_array_equal(residuals(poses, edges, mask)[~mask], 0.0)
-    for gradient in jax.grad(total, (0, 1))(poses, edges.measurements):
-        assert np.isfinite(gradient).all()
-        assert np.any(np.asarray(gradient) != 0)
 
 
 def test_wrong_shapes_are_named() -> None:

@@ -250,7 +250,7 @@ def losses(network: Network, a: Cloud, b: Cloud, T_b_a: Array) -> dict[str, floa
                 "pairing": info_nce(cosine, positive, np.zeros_like(neutral)),
                 "coarse": info_nce(cosines(*coarse)[rows], positive, neutral),
                 "offset": float(np.sqrt(np.einsum("ni,ij,nj->n", error, inverse, error)).mean()),
-                "top1": float((cosine.argmax(axis=1) == positive).mean()),
+                "top1_accuracy": float((cosine.argmax(axis=1) == positive).mean()),
             }
         )
     terms = {name: (ways[0][name] + ways[1][name]) / 2 for name in ways[0]}

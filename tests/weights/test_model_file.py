@@ -1,11 +1,9 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import pickle
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -122,61 +120,45 @@ class Evil:
         return os.system, ("exit 1",)
 
 
-def test_checkpoint_that_would_run_something_is_refused(tmp_path: Path) -> None:
-    path = archive(tmp_path / "x.pth", pickle.dumps({"encoder": Evil()}))
-    with pytest.raises(ValueError, match="which is no tensor"):
-        load_model(path)
-
-
 def test_tensor_beyond_its_storage_is_refused(tmp_path: Path) -> None:
-    class TorchPickler(pickle._Pickler):
-        """Writes the name of a storage and of the function that makes tensors, without PyTorch."""
-
-        def save(self, obj: object, *_: object, **__: object) -> None:
-            if isinstance(obj, str) and obj.startswith("c"):
-                self.write(obj.encode())
-            else:
-                super().save(obj)
-
-    stream = io.BytesIO()
-    stream.write(pickle.PROTO + b"\x02ctorch._utils\n_rebuild_tensor_v2\n(")
+    content = pickle.PROTO + b"\x02ctorch._utils\n_rebuild_tensor_v2\n("
     # persistent id ('storage', torch.FloatStorage, '0', 'cpu', 2), then offset 0, shape (3,), strides (1,)
-    stream.write(b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x02tQ")
-    stream.write(b"K\x00(K\x03t(K\x01t\x89}tR.")
-    path = tmp_path / "x.pth"
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr("x/data.pkl", stream.getvalue())
+    content += b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x02tQ"
+    path = archive(tmp_path / "x.pth", content + b"K\x00(K\x03t(K\x01t\x89}tR.")
+    with zipfile.ZipFile(path, "a") as file:
         file.writestr("x/data/0", np.ones(2, np.float32).tobytes())
     with pytest.raises(ValueError, match="reaches beyond its storage"):
         read_torch_file(path)
 
 
-def test_old_format_without_pytorch_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)
-    (tmp_path / "x.pth").write_bytes(b"\x80\x02no archive")
-    with pytest.raises(ValueError, match=r"pip install dpmjax\[torch\]"):
-        load_model(tmp_path / "x.pth")
+FOREIGN = {
+    "which is no tensor": pickle.dumps({"encoder": Evil()}),
+    "expected a dictionary of encoder and decoder": pickle.dumps({"encoder": {}}),
+    "encoder: unknown tensor point_mlp9.weight": pickle.dumps({"encoder": {"point_mlp9.weight": 1}, "decoder": {}}),
+    "0 stages": pickle.dumps({"encoder": {}, "decoder": {}}),
+}
 
 
-def test_other_layouts_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected a dictionary of encoder and decoder"):
-        load_model(archive(tmp_path / "a.pth", pickle.dumps({"encoder": {}})))
-    with pytest.raises(ValueError, match="encoder: unknown tensor point_mlp9.weight"):
-        load_model(archive(tmp_path / "b.pth", pickle.dumps({"encoder": {"point_mlp9.weight": 1}, "decoder": {}})))
-    with pytest.raises(ValueError, match="0 stages"):
-        load_model(archive(tmp_path / "c.pth", pickle.dumps({"encoder": {}, "decoder": {}})))
+@pytest.mark.parametrize("message", FOREIGN)
+def test_foreign_checkpoints_are_refused_and_run_nothing(message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_model(archive(tmp_path / "x.pth", FOREIGN[message]))
 
 
-def test_broken_files_are_named(model: Model, tmp_path: Path) -> None:
+def test_broken_and_missing_files_are_named(model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_model(model, tmp_path / "whole.safetensors")
     content = (tmp_path / "whole.safetensors").read_bytes()
     (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match="cut.safetensors: not a whole safetensors file"):
-        load_model(tmp_path / "cut.safetensors")
-    with pytest.raises(ValueError, match="none.safetensors: no such file"):
-        load_model(tmp_path / "none.safetensors")
-    with pytest.raises(ValueError, match="none.pth: no such file"):
-        load_model(tmp_path / "none.pth")
+    (tmp_path / "old.pth").write_bytes(b"\x80\x02no archive")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    for name, message in (
+        ("cut.safetensors", "cut.safetensors: not a whole safetensors file"),
+        ("none.safetensors", "none.safetensors: no such file"),
+        ("none.pth", "none.pth: no such file"),
+        ("old.pth", r"pip install dpmjax\[torch\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load_model(tmp_path / name)
 
 
 def test_parameters_that_half_precision_cannot_hold_are_refused(model: Model, tmp_path: Path) -> None:
@@ -192,9 +174,7 @@ def test_converter_converts(model: Model, tmp_path: Path) -> None:
     assert read_card(tmp_path / "b.safetensors") == "copy"
 
 
-def test_converter_tells_bad_input_in_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "dpmjax.weights", str(tmp_path / "no.pth"), str(tmp_path / "x.safetensors")]
-    result = subprocess.run(command, capture_output=True, text=True)
-    assert result.returncode == 2
-    assert result.stderr.strip().count("\n") == 0
-    assert "no.pth: no such file" in result.stderr
+def test_converter_tells_bad_input_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "no.pth"), str(tmp_path / "x.safetensors")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no.pth: no such file" in line

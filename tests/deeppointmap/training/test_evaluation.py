@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import functools
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import (
-    ObjectiveConfig,
     PairKind,
     draw_evaluation_pairs,
     evaluate_registration,
-    init_model,
 )
 from dpmjax.deeppointmap.model import encode_pyramid
-from dpmjax.deeppointmap.training import evaluation as evaluation_module
-from dpmjax.deeppointmap.training.offset_quality import offset_r2, wall_offsets
 from tests.deeppointmap import toy
 from tests.tolerances import ACCUMULATED
 
 
 @pytest.mark.slow
-def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
-    model = init_model(jax.random.key(0), toy.MODEL)
+def test_each_scan_of_an_evaluation_is_encoded_in_its_row(model) -> None:
     pairs = draw_evaluation_pairs([toy.drive(num_scans=4)], 2, toy.MODEL)
     clouds = evaluate_registration(model, pairs).clouds
     for row, pyramid in enumerate(pairs.pyramids):
@@ -38,8 +29,7 @@ def test_each_scan_of_an_evaluation_is_encoded_in_its_row() -> None:
 
 
 @pytest.mark.slow
-def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(assert_compiles_nothing) -> None:
-    model = init_model(jax.random.key(0), toy.MODEL)
+def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(model, assert_compiles_nothing) -> None:
     kinds = (PairKind(2.0, 10.0), PairKind(2.0, 10.0, num_scans=3))
     few, many = (
         draw_evaluation_pairs([toy.drive(num_scans=num_scans)], num_pairs, toy.MODEL, kinds=kinds)
@@ -50,22 +40,6 @@ def test_an_evaluation_of_other_numbers_of_scans_and_pairs_compiles_nothing(asse
         found = evaluate_registration(model, many)
     assert [len(recall.translation_errors_m) for recall in found.recalls] == [13, 13]
     assert found.clouds.positions.shape[0] == 24
-
-
-@pytest.mark.slow
-def test_offsets_of_an_evaluation_are_those_of_its_pairs(monkeypatch) -> None:
-    # The points of the toy lie far apart.
-    wide = functools.partial(wall_offsets, config=ObjectiveConfig(offset_radius_m=10.0))
-    monkeypatch.setattr(evaluation_module, "wall_offsets", wide)
-    model = init_model(jax.random.key(0), toy.SLAM_MODEL)
-    pairs = draw_evaluation_pairs([toy.drive(num_scans=6)], 4, toy.SLAM_MODEL)
-    evaluation, some = evaluate_registration(model, pairs), pairs.pairs[0]
-    parts = []
-    for source, target, T in zip(some.sources[:, 0], some.targets[:, 0], pairs.true_motions(some), strict=True):
-        sides = (jax.tree.map(lambda leaf, row=row: leaf[row], evaluation.clouds) for row in (source, target))
-        parts.append(jax.device_get(wide(model, *sides, jnp.asarray(T, jnp.float32))))
-    assert np.isfinite(evaluation.offset_r2).all()
-    np.testing.assert_allclose(evaluation.offset_r2, offset_r2(parts), **ACCUMULATED)
 
 
 def test_scans_are_turned_with_their_poses() -> None:

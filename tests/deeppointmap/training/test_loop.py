@@ -85,19 +85,11 @@ def test_the_best_model_is_that_of_the_best_score(whole) -> None:
 
 
 @pytest.mark.slow
-def test_a_training_that_is_told_to_finish_ends_early_at_the_end_of_its_cosine() -> None:
+def test_a_training_that_is_told_to_finish_ends_early() -> None:
     config = replace(TRAINING, curriculum=(CurriculumStage(2, 60),))
-    rates: list[float] = []
-    hooks = TrainingHooks(
-        steps_left=lambda step: 4 if step == 5 else 0,
-        on_report=lambda record, _: rates.append(float(record.report.learning_rate)),
-    )
+    hooks = TrainingHooks(steps_left=lambda step: 4 if step == 5 else 0)
     trained = dpmjax.train(toy.store(), config, hooks=hooks)
     assert num_steps(trained) == int(trained.progress.state.end) == 9
-    planned = 1e-5 + (1e-3 - 1e-5) * (1 + np.cos(np.pi * np.arange(61) / 60)) / 2
-    np.testing.assert_allclose(rates[:6], planned[:6], rtol=1e-4)
-    progress = 5 / 60 + (1 - 5 / 60) * np.arange(4) / 4
-    np.testing.assert_allclose(rates[5:], 1e-5 + (1e-3 - 1e-5) * (1 + np.cos(np.pi * progress)) / 2, rtol=1e-4)
 
 
 @pytest.mark.slow

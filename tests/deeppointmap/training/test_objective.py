@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -42,54 +41,8 @@ def sides(seed: int, mask_a=None, mask_b=None, poison: bool = False) -> tuple[Tr
     return result[0], result[1]
 
 
-def info_nce_in_numpy(queries, keys, distances, *, is_coarse: bool) -> tuple[float, float]:
-    queries, keys = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (queries, keys))
-    losses, hits = [], []
-    for i, distance in enumerate(distances):
-        positive = int(np.argmin(distance))
-        if distance[positive] > 1.0:
-            continue
-        logits = keys @ queries[i] / 0.1
-        used = [j for j in range(len(keys)) if j == positive or not is_coarse or distance[j] > 1.0]
-        losses.append(np.log(np.sum(np.exp(logits[used]))) - logits[positive])
-        hits.append(np.argmax(logits) == positive)
-    return float(np.mean(losses)), float(np.mean(hits))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0])
-def test_terms_are_those_of_numpy(seed: int) -> None:
-    a, b = sides(seed)
-    in_b = np.asarray(rigid.transform_points(T_B_A, a.positions))
-    distances = np.linalg.norm(in_b[:, None].astype(np.float64) - np.asarray(b.positions), axis=-1)
-    total, terms = matching_loss(a, b, T_B_A, config=CONFIG)
-    matched, coarse = (
-        (a.matched_features, b.matched_features),
-        (a.coarse_features, b.coarse_features),
-    )
-    info = 0.0
-    for features, value, is_coarse in ((matched, terms.pairing, False), (coarse, terms.coarse, True)):
-        features = [np.asarray(array, np.float64) for array in features]
-        there = info_nce_in_numpy(*features, distances, is_coarse=is_coarse)
-        back = info_nce_in_numpy(*features[::-1], distances.T, is_coarse=is_coarse)
-        np.testing.assert_allclose(value, (there[0] + back[0]) / 2, **ACCUMULATED)
-        info += (0.1 if is_coarse else 1.0) * (there[0] + back[0]) / 2
-        if not is_coarse:
-            np.testing.assert_allclose(terms.top1_accuracy, (there[1] + back[1]) / 2, **ACCUMULATED)
-    offset = 0.0
-    for side in (a, b):
-        mask = np.asarray(side.close.mask)
-        residuals = (np.asarray(side.offsets) - np.asarray(side.close.offsets))[mask].astype(np.float64)
-        inverse = np.linalg.inv(np.cov(residuals.T))
-        offset += np.sqrt(np.einsum("ni,ij,nj->n", residuals, inverse, residuals)).mean() / 2
-    np.testing.assert_allclose(terms.offset, offset, **ACCUMULATED)
-    np.testing.assert_allclose(total, info + offset, **ACCUMULATED)
-    assert terms.num_positives == np.sum(distances.min(axis=1) <= 1) + np.sum(distances.min(axis=0) <= 1)
-
-
-@pytest.mark.parametrize("seed", [1])
-def test_close_pairs_are_all_pairs_within_the_radius(seed: int) -> None:
-    a, b = positions(seed)
+def test_close_pairs_are_all_pairs_within_the_radius() -> None:
+    a, b = positions(1)
     of_a, of_b = jax.device_get(training_pairs(toy.cloud(a), toy.cloud(b), T_B_A, config=replace(CONFIG, max_close=50)))
     in_a = np.asarray(rigid.transform_points(np.linalg.inv(T_B_A), b))
     is_close = np.linalg.norm(a[:, None] - in_a, axis=-1) <= 2
@@ -100,15 +53,6 @@ def test_close_pairs_are_all_pairs_within_the_radius(seed: int) -> None:
     np.testing.assert_allclose(landed[of_a.mask], in_a[of_a.indices][of_a.mask], atol=1e-4)
     in_b = np.asarray(rigid.transform_points(T_B_A, a))
     np.testing.assert_allclose((b[:, None] + of_b.offsets)[of_b.mask], in_b[of_b.indices][of_b.mask], atol=1e-4)
-
-
-def test_directions_are_symmetric() -> None:
-    a, b = sides(2)
-    forward, backward = (
-        matching_loss(a, b, T_B_A, config=CONFIG),
-        matching_loss(b, a, np.linalg.inv(T_B_A), config=CONFIG),
-    )
-    np.testing.assert_allclose(forward[0], backward[0], **ACCUMULATED)
 
 
 @jax.jit
@@ -145,22 +89,6 @@ def test_clouds_far_apart_cost_nothing() -> None:
     total, terms = matching_loss(*far, T_far, config=CONFIG)
     assert total == 0
     assert terms.num_positives == 0
-
-
-def test_vmap_equals_a_loop() -> None:
-    pairs = [sides(seed) for seed in (5, 6)]
-    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *some) for some in zip(*pairs, strict=True)]
-    totals, _ = jax.vmap(partial(matching_loss, config=CONFIG), (0, 0, None))(*stacked, T_B_A)
-    for i, pair in enumerate(pairs):
-        np.testing.assert_allclose(totals[i], matching_loss(*pair, T_B_A, config=CONFIG)[0], **ACCUMULATED)
-
-
-def test_second_call_compiles_nothing(assert_compiles_nothing) -> None:
-    first, second = sides(7), sides(8)
-    matching_loss(*first, T_B_A, config=CONFIG)
-    with assert_compiles_nothing():
-        matching_loss(*second, T_B_A, config=CONFIG)
-        sides(9)
 
 
 def test_without_weight_offsets_reach_neither_loss_nor_gradient() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap import OverlapConfig, OverlapHooks, draw_overlap_pairs, train_overlap, why_no_overlap
+from dpmjax.deeppointmap.training import overlap_stage
 from dpmjax.deeppointmap.training.overlap_stage import PairFeatures, hard_pairs, head_logits, init_overlap, with_head
 from dpmjax.deeppointmap.training.sampling import ScanTable
 from tests.deeppointmap import toy
@@ -84,8 +85,6 @@ def test_a_head_learns_to_tell_pairs_apart(model) -> None:
     is_overlap = np.arange(64) % 2 == 0
     features = rng.normal(is_overlap[:, None, None, None], 0.5, (64, 2, 8, 12)).astype(np.float16)
     pairs = PairFeatures(features, np.ones((64, 2, 8), bool), is_overlap)
-    from dpmjax.deeppointmap.training import overlap_stage
-
     state, losses = init_overlap(model), []
     for _ in range(60):
         state, loss, _ = overlap_stage._step(state, model, pairs, 1e-2, 0.0)
