@@ -235,12 +235,7 @@ def write_plain_drive(folder, rng):
     return folder
 
 
-def upper(size):
-    return " ".join(f"{float(row == column):g}" for row in range(size) for column in range(row, size))
-
-
 TORO_PLANAR = "VERTEX2 1 0 0 0\nVERTEX2 2 1 0 0.1\nEDGE2 1 2 1 0 0.1 9 0 9 9 0 0\nEQUIV 1 2\n"
-TORO_SPATIAL = f"VERTEX3 1 0 0 0 0 0 0\nVERTEX3 2 1 0 0 0.1 0 0\nEDGE3 1 2 1 0 0 0.1 0 0 {upper(6)}\n"
 EDGES_ALONE = "EDGE_SE2 1 2 1 0 0.1 9 0 0 9 0 9\nEDGE_SE2 2 3 1 0 0.1 9 0 0 9 0 9\nEDGE_SE2 3 1 1 0 2 9 0 0 9 0 9\n"
 PLANAR_GRAPH = """VERTEX_SE2 7 0 0 0
 VERTEX_SE2 3 1 2 0.5
@@ -304,7 +299,6 @@ CASES: dict[str, tuple[Write, Read]] = {
     **{f"drive, {kind}": (partial(write_bag, kind=kind), read_drive) for kind in KINDS},
     **{f"scans, {kind}": (partial(write_planar_bag, kind=kind), io.read_sequence) for kind in KINDS},
     "graph, toro": (partial(write_graph, text=TORO_PLANAR), dpmjax.read_g2o),
-    "graph, toro in space": (partial(write_graph, text=TORO_SPATIAL), dpmjax.read_g2o),
     "graph, edges": (partial(write_graph, text=EDGES_ALONE), dpmjax.read_g2o),
     "graph, planar": (partial(write_graph, text=PLANAR_GRAPH), dpmjax.read_g2o),
     "graph, spatial": (partial(write_graph, text=SPATIAL_GRAPH), dpmjax.read_g2o),
@@ -446,62 +440,3 @@ def test_a_header_that_lies_allocates_nothing(tmp_path, claim):
     (tmp_path / "a.npy").write_bytes(content[:10] + header.ljust(117).encode() + b"\n" + content[128:])
     with pytest.raises(InputError, match="NumPy"):
         io.read_sequence(tmp_path / "a.npy")
-
-
-COMMAND_SEEDS = range(8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCANS)
-def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, monkeypatch):
-    """Every refusal has exit code 2 and one line; work begins only with scans that were read."""
-    from dpmjax.cli.command import run_command
-
-    from dpmjax.cli import map2d as command
-
-    class BegunError(Exception):
-        pass
-
-    def begin(*_):
-        raise BegunError
-
-    monkeypatch.setattr(command, "starting_poses", begin)
-    num_refused = 0
-    for seed in COMMAND_SEEDS:
-        path = make_input(f"scans, {name}", seed, tmp_path / str(seed))
-        output = tmp_path / f"out {seed}"
-        arguments = [str(path), "-o", str(output)]
-        code = run_command(command.main, command.Config, name="deepmapping_2d", description="", args=arguments)
-        told = capsys.readouterr().err
-        assert not output.exists()
-        if "BegunError" in told:
-            continue
-        num_refused += 1
-        lines = [line for line in told.splitlines() if "WARNING" not in line]
-        assert code == 2, told
-        assert len(lines) == 1, told
-        assert "Traceback" not in told
-    assert num_refused > 0
-
-
-@pytest.mark.parametrize(
-    ("points", "found"),
-    [
-        (np.ones((5, 10, 3)), "scans of 10 beams"),
-        (np.ones((5, 40, 2)), "one and the same"),
-        (np.ones((5, 40, 2)) * 1e5, "m"),
-    ],
-)
-def test_the_command_refuses_what_cannot_be_registered(tmp_path, capsys, points, found):
-    from dpmjax.cli.command import run_command
-
-    from dpmjax.cli import map2d as command
-
-    np.save(tmp_path / "a.npy", points)
-    arguments = [str(tmp_path / "a.npy"), "-o", str(tmp_path / "out")]
-    code = run_command(command.main, command.Config, name="deepmapping_2d", description="", args=arguments)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert code == 2
-    assert line.startswith(f"dpmjax: error: {tmp_path / 'a.npy'}: ")
-    assert found in line
-    assert not (tmp_path / "out").exists()
