@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.metrics import absolute_trajectory_error, position_bound
+from dpmjax.metrics import position_bound
 from dpmjax.registration2d import planar_scans
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.simulation import cast_scans, make_world
-
-
-def ate(poses: np.ndarray, reference: np.ndarray) -> float:
-    return absolute_trajectory_error(poses[:, :2], reference[:, :2])
+from tests.registration2d.conftest import ate
 
 
 @pytest.fixture(scope="module")

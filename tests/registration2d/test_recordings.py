@@ -81,13 +81,6 @@ def test_rows_that_do_not_span_the_recording_are_refused(chosen: list[int]) -> N
         fill_between(np.array(chosen), np.zeros((len(chosen), 3)), drive())
 
 
-def test_a_single_scan_is_a_recording() -> None:
-    chosen = choose_by_motion(np.zeros((1, 3)), 1.0, 1.0)
-    np.testing.assert_array_equal(
-        fill_between(chosen, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3))), [[1.0, 2.0, 3.0]]
-    )
-
-
 @pytest.mark.slow
 def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     """A dense walk whose odometry wanders between the chosen scans, which are right."""
@@ -136,9 +129,3 @@ def test_scans_recorded_twice_and_a_standing_robot_add_no_scan() -> None:
     found = choose_scans(ScanSet(noisy, walk.mask[standing]), true[standing], 1.0, 0.5)
     np.testing.assert_array_equal(standing[found.chosen], np.arange(12))
     np.testing.assert_allclose(found.between(true), true[standing], atol=1e-9)
-
-
-def test_equal_scans_are_refused(as_user) -> None:
-    points = np.repeat(np.random.default_rng(0).normal(size=(1, 40, 2)), 3, axis=0).astype(np.float32)
-    with pytest.raises(ValueError, match="^scans: expected two different ones, got 3"):
-        choose_scans(ScanSet(points, np.ones((3, 40), bool)), None, 1.0, 1.0)

@@ -107,11 +107,6 @@ def test_noise_and_missing_pixels_grow_with_the_square_of_the_depth():
         assert (~noisy.mask[among]).mean() == pytest.approx(expected, rel=0.2)
 
 
-def test_a_walk_that_no_apartment_has_room_for_is_refused():
-    with pytest.raises(ValueError, match="min_spread_m: no walk of 2 views"):
-        simulation.simulate_depth_sequence(0, 2, config=simulation.DepthWalkConfig(min_spread_m=2.0))
-
-
 def write_png(path, depth_mm):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.asarray(depth_mm, np.uint16)).save(path)
@@ -180,14 +175,6 @@ def test_depth_of_another_unit_is_refused_where_an_image_is_empty(pose_folder, s
         io.read_pose_folder(pose_folder, height=6, width=8)
 
 
-def test_depth_of_another_unit_is_warned_of(pose_folder, caplog):
-    """A quarter of the pixels is near."""
-    for index in (2, 10):
-        write_png(pose_folder / f"frame-{index}.depth.png", np.where(np.arange(8) < 2, 3000, 9000) + np.zeros((6, 1)))
-    assert io.read_pose_folder(pose_folder, height=6, width=8).mask.mean() == 0.25
-    assert "the median depth is 9 m" in caplog.text
-
-
 @pytest.fixture
 def scene(tmp_path):
     """Four views in the layout of the Active Vision Dataset: two places, two directions."""
@@ -246,5 +233,7 @@ def test_bad_arguments_are_named():
         simulation.make_apartment(-1)
     with pytest.raises(ValueError, match="dropout_share"):
         simulation.DepthWalkConfig(dropout_share=2.0)
+    with pytest.raises(ValueError, match="min_spread_m: no walk of 2 views"):
+        simulation.simulate_depth_sequence(0, 2, config=simulation.DepthWalkConfig(min_spread_m=2.0))
     with pytest.raises(ValueError, match="depth_m: expected"):
         back_project(np.ones((3, 3)), CAMERA, height=2, width=2, max_depth_m=5.0)
