@@ -70,36 +70,6 @@ def test_planar_motions_turn_about_the_vertical_axis() -> None:
 
 
 @pytest.mark.slow
-def test_published_batches_of_images_follow_each_other_in_time(walk) -> None:
-    config = dm.preset("paper", "depth")
-    phase = replace(config.cold_phases[0], scans_per_step=2, num_free=2)
-    config = replace(
-        config,
-        cold_phases=(phase,),
-        localization=replace(config.localization, features=(4, 8), strides=(1, 1), hidden=(8,)),
-        occupancy=replace(config.occupancy, features=(8,)),
-    )
-
-    def data_of(rows: slice) -> MappingData:
-        return dm.mapping_data(as_depth_scans(walk.points[rows], walk.mask[rows]), unit=config.unit)[0]
-
-    whole = data_of(slice(None))
-    problem = mapping_problem(config, whole)
-    assert problem.phases[0].num_steps == 6000  # two batches of 3,000 epochs
-    params = init(problem, whole, key=KEY).params
-    for step, rows in enumerate((slice(0, 2), slice(2, 4))):
-        some, own = data_of(rows), replace(params, start=params.start[rows])
-        expected, _ = problem.loss(config, problem.phases[0], own, some, jnp.int32(0), KEY)
-        found, _ = problem.loss(config, problem.phases[0], params, whole, jnp.int32(step), KEY)
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
-    # The second batch of three has one image, which has no neighbour.
-    short = replace(problem.phases[0], scans_per_step=3)
-    loss, terms = problem.loss(config, short, params, whole, jnp.int32(1), KEY)
-    assert np.isfinite(loss)
-    assert float(terms.chamfer) == 0.0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["planar", "full"])
 def test_a_fit_goes_through_all_phases_and_returns_rigid_motions(scans, motion: str) -> None:
     start = None if motion == "planar" else np.tile(np.eye(4), (4, 1, 1))
@@ -175,22 +145,6 @@ def test_the_surface_between_pixels_of_a_plane_is_the_plane(scans) -> None:
     np.testing.assert_allclose(along_row, np.where(is_surface, -0.02, 0.0), **ROUNDING)
     np.testing.assert_allclose(along_column, np.where(is_surface, 0.03, 0.0), **ROUNDING)
     np.testing.assert_allclose(twist, 0.0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_an_image_matches_itself_and_contradicts_itself_from_elsewhere(walk) -> None:
-    points, mask = jnp.asarray(walk.points[0].reshape(-1, 3)), jnp.asarray(walk.mask[0].reshape(-1))
-    surface = as_depth_scans(walk.points, walk.mask).surfaces[0]
-    pinhole, tolerance = fit_pinhole(walk.points, walk.mask), jnp.float32(0.05)
-
-    def consistency(T_other_camera: jax.Array, mask: jax.Array) -> float:
-        return float(
-            image_agreement(T_other_camera, PixelSample(points, mask), surface, pinhole, tolerance).consistency()
-        )
-
-    assert consistency(jnp.eye(4), mask) > 0.8
-    assert consistency(jnp.eye(4).at[2, 3].set(-0.6), mask) < 0.0
-    assert consistency(jnp.eye(4), jnp.zeros_like(mask)) == 0.0
 
 
 @pytest.mark.slow

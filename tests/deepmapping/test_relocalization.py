@@ -13,12 +13,12 @@ import dpmjax
 from dpmjax import deepmapping as dm
 from dpmjax.deepmapping import localization_training
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.localization_training import make_raster, nearest_nodes, render_scans
+from dpmjax.deepmapping.localization_training import make_raster, render_scans
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
-from dpmjax.deepmapping.problem import MapFrame, bind_map
+from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.relocalization import propose_poses
 from dpmjax.geometry import se2
-from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig, init_map_net
+from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -134,18 +134,6 @@ def test_rendered_scans_are_those_of_the_world(fitted, tiny_walk) -> None:
     spacing = float(raster.spacing) * fitted.unit
     assert np.median(error) < spacing
     assert (error < 3.0 * spacing).mean() > 0.9
-
-
-@pytest.mark.slow
-def test_the_raster_of_an_mlp_covers_the_way(unmapped) -> None:
-    poses = np.array([[-40.0, 0, 0], [60.0, 20.0, 0]]) * unmapped.unit
-    config = replace(unmapped.config, occupancy=dm.preset("paper").occupancy)
-    params = replace(unmapped.params, occupancy=init_map_net(config.occupancy, key=KEY))
-    raster = make_raster(unmapped._replace(poses=poses, params=params, config=config))
-    _, is_inside = nearest_nodes(raster.frame, jnp.asarray(poses[:, :2] / unmapped.unit))
-    assert is_inside.all()
-    node = raster.frame.centre + raster.frame.half_side * jnp.array([[-1.0, 1.0]])
-    np.testing.assert_allclose(raster.logits[0, -1], bind_map(params, config)(node)[0], rtol=1e-5)
 
 
 def test_nothing_is_rendered_from_a_map_that_knows_nothing(unmapped, tiny_walk) -> None:

@@ -13,7 +13,6 @@ from experiments import deepmapping_ablations, deepmapping_relocalize, deepmappi
 from tests.experiments.running import read_rows, run
 
 
-
 @pytest.mark.parametrize(
     ("module", "options", "message"),
     [

@@ -20,7 +20,7 @@ from dpmjax.deeppointmap import (
     LogisticModel,
     MatchEvidence,
 )
-from dpmjax.deeppointmap.scan_evaluation import StagedRegistration, StageSeconds
+from dpmjax.deeppointmap.scan_evaluation import StagedRegistration
 from experiments import dpm_calibrate
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
@@ -53,7 +53,7 @@ def kinds(monkeypatch) -> list[str | None]:
         )
         of_elements = np.concatenate([of_clouds, rng.normal(size=len(ELEMENT_FEATURES) - 4) + is_right])
         motions.append((T, MatchEvidence(of_clouds, None, of_elements=of_elements)))
-        return StagedRegistration(T, T, T, evidence, StageSeconds(*[0.0] * 5))
+        return StagedRegistration(T, T, T, evidence, 0.0)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
     monkeypatch.setattr(deeppointmap, "encode", lambda model, points, num_elements: points)

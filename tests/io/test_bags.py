@@ -269,10 +269,3 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(InputError, match=r"needs rosbags, which is not installed; pip install 'dpmjax\[ros\]'"):
         open_lidar_sequence(tmp_path / "a.bag")
-
-
-@pytest.mark.parametrize("name", ["a.pcap", "a.osf"])
-def test_captures_name_their_converter(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(b"123")
-    with pytest.raises(InputError, match="capture .* which is not read; convert it to a bag"):
-        open_lidar_sequence(tmp_path / name)

@@ -214,20 +214,3 @@ def test_labels_beside_scans_are_left_out_and_named(folder: Path, suffix: str, n
     drive = open_lidar_sequence(folder)
     assert {Path(source).suffix for source in drive.sources} == {".pcd"}
     assert f"{num} {suffix} left out beside {NUM} .pcd" in drive.notes[0].text
-
-
-def test_kitti_folders_take_rows_of_tum_by_time(tmp_path: Path) -> None:
-    (tmp_path / "velodyne").mkdir()
-    rng = np.random.default_rng(0)
-    for index in range(NUM):
-        rows = np.column_stack([rng.normal(size=(40, 3)) * [10, 10, 1], np.ones(40)])
-        rows.astype("<f4").tofile(tmp_path / "velodyne" / f"{index:06d}.bin")
-    (tmp_path / "velodyne" / "map.bin").write_bytes(b"0" * 160)
-    times, fine = 0.1 * np.arange(NUM), 0.01 * np.arange(10 * NUM)
-    write_times(tmp_path, times)
-    for name in ("poses_lidar.txt", "groundtruth.txt"):
-        write_tum(tmp_path / name, drive_along(fine), times=fine)
-        drive = open_lidar_sequence(tmp_path)
-        np.testing.assert_allclose(drive.T_world_lidar, drive_along(times), atol=1e-4)
-        assert "map.bin is no scan" in drive.notes[0].text
-        (tmp_path / name).unlink()

@@ -14,12 +14,10 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import GlobalConfig, nearest_tour, planar_scans, refine, register_globally
 from dpmjax.registration2d.global_registration import find_unregistered
-from dpmjax.registration2d.map_assembly import PoseScorer, add_up, agreeing_edges, assemble, move_blocks, weakest_cuts
+from dpmjax.registration2d.map_assembly import add_up, agreeing_edges, assemble, weakest_cuts
 from dpmjax.registration2d.pair_search import (
-    APART,
     Candidates,
     CorrelativeConfig,
-    Hypotheses,
     _spectra,
     search_pairs,
 )
@@ -54,11 +52,6 @@ def found(profiles) -> Candidates:
     return search_pairs(profiles, *np.tril_indices(len(profiles), k=-1), COARSE)
 
 
-@pytest.fixture(scope="module")
-def scorer(profiles) -> PoseScorer:
-    return PoseScorer(profiles, 100.0, 0.02, False)
-
-
 def test_support_counts_by_rank_and_contradictions_in_full() -> None:
     # 3 + 2 / 2 - 1; nothing; all that contradicts.
     scores = np.array([[2.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 0.0], [-1.0, -2.0, 0.0, -4.0]])
@@ -80,15 +73,6 @@ def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
 
 
 @pytest.mark.slow
-def test_candidates_of_a_pair_are_different_poses(profiles, found) -> None:
-    poses = np.where(np.isfinite(found.scores)[..., None], found.poses, np.nan)
-    for first, second in ((0, 1), (0, 2), (1, 2)):
-        off = poses[:, first] - poses[:, second]
-        is_near = np.hypot(off[:, 0], off[:, 1]) < APART * profiles.scans.typical_range
-        assert not (is_near & (np.abs(se2.wrap_angle(off[:, 2])) < APART)).any()
-
-
-@pytest.mark.slow
 def test_only_the_given_turns_are_searched(profiles) -> None:
     turns = np.zeros((1, COARSE.num_turns), bool)
     turns[0, 18] = True
@@ -98,11 +82,11 @@ def test_only_the_given_turns_are_searched(profiles) -> None:
     np.testing.assert_allclose(headings, np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
 
 
-def test_a_program_has_one_fourier_transform(profiles, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_has_one_fourier_transform(walk_scans, monkeypatch: pytest.MonkeyPatch) -> None:
     # Two at once may wait for each other's threads for ever (CPU, JAX 0.11).
     transform = Mock(wraps=jnp.fft.rfft2)
     monkeypatch.setattr(jnp.fft, "rfft2", transform)
-    _spectra.__wrapped__(profiles, jnp.zeros(()), jnp.ones(()), COARSE)
+    _spectra.__wrapped__(make_profiles(walk_scans), jnp.zeros(()), jnp.ones(()), COARSE)
     assert transform.call_count == 1
 
 
@@ -117,33 +101,6 @@ def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
     assert ate(assembled, sequence.reference_poses) < 4.0
     edges = agreeing_edges(assembled, candidates, profiles)
     assert not ((edges.source == 6) & (edges.target == 0)).any()
-
-
-def test_a_pair_agrees_with_the_map_by_its_nearest_candidate(truth, profiles) -> None:
-    source, target, unit = np.array([1, 4, 6, 2]), np.array([0, 3, 1, 0]), profiles.scans.typical_range
-    right = se2.relative(truth[target], truth[source])
-    off = np.array([[0.3, 0.0, 0.0], [0.02, 0.02, 0.02], [0.0, 0.0, 0.0]]) * [unit, unit, 1.0]
-    poses = se2.compose(right[:, None], off)
-    poses[2] = se2.compose(right[2], np.array([0.0, 0.0, 0.3]))
-    num_beams = np.asarray(profiles.scans.mask.sum(axis=1))
-    scores = np.array([[0.9, 0.5, 0.4]] * 3 + [[0.05, 0.05, 0.05]]) * (num_beams[source] + num_beams[target])[:, None]
-    edges = agreeing_edges(truth, Candidates(source, target, poses, scores), profiles)
-    # The third pair has no candidate that is near, the fourth none with enough beams.
-    np.testing.assert_array_equal((edges.source, edges.target), ([1, 4], [0, 3]))
-    np.testing.assert_allclose(edges.measurements, right[:2], atol=1e-9)
-    expected = 0.4 / np.array([0.0045 * unit, 0.0045 * unit, 0.01]) ** 2
-    np.testing.assert_allclose(edges.information, [np.diag(expected)] * 2, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_block_at_a_wrong_pose_moves_back_as_a_whole(sequence, truth, found, scorer) -> None:
-    torn = truth.copy()
-    torn[4:] = se2.compose(np.array([300.0, 150.0, 0.4]), torn[4:])
-    mended, num_moved = move_blocks(torn, Hypotheses.of(found, 0.0).in_both_directions(), scorer)
-    assert num_moved == 1
-    assert ate(torn, sequence.reference_poses) > 50.0
-    assert ate(mended, sequence.reference_poses) < 4.0
-    assert move_blocks(mended, Hypotheses.of(found, 0.0).in_both_directions(), scorer)[1] == 0
 
 
 def test_weakest_cut_is_between_two_groups() -> None:

@@ -134,15 +134,6 @@ def test_untrusted_odometry_leads_to_a_registration_without_it(walk) -> None:
 
 
 @pytest.mark.slow
-def test_stop_ends_with_what_exists(few) -> None:
-    found = register(few, start=few.reference_poses, hooks=RegistrationHooks(stop=lambda: True))
-    assert list(found.candidates) == [GIVEN_POSES]
-    assert found.kept == GIVEN_POSES
-    assert found.fitted.num_steps == 0
-    np.testing.assert_array_equal(found.poses, few.reference_poses)
-
-
-@pytest.mark.slow
 def test_a_resumed_fit_that_is_over_is_a_candidate_and_one_without_a_step_is_not(few) -> None:
     start = few.reference_poses
     for num_steps, names in ((0, [GIVEN_POSES]), (20, [GIVEN_POSES, DEEPMAPPING])):

@@ -102,16 +102,8 @@ def test_a_choice_needs_a_candidate(walk_scans) -> None:
         choose_trajectory(walk_scans, {})
 
 
-@pytest.fixture(scope="module")
-def sparse():
-    """Eleven scans, 40 px apart, and their sequence."""
-    sequence = simulate_sequence(0, 41, seed=1).take(slice(0, None, 4))
-    return sequence, planar_scans(sequence.points, sequence.mask)
-
-
-def test_truth_is_trusted_in_any_frame_and_torn_or_collapsed_maps_are_not(sparse) -> None:
-    sequence, scans = sparse
-    true = sequence.reference_poses
+def test_truth_is_trusted_in_any_frame_and_torn_or_collapsed_maps_are_not(walk, walk_scans) -> None:
+    scans, true = walk_scans, walk.reference_poses
     one, other = (assess_trajectory(scans, true + offset) for offset in (0.0, np.array([500.0, -300.0, 0.0])))
     assert one.is_trusted
     assert one.contradiction < 0.01

@@ -75,17 +75,6 @@ def test_right_steps_are_strong_and_torn_ones_weak(log) -> None:
     assert np.flatnonzero(weak_steps(profiles, torn, rows)).tolist() == [9]
 
 
-def test_usual_motion_surprises_least() -> None:
-    steps = np.array([[1.0, 0.0, 0.1], [1.1, 0.1, 0.0], [0.9, 0.0, -0.1]])
-    prior = MotionPrior.of(steps, typical_range=5.0)
-    ways = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [4.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 0.0, 2.0]])
-    surprise = prior.surprise(ways, np.ones(len(ways), np.int64))
-    assert surprise.argmin() == 0
-    assert (surprise[1:] > 0.5).all()
-    np.testing.assert_allclose(prior.expected(2), [2.0, 0.0, 0.0], atol=0.05)
-    assert MotionPrior.of(np.zeros((0, 3)), 5.0).forward == 0.0
-
-
 def test_arcs_bend_by_half_their_turn_and_have_the_usual_lengths() -> None:
     prior = MotionPrior(1.0, 0.9)
     arcs = prior.arcs()

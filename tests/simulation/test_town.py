@@ -98,14 +98,6 @@ def test_poses_of_a_route_look_along_it_at_equal_steps():
     np.testing.assert_allclose(T[:, 2, 2], np.linalg.det(R), atol=1e-9)
 
 
-@pytest.mark.slow
-def test_there_and_back_sees_a_street_from_both_sides():
-    poses = route("there_and_back")
-    apart = np.linalg.norm(poses[:, None, :2, 3] - poses[None, :, :2, 3], axis=-1)
-    facing = np.einsum("ni,mi->nm", poses[:, :2, 0], poses[:, :2, 0])
-    assert ((apart < 5) & (facing < -0.9)).any(axis=1).mean() > 0.1
-
-
 def test_reverse_drives_the_other_lane(town, way):
     back = drive(town, DriveConfig(is_reversed=True)).T_world_lidar
     apart = np.linalg.norm(back[:, None, :2, 3] - way.T_world_lidar[None, :, :2, 3], axis=-1).min(1)

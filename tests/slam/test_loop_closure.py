@@ -11,8 +11,7 @@ from dpmjax.deeppointmap import pooled_vector
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.pose_graph import optimize_pose_graph
-from dpmjax.scans.surface_alignment import PlanePairs
-from dpmjax.scans.weak_directions import diagonal_information, plane_information, with_least_covariance
+from dpmjax.scans.weak_directions import diagonal_information
 from dpmjax.slam import KeyframeMap, LoopClosureConfig, SlamConfig, SlamMethods
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, as_pose_graph, submap_around
 from dpmjax.slam.loop_closure import (
@@ -164,23 +163,6 @@ def test_a_wrong_loop_is_taken_back() -> None:
         absolute_trajectory_error(each.T_world_keyframe[:, :3, 3], truth[:, :3, 3]) for each in (slam_map, after)
     )
     assert found < 0.8 * before
-
-
-def test_an_alignment_is_as_exact_as_its_planes_and_the_configuration_say() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-10, 10, (300, 3))
-    normals = np.eye(3)[rng.integers(1, 3, 300)]  # walls and floor of a corridor along x
-    pairs = PlanePairs(points, rng.normal(0, 0.02, 300), normals)
-    T = pose(3.0, -1.0, 0.4)
-    information = with_least_covariance(plane_information(pairs, T), 0.1, 0.02)
-    covariance = np.linalg.inv(information)
-    # The axis of the corridor in the frame of the source.
-    along, across = (T[:3, :3].T @ np.eye(3)[axis] for axis in (0, 1))
-    assert np.sqrt(along @ covariance[:3, :3] @ along) > 5.0
-    np.testing.assert_allclose(np.sqrt(across @ covariance[:3, :3] @ across), 0.1, atol=0.01)
-    assert (np.linalg.eigvalsh(covariance - np.diag([0.01] * 3 + [0.0004] * 3)) > -1e-9).all()
-    few = PlanePairs(points[:3], np.zeros(3), normals[:3])
-    assert np.linalg.inv(plane_information(few, T))[0, 0] > 50.0
 
 
 def test_a_part_starts_where_a_loop_says() -> None:

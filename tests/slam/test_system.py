@@ -298,26 +298,6 @@ def test_a_scan_where_nothing_agrees_is_predicted() -> None:
     assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:40, :3, 3]) < 0.5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_map_is_extended_by_a_later_drive(seed) -> None:
-    # The second drive begins elsewhere and meets the first one on its way.
-    truth = laps(2, side_m=60.0, step_m=2.0)
-    methods = SlamMethods(TruthMatcher(truth, seed=seed), TruthGeometry(truth, seed=seed), CONFIG)
-    first = run_slam(methods, scans_of(range(70)))
-    second = run_slam(methods, scans_of(range(90, 200)), slam_map=first.map)
-    assert [report.scan for report in second.reports][:2] == [69, 70]
-    assert second.reports[0].status == "first"
-    assert second.T_world_scan.shape == (110, 4, 4)
-    expected = (rigid.inverse(truth[0]) @ truth[90:200])[:, :3, 3]
-    apart = np.linalg.norm(second.T_world_scan[:, :3, 3] - expected, axis=1)
-    assert apart.max() < 1.0
-    # The first part keeps its frame and its loops.
-    rows = len(first.keyframes)
-    kept = second.map.T_world_keyframe[:rows, :3, 3] - first.map.T_world_keyframe[:, :3, 3]
-    assert np.abs(kept).max() < 0.5
-
-
 class SparseGeometry(TruthGeometry):
     """Scans of so few points that a right pose never scores high."""
 
