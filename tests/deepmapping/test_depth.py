@@ -96,14 +96,6 @@ def test_a_fit_improves_the_trajectory_of_a_perturbed_start(walk, scans) -> None
     assert ate(fitted.T_world_scan) < 0.5 * ate(start)
 
 
-@pytest.mark.slow
-def test_sets_of_one_shape_share_their_compilation(scans, assert_compiles_nothing) -> None:
-    start, other = np.tile(np.eye(4), (4, 1, 1)), replace(scans, points=0.9 * scans.points)
-    dm.fit_deepmapping(scans, small("full"), key=KEY, start=start)
-    with assert_compiles_nothing():
-        dm.fit_deepmapping(other, small("full"), key=KEY, start=start)
-
-
 def test_masked_pixels_never_matter(walk) -> None:
     mask = walk.mask.copy()
     mask[:, 3:5] = False
