@@ -53,24 +53,19 @@ def test_of_start_and_fit_the_more_consistent_one_is_kept(walk, scans) -> None:
         assert found.misfit == pytest.approx(1.0 - float(projective_consistency(scans, fitted)), abs=1e-4)
 
 
-def test_a_fit_without_a_step_is_not_kept(walk, scans) -> None:
+def test_a_fit_that_is_not_finite_or_has_no_step_is_not_kept(walk, scans) -> None:
     apart = np.array(walk.T_world_camera)
     apart[:, 0, 3] += np.arange(4.0)
-    trained = returning(walk.T_world_camera, scans)
+    right, lost = (returning(T, scans) for T in (walk.T_world_camera, np.full((4, 4, 4), np.nan)))
 
-    def engine(problem, data, *, key):
-        done = trained(problem, data, key=key)
+    def without_step(problem, data, *, key):
+        done = right(problem, data, key=key)
         return done._replace(state=done.state.replace(step=jnp.zeros((), jnp.int32)))
 
-    found = dm.register_depth(scans, CONFIG, key=KEY, start=apart, engine=engine)
-    assert found.kept == "start"
-    np.testing.assert_array_equal(found.T_world_scan, apart)
-
-
-def test_a_fit_that_is_not_finite_is_not_kept(walk, scans) -> None:
-    lost = np.full((4, 4, 4), np.nan)
-    found = dm.register_depth(scans, CONFIG, key=KEY, start=walk.T_world_camera, engine=returning(lost, scans))
-    assert found.kept == "start"
+    for start, engine in ((walk.T_world_camera, lost), (apart, without_step)):
+        found = dm.register_depth(scans, CONFIG, key=KEY, start=start, engine=engine)
+        assert found.kept == "start"
+        np.testing.assert_array_equal(found.T_world_scan, start)
 
 
 @pytest.mark.slow

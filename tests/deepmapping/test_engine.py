@@ -106,18 +106,32 @@ def test_each_of_several_starts_is_a_fit_of_its_own() -> None:
     assert together.state.step.tolist() == [80, 80, 80]
 
 
-def test_an_older_key_is_the_same_key_and_a_number_is_refused() -> None:
-    older = fit(valley(), jnp.zeros(()), key=jax.random.PRNGKey(3))
-    np.testing.assert_array_equal(older.poses, fit(valley(), jnp.zeros(()), key=jax.random.key(3)).poses)
-    with pytest.raises(ValueError, match=r"^key: expected a key such as jax.random.key\(0\), got int"):
-        fit(valley(), jnp.zeros(()), key=3)
-
-
-def test_a_fit_without_jit_is_the_fit() -> None:
-    expected = fit(valley(), jnp.zeros(()), key=KEY)
+def test_steps_solve_and_a_fit_without_jit_are_the_fit() -> None:
+    problem, data = valley(), jnp.zeros(())
+    done = fit(problem, data, key=KEY)
+    state = init(problem, data, key=KEY)
+    while not is_finished(problem, state):
+        state, report = step(problem, state, data)
+    jax.tree.map(np.testing.assert_array_equal, state, done.state)
+    assert report.loss == pytest.approx(float(np.mean(done.report.losses)))
+    solved = solve(problem, data, key=KEY)
     with jax.disable_jit():
-        found = fit(valley(), jnp.zeros(()), key=KEY)
-    np.testing.assert_allclose(found.poses, expected.poses, **ACCUMULATED)
+        without_jit = fit(problem, data, key=KEY)
+    for state, report in (solved, (without_jit.state, without_jit.report)):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), state, done.state)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), report, done.report)
+
+
+def test_an_older_key_is_the_same_key_and_bad_input_is_named() -> None:
+    problem, data = valley(), jnp.zeros(())
+    older = fit(problem, data, key=jax.random.PRNGKey(3))
+    np.testing.assert_array_equal(older.poses, fit(problem, data, key=KEY).poses)
+    with pytest.raises(ValueError, match=r"^key: expected a key such as jax.random.key\(0\), got int"):
+        fit(problem, data, key=3)
+    with pytest.raises(ValueError, match="num_starts"):
+        fit(problem, data, key=KEY, num_starts=0)
+    with pytest.raises(ValueError, match="phase: expected the index"):
+        jax.jit(lambda state: step(problem, state, data))(init(problem, data, key=KEY))
 
 
 def test_stop_ends_the_fit_and_a_state_goes_on_to_the_same_numbers() -> None:
@@ -148,16 +162,6 @@ def test_a_second_fit_traces_nothing() -> None:
     assert num_traced == first
 
 
-def test_step_by_step_is_the_fit() -> None:
-    problem, data = valley(), jnp.zeros(())
-    state = init(problem, data, key=KEY)
-    while not is_finished(problem, state):
-        state, report = step(problem, state, data)
-    done = fit(problem, data, key=KEY)
-    jax.tree.map(np.testing.assert_array_equal, state, done.state)
-    assert report.loss == pytest.approx(float(np.mean(done.report.losses)))
-
-
 def test_the_steps_of_a_phase_run_under_jit_and_vmap() -> None:
     problem, data = valley(), jnp.linspace(0.0, 1.0, 3)
     keys = jax.random.split(KEY, 3)
@@ -174,31 +178,12 @@ def test_the_steps_of_a_phase_run_under_jit_and_vmap() -> None:
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), of_row, expected)
 
 
-def test_a_traced_state_needs_its_phase() -> None:
-    state = init(valley(), jnp.zeros(()), key=KEY)
-    with pytest.raises(ValueError, match="phase: expected the index"):
-        jax.jit(lambda state: step(valley(), state, jnp.zeros(())))(state)
-
-
-def test_solve_is_the_fit() -> None:
-    problem, data = valley(), jnp.zeros(())
-    state, report = solve(problem, data, key=KEY)
-    done = fit(problem, data, key=KEY)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), state, done.state)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), report, done.report)
-
-
 def test_progress_tells_shares_phases_and_seconds() -> None:
     seen: list[Progress] = []
     fit(valley(), jnp.zeros(()), key=KEY, on_report=seen.append)
     np.testing.assert_allclose([p.share for p in seen], np.arange(5, 81, 5) / 80, **DOUBLE)
     assert [p.phase.name for p in seen] == ["valley"] * 12 + ["again"] * 4
     assert all(later.run_s > earlier.run_s > 0.0 for earlier, later in itertools.pairwise(seen))
-
-
-def test_no_start_is_refused() -> None:
-    with pytest.raises(ValueError, match="num_starts"):
-        fit(valley(), jnp.zeros(()), key=KEY, num_starts=0)
 
 
 NO_SCANS = ScanSet(jnp.zeros((2, 4, 2)), jnp.zeros((2, 4), bool))
@@ -250,13 +235,6 @@ def test_planar_fits_under_vmap_are_the_single_fits(tiny_data) -> None:
         np.testing.assert_allclose(shape, shape_alone, rtol=1e-3, atol=1e-4)
         np.testing.assert_allclose(report.losses[row], alone.report.losses, rtol=1e-3)
         assert int(state.step[row]) == int(alone.state.step)
-
-
-@pytest.mark.slow
-def test_same_key_same_numbers_and_another_key_others(tiny_data) -> None:
-    one, same, other = (fit(COLD, tiny_data, key=key).state for key in (KEY, KEY, jax.random.key(4)))
-    jax.tree.map(np.testing.assert_array_equal, one, same)
-    assert not np.array_equal(*(jax.tree.leaves(s.params.localization)[-1] for s in (one, other)))
 
 
 @pytest.mark.slow

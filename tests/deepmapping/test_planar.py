@@ -170,12 +170,6 @@ def test_a_given_unit_scales_scans_and_poses(tiny_walk) -> None:
     np.testing.assert_allclose(data.start, start / [512.0, 512.0, 1.0], **ROUNDING)
 
 
-def test_a_unit_that_is_none_of_the_scans_is_refused(tiny_walk, as_user) -> None:
-    in_metres = ScanSet(tiny_walk.points / 100.0, tiny_walk.mask)
-    with pytest.raises(ValueError, match="unit: expected a length like the ranges of the scans"):
-        dm.fit_deepmapping(in_metres, dm.preset("paper"), key=KEY)
-
-
 # Losses of the preset `fast` at its initial parameters, by phase, from zero poses or from given ones.
 FAST_LOSSES = {("L-Net", True): 0.1781985, ("free poses", True): 0.7525633, ("free poses", False): 0.7428900}
 
@@ -204,51 +198,30 @@ def test_direct_optimisation_starts_at_the_output_of_the_untrained_networks(tiny
     assert float(jnp.abs(poses[1]).max()) > 1e-3
 
 
-def test_direct_optimisation_keeps_given_poses(tiny_walk, shaken) -> None:
-    data, unit = dm.mapping_data(ScanSet(tiny_walk.points, tiny_walk.mask), shaken)
-    params = init(mapping_problem(dm.as_direct(SMALL), data), data, key=KEY).params
-    np.testing.assert_allclose(params.poses * np.array([unit, unit, 1.0]), shaken, rtol=1e-5, atol=1e-3)
-
-
-def test_large_sets_are_drawn_in_blocks_of_neighbours() -> None:
-    rows, is_scan = map(np.asarray, blocks_of_step(dm.preset("fast").warm_phases[0], 1000, jnp.int32(0), key=KEY))
-    assert rows.shape == (8, 32)
+@pytest.mark.parametrize(
+    ("num_scans", "scans_per_step", "shape"),
+    [(1000, None, (8, 32)), (200, 16, (1, 16)), (200, 40, (1, 32)), (200, 100, (3, 32))],
+)
+def test_scans_are_drawn_in_blocks_of_neighbours(num_scans: int, scans_per_step: int | None, shape) -> None:
+    phase = dm.preset("fast").warm_phases[0]
+    phase = phase if scans_per_step is None else replace(phase, scans_per_step=scans_per_step)
+    rows, is_scan = map(np.asarray, blocks_of_step(phase, num_scans, jnp.int32(0), key=KEY))
+    assert rows.shape == shape
     assert is_scan.all()
     assert (np.diff(rows, axis=1) == 1).all()
-    assert rows.min() >= 0
-    assert rows.max() < 1000
+    assert 0 <= rows.min() <= rows.max() < num_scans
 
 
-@pytest.mark.parametrize(("num_scans", "shape"), [(16, (1, 16)), (40, (1, 32)), (100, (3, 32))])
-def test_steps_of_few_scans_have_one_block(num_scans: int, shape: tuple[int, int]) -> None:
-    phase = replace(dm.preset("fast").warm_phases[0], scans_per_step=num_scans)
-    rows = np.asarray(blocks_of_step(phase, 200, jnp.int32(0), key=KEY).rows)
-    assert rows.shape == shape
-    assert (np.diff(rows, axis=1) == 1).all()
-
-
-def test_a_start_far_from_the_origin_is_refused(tiny_walk, as_user) -> None:
-    start = tiny_walk.reference_poses + np.array([4.5e6, 5.4e7, 0.0])
-    with pytest.raises(ValueError, match="start: the positions are too far from the origin"):
-        dm.fit_deepmapping(tiny_walk.points, key=KEY, start=start)
-
-
-def test_masked_beams_never_matter(tiny_data) -> None:
+def test_masked_beams_never_matter_and_those_that_are_zero_or_not_finite_are_masked(tiny_data) -> None:
     scans = tiny_data.scans
     mask = scans.mask & (jax.random.uniform(KEY, scans.mask.shape) < 0.8)
-    scans = [
+    one, *others = (
         as_scan_set(ScanSet(jnp.where(mask[..., None], scans.points, filling), mask)) for filling in (0.0, 1e6, np.nan)
-    ]
-    jax.tree.map(np.testing.assert_array_equal, scans[0], scans[1])
-    jax.tree.map(np.testing.assert_array_equal, scans[0], scans[2])
-
-
-def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
-    points = np.ones((3, 5, 2))
-    points[0, 1], points[1, 2] = 0.0, [np.nan, 1.0]
-    scans = as_scan_set(points)
-    assert np.argwhere(~np.asarray(scans.mask)).tolist() == [[0, 1], [1, 2]]
-    assert np.isfinite(scans.points).all()
+    )
+    points = np.where(mask[..., None], scans.points, 0.0)
+    points[::2] = np.where(mask[::2, :, None], points[::2], np.nan)
+    for other in (*others, as_scan_set(points)):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.mark.parametrize(
@@ -261,11 +234,13 @@ def test_beams_that_are_zero_or_not_finite_are_masked() -> None:
         (ScanSet(jnp.full((2, 5, 2), jnp.nan), jnp.ones((2, 5), bool)), {}, "scans: expected finite"),
         (np.ones((2, 5, 2)), {"start": np.zeros((3, 3))}, "start: expected shape"),
         (np.ones((2, 5, 2)), {"start": np.full((2, 3), np.nan)}, "start: expected finite"),
+        (np.ones((2, 5, 2)), {"start": np.full((2, 3), 5.4e7)}, "start: the positions are too far from the origin"),
+        (np.ones((2, 5, 2)), {"config": dm.preset("paper")}, "unit: expected a length like the ranges of the scans"),
     ],
 )
 def test_bad_input_is_named(as_user, scans, options, message) -> None:
     with pytest.raises(ValueError, match=message):
-        dm.fit_deepmapping(scans, SMALL, key=KEY, **options)
+        dm.fit_deepmapping(scans, **{"config": SMALL, "key": KEY, **options})
 
 
 def test_unknown_presets_and_too_few_steps_are_refused() -> None:

@@ -12,14 +12,6 @@ from dpmjax.deepmapping import preset, with_steps
 from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d
 from tests.experiments.running import read_rows, run
 
-MODULES = (deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d)
-
-
-@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.EXPERIMENT)
-def test_help_shows_examples(module, capsys) -> None:
-    assert run(module, "--help") == 0
-    assert f"python -m experiments.{module.EXPERIMENT}" in capsys.readouterr().out
-
 
 @pytest.mark.parametrize(
     ("module", "options", "message"),

@@ -14,7 +14,6 @@ from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.deeppointmap import (
     CLOUD_FEATURES,
     ELEMENT_FEATURES,
-    OVERLAP_FEATURES,
     SCAN_FEATURES,
     WEAK_FEATURES,
     Calibration,
@@ -140,14 +139,6 @@ def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
     assert answers(calibration, "scans", "sure") == [False, True, True, False]
 
 
-@pytest.mark.slow
-def test_half_of_the_overlap_pairs_of_drives_overlap(weights) -> None:
-    drives = [toy.drive(1), toy.drive(2)]
-    row = deeppointmap.measure_overlap(dpmjax.load_model(weights), drives, 32, 0)
-    assert sum(row["is_overlap"]) == 16
-    assert np.shape(row["evidence"]) == (32, len(OVERLAP_FEATURES))
-
-
 def test_the_weights_that_made_the_evidence_are_found(weights, tmp_path, monkeypatch) -> None:
     """Motions that are right as often as known weights say; the fit finds these weights, scene by scene."""
     true, rng = np.array([-2.0, 8.0, -3.0, 0.0, 0.0, 2.0, -5.0]), np.random.default_rng(0)
@@ -169,12 +160,3 @@ def test_the_weights_that_made_the_evidence_are_found(weights, tmp_path, monkeyp
     monkeypatch.setattr(dpm_calibrate, "measure_motions", None)
     assert run(dpm_calibrate, "--resume", "-o", out) == EXIT_OK
     assert load_json(out / "metrics.json")["evidence"] == metrics["evidence"]
-
-
-@pytest.mark.slow
-def test_a_few_pairs_of_a_scene_give_weights(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(dpm_calibrate, "SCENES", {False: "suburb HDL64E", True: "suburb HDL64E"})
-    monkeypatch.setattr(dpm_calibrate, "NUM_SCENE_PAIRS", 2)
-    assert run(dpm_calibrate, "--evidence", "-o", tmp_path) == EXIT_OK
-    assert load_json(tmp_path / "metrics.json")["evidence"]["walls_contradicted"] < 0
-    assert [row["num_pairs"] for row in read_rows(tmp_path)] == ["4", "4"]

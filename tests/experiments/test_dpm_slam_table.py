@@ -16,10 +16,10 @@ from dpmjax.cli.drives import DriveOptions
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, Run, load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from dpmjax.slam import SlamConfig, SlamMethods, init_slam, slam_preset, step_slam
-from experiments import _slam_peers, _slam_settings, dpm_slam_table
+from dpmjax.slam import SlamConfig, SlamMethods, init_slam, step_slam
+from experiments import _slam_peers, dpm_slam_table
 from experiments._slam_peers import FoundLoop
-from experiments._slam_settings import NEAREST, NETWORK, NO_OFFSETS, PAPER, PAPER_WIDE, WHOLE, make_setting
+from experiments._slam_settings import NETWORK, NO_OFFSETS, PAPER, WHOLE, make_setting
 from experiments.dpm_slam_table import cut_drive, map_by_agents, map_by_peer, map_by_setting, measure_trajectory
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
@@ -174,15 +174,6 @@ def test_wrong_loops_are_counted_and_find_nothing(opened) -> None:
     assert measure(loop(200, 0)._replace(newer=(200, 399), older=(0, 199)))["loop_recall"] == 1.0
 
 
-def test_scans_without_a_reference_are_left_out(tmp_path, monkeypatch) -> None:
-    whole = toy.drive(num_scans=5)
-    poses = whole.T_world_lidar.copy()
-    poses[3] = np.nan
-    monkeypatch.setattr("dpmjax.cli.open_drive", lambda *_: replace(whole, T_world_lidar=poses))
-    (drive,) = dpm_slam_table.open_drives(dpm_slam_table.SlamTableOptions(paths=(str(tmp_path),)))
-    np.testing.assert_array_equal(drive.T_world_lidar, poses[[0, 1, 2, 4]])
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -228,25 +219,6 @@ def test_a_map_of_fewer_elements_holds_the_first_ones(model, num_elements: int) 
     np.testing.assert_array_equal(fewer.elements.positions, whole.elements.positions[:num_elements])
     np.testing.assert_array_equal(fewer.features, whole.features[:num_elements])
     assert len(fewer.cloud.described.mask) == min(num_elements, len(whole.features))
-
-
-def test_the_first_elements_of_a_scan_keep_their_normals(model) -> None:
-    points = toy.drive(1, num_scans=1)[0]
-    whole, few = (make_setting(model, s).geometry.thin(points).measured.surface for s in (WHOLE, "16 elements"))
-    for name in ("points", "normals", "flatness"):
-        np.testing.assert_array_equal(getattr(few, name), getattr(whole, name)[:16])
-    np.testing.assert_array_equal(few.samples, [row for row in whole.samples if row < 16])
-
-
-def test_a_setting_changes_one_thing(model) -> None:
-    whole, network, nearest, paper, wide = (
-        make_setting(model, setting).config for setting in (WHOLE, NETWORK, NEAREST, PAPER, PAPER_WIDE)
-    )
-    assert network == replace(whole, odometry=replace(whole.odometry, proposer="network")) != whole
-    assert nearest == replace(whole, front_end=replace(whole.front_end, num_submap=1)) != whole
-    assert paper == slam_preset("paper")
-    assert replace(wide, descriptors=paper.descriptors) == paper
-    assert wide.descriptors.max_rmse_m == _slam_settings.WIDE_M
 
 
 def test_the_offset_head_is_off_only_where_a_setting_says_so(model) -> None:

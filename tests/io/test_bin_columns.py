@@ -110,8 +110,3 @@ def test_one_scan_decides_for_its_drive(tmp_path: Path, table: np.ndarray) -> No
     (tmp_path / "2.bin").write_bytes(table[:, :5].tobytes()[:-8])
     with pytest.raises(InputError, match=r"2\.bin.*of 5 float32"):
         require_whole_files(drive)
-
-
-def test_real_scan_of_five_columns(real_data: Path) -> None:
-    (path,) = (real_data / "field_3d" / "nuscenes_5_columns").glob("*.bin")
-    assert len(read_lidar_file(path)) == 12800

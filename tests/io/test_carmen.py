@@ -84,17 +84,6 @@ def test_a_log_as_recorded_has_odometry_and_no_reference(tmp_path):
         np.testing.assert_allclose(log.reference_poses, poses)
 
 
-def test_a_log_as_recorded_is_known_in_thinned_lines_too(tmp_path):
-    """The wheels were read just before each scan, 0.8 m after the scan before."""
-    poses = [(0.8 * i, 2, 0.3) for i in range(6)]
-    lines = [
-        line for i, pose in enumerate(poses) for line in (odom(pose, 0.9 + i), flaser([1, 2], pose, pose, 1.0 + i))
-    ]
-    log = read_carmen_log(write(tmp_path, *lines))
-    assert log.reference_poses is None
-    np.testing.assert_allclose(log.odometry_poses, poses)
-
-
 @pytest.mark.parametrize("kind", ["twice", "set back for good", "set back for a while", "missing stamps"])
 def test_wrong_stamps_alone_change_no_odometry(tmp_path, kind):
     turns = np.linspace(0, 3, 30)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import json
 import os
 import re
 import tarfile
@@ -14,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-from scipy.io import savemat
 
 import dpmjax
 from dpmjax import io
 from dpmjax.sequences import InputError, LidarSequence, ScanSequence
 from tests.data_sets import readable_scans, write_deepmapping_folder, write_pcd
+from tests.io import drives
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
+from tests.io.depth_files import write_pose_folder, write_scene
 from tests.io.test_las import write_las
 from tests.io.test_pcd import compressed
 from tests.io.test_pcd import header as pcd_header
@@ -97,22 +96,9 @@ def write_ascii_ply(folder, rng):
     return folder / "0.ply"
 
 
-def write_bin(folder, rng):
-    np.column_stack([cloud(rng), np.ones(40)]).astype("<f4").tofile(folder / "0.bin")
-    return folder / "0.bin"
-
-
 def write_npy_3d(folder, rng):
     np.save(folder / "0.npy", cloud(rng))
     return folder / "0.npy"
-
-
-def write_learned(folder, rng):
-    for index in range(3):
-        np.savez(
-            folder / f"{index}.npz", lidar_pcd=cloud(rng), ego_rotation=np.eye(3), ego_translation=np.zeros((3, 1))
-        )
-    return folder
 
 
 def trajectory(rng):
@@ -129,64 +115,9 @@ def write_columns(folder, rng):
 
 
 def write_drive(folder, rng, *, kind):
-    """The layout of a data set with all its side files."""
-    T = "1 0 0 0.5 0 1 0 0 0 0 1 0"
-    rows = [T.replace("0.5", str(i)) for i in range(3)]
-    homes = {
-        "kitti": "velodyne",
-        "raw": "velodyne_points/data",
-        "360": "data_3d_raw/d/velodyne_points/data",
-        "mulran": "Ouster",
-        "carla": "generated/frames",
-    }
-    home = folder / homes[kind]
-    home.mkdir(parents=True)
-    files = {"times.txt": "0\n0.1\n0.2\n", f"{homes[kind]}/../timestamps.txt": "2011-09-26 13:02:25.95\n" * 3}
-    if kind == "kitti":
-        files |= {"calib.txt": f"P0: {T}\nTr: {T}\n", "poses.txt": "\n".join(rows)}
-    if kind == "raw":
-        files |= {f"oxts/data/{i}.txt": f"49 {8 + 1e-5 * i} 100 0 0 {i}" for i in range(3)}
-        files |= {"calib_imu_to_velo.txt": "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n"}
-    if kind == "360":
-        files |= {"data_poses/d/poses.txt": "\n".join(f"{i} {row}" for i, row in enumerate(rows))}
-        files |= {"calibration/calib_cam_to_pose.txt": f"image_00: {T}", "calibration/calib_cam_to_velo.txt": T}
-    if kind == "mulran":
-        files |= {"global_pose.csv": "\n".join(f"{i},{row.replace(' ', ',')}" for i, row in enumerate(rows))}
-    if kind == "carla":
-        files |= {"generated/full_poses_lidar.txt": "\n".join(f"{rows[i // 100]} {0.01 * i}" for i in range(300))}
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-    for index in range(3):
-        if kind == "carla":
-            io.write_ply(home / f"frame_{index}.ply", cloud(rng))
-        else:
-            np.column_stack([cloud(rng), np.ones(40)]).astype("<f4").tofile(home / f"{index}.bin")
-    return folder
-
-
-def write_png(path, rng):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(rng.integers(500, 3000, (6, 8)).astype(np.uint16)).save(path)
-
-
-def write_pose_folder(folder, rng):
-    np.savetxt(folder / "intrinsics.txt", [[6.0, 0, 3.5], [0, 6.5, 2.5], [0, 0, 1]])
-    for index in range(2):
-        write_png(folder / f"{index}.depth.png", rng)
-        np.savetxt(folder / f"{index}.pose.txt", np.eye(4))
-    return folder
-
-
-def write_scene(folder, rng):
-    names = [f"00{k}0101.jpg" for k in range(2)]
-    structs = np.zeros(2, [("image_name", object), ("R", object), ("t", object)])
-    for k, name in enumerate(names):
-        structs[k] = (name, np.eye(3), np.zeros(3))
-        write_png(folder / "high_res_depth" / f"{name[:-6]}03.png", rng)
-    savemat(folder / "image_structs.mat", {"image_structs": structs, "scale": 3000.0})
-    (folder / "annotations.json").write_text(json.dumps({n: {"rotate_cw": names[1 - k]} for k, n in enumerate(names)}))
-    (folder / "cameras.txt").write_text("1 OPENCV 8 6 6.0 6.5 3.5 2.5 0 0 0 0\n")
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = range(3)
+    drives.WRITERS[kind](folder, [cloud(rng) for _ in range(3)], poses)
     return folder
 
 
@@ -235,12 +166,7 @@ def write_plain_drive(folder, rng):
     return folder
 
 
-def upper(size):
-    return " ".join(f"{float(row == column):g}" for row in range(size) for column in range(row, size))
-
-
 TORO_PLANAR = "VERTEX2 1 0 0 0\nVERTEX2 2 1 0 0.1\nEDGE2 1 2 1 0 0.1 9 0 9 9 0 0\nEQUIV 1 2\n"
-TORO_SPATIAL = f"VERTEX3 1 0 0 0 0 0 0\nVERTEX3 2 1 0 0 0.1 0 0\nEDGE3 1 2 1 0 0 0.1 0 0 {upper(6)}\n"
 EDGES_ALONE = "EDGE_SE2 1 2 1 0 0.1 9 0 0 9 0 9\nEDGE_SE2 2 3 1 0 0.1 9 0 0 9 0 9\nEDGE_SE2 3 1 1 0 2 9 0 0 9 0 9\n"
 PLANAR_GRAPH = """VERTEX_SE2 7 0 0 0
 VERTEX_SE2 3 1 2 0.5
@@ -274,7 +200,7 @@ SCANS = {
     "pcd tar": write_pcd_tar,
 }
 LIDAR_FILES = {
-    "bin": write_bin,
+    "bin": lambda folder, rng: drives.write_bin(folder / "0.bin", cloud(rng)),
     "npy": write_npy_3d,
     "pcd": lambda folder, rng: write_pcd(folder / "0.pcd", cloud(rng)),
     "ascii pcd": write_ascii_pcd,
@@ -295,21 +221,22 @@ CASES: dict[str, tuple[Write, Read]] = {
     **{f"lidar file, {name}": (write, io.read_lidar_file) for name, write in LIDAR_FILES.items()},
     **{f"poses, {name}": (write, io.read_poses) for name, write in POSES.items()},
     **{f"planar, {name}": (write, lambda path: io.read_planar_poses(path, 5, "m")) for name, write in POSES.items()},
-    **{
-        f"drive, {kind}": (partial(write_drive, kind=kind), read_drive)
-        for kind in ("kitti", "raw", "360", "mulran", "carla")
-    },
-    "drive, learned": (write_learned, read_drive),
+    **{f"drive, {kind}": (partial(write_drive, kind=kind), read_drive) for kind in drives.WRITERS},
     "drive, plain": (write_plain_drive, read_drive),
     **{f"drive, {kind}": (partial(write_bag, kind=kind), read_drive) for kind in KINDS},
     **{f"scans, {kind}": (partial(write_planar_bag, kind=kind), io.read_sequence) for kind in KINDS},
     "graph, toro": (partial(write_graph, text=TORO_PLANAR), dpmjax.read_g2o),
-    "graph, toro in space": (partial(write_graph, text=TORO_SPATIAL), dpmjax.read_g2o),
     "graph, edges": (partial(write_graph, text=EDGES_ALONE), dpmjax.read_g2o),
     "graph, planar": (partial(write_graph, text=PLANAR_GRAPH), dpmjax.read_g2o),
     "graph, spatial": (partial(write_graph, text=SPATIAL_GRAPH), dpmjax.read_g2o),
-    "depth folder": (write_pose_folder, lambda path: io.read_pose_folder(path, height=6, width=8)),
-    "depth scene": (write_scene, lambda path: io.read_active_vision(path, 3, height=6, width=8)),
+    "depth folder": (
+        lambda folder, _: write_pose_folder(folder),
+        lambda path: io.read_pose_folder(path, height=6, width=8),
+    ),
+    "depth scene": (
+        lambda folder, _: write_scene(folder),
+        lambda path: io.read_active_vision(path, 3, height=6, width=8),
+    ),
 }
 
 HUGE = (b"99999999999", b"-1", b"1e308", b"nan", b"inf", b"0", b"", b"x", b"4294967297", b"1e999", b"\xff", b"-nan")
@@ -446,62 +373,3 @@ def test_a_header_that_lies_allocates_nothing(tmp_path, claim):
     (tmp_path / "a.npy").write_bytes(content[:10] + header.ljust(117).encode() + b"\n" + content[128:])
     with pytest.raises(InputError, match="NumPy"):
         io.read_sequence(tmp_path / "a.npy")
-
-
-COMMAND_SEEDS = range(8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCANS)
-def test_the_command_refuses_spoilt_scans_in_one_line(tmp_path, name, capsys, monkeypatch):
-    """Every refusal has exit code 2 and one line; work begins only with scans that were read."""
-    from dpmjax.cli.command import run_command
-
-    from dpmjax.cli import map2d as command
-
-    class BegunError(Exception):
-        pass
-
-    def begin(*_):
-        raise BegunError
-
-    monkeypatch.setattr(command, "starting_poses", begin)
-    num_refused = 0
-    for seed in COMMAND_SEEDS:
-        path = make_input(f"scans, {name}", seed, tmp_path / str(seed))
-        output = tmp_path / f"out {seed}"
-        arguments = [str(path), "-o", str(output)]
-        code = run_command(command.main, command.Config, name="deepmapping_2d", description="", args=arguments)
-        told = capsys.readouterr().err
-        assert not output.exists()
-        if "BegunError" in told:
-            continue
-        num_refused += 1
-        lines = [line for line in told.splitlines() if "WARNING" not in line]
-        assert code == 2, told
-        assert len(lines) == 1, told
-        assert "Traceback" not in told
-    assert num_refused > 0
-
-
-@pytest.mark.parametrize(
-    ("points", "found"),
-    [
-        (np.ones((5, 10, 3)), "scans of 10 beams"),
-        (np.ones((5, 40, 2)), "one and the same"),
-        (np.ones((5, 40, 2)) * 1e5, "m"),
-    ],
-)
-def test_the_command_refuses_what_cannot_be_registered(tmp_path, capsys, points, found):
-    from dpmjax.cli.command import run_command
-
-    from dpmjax.cli import map2d as command
-
-    np.save(tmp_path / "a.npy", points)
-    arguments = [str(tmp_path / "a.npy"), "-o", str(tmp_path / "out")]
-    code = run_command(command.main, command.Config, name="deepmapping_2d", description="", args=arguments)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert code == 2
-    assert line.startswith(f"dpmjax: error: {tmp_path / 'a.npy'}: ")
-    assert found in line
-    assert not (tmp_path / "out").exists()

@@ -46,10 +46,6 @@ def test_points_and_times_are_read(tmp_path: Path, points: np.ndarray, suffix: s
     assert len(open_lidar_sequence(tmp_path)) == 1
 
 
-def test_a_format_without_times_says_so(tmp_path: Path, points: np.ndarray) -> None:
-    assert read_point_times(write_las(tmp_path / "0.las", points)) is None
-
-
 def test_national_coordinates_get_an_origin(tmp_path: Path, points: np.ndarray) -> None:
     path = write_las(tmp_path / "0.laz", points + np.array([512_000.0, 5_403_000.0, 300.0]))
     with pytest.raises(InputError, match=r"UTM; subtract an origin such as 51\d{4} 540\d{4} \d{3}"):

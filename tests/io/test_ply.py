@@ -64,11 +64,6 @@ def test_broken_files_are_named(tmp_path, content, found):
         read_ply(tmp_path / "bad.ply")
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"none\.ply"):
-        read_ply(tmp_path / "none.ply")
-
-
 def test_other_shapes_are_not_written(tmp_path):
     with pytest.raises(ValueError, match="points"):
         write_ply(tmp_path / "a.ply", POINTS[:, :2])

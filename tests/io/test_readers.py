@@ -1,7 +1,6 @@
 """Laws of the one door for scans and of NumPy files."""
 
 import gzip
-import logging
 import subprocess
 import sys
 
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 
 from dpmjax.io import InputError, ScanSequence, read_planar_poses, read_sequence
-from dpmjax.io.files import load_arrays
 from dpmjax.sequences import has_angular_order
 from tests.data_sets import write_deepmapping_folder
 
@@ -64,20 +62,11 @@ def test_matrices_and_triples_are_the_same_poses(tmp_path):
 
 def test_nan_points_and_the_mask_are_invalid_beams(tmp_path):
     holed, mask = POINTS.copy(), np.ones((6, NUM_BEAMS), bool)
-    holed[0, 1], holed[2, 3], mask[1, 2] = np.nan, 0.0, False
+    holed[0, 1], holed[2, 3], holed[4, 0], mask[1, 2] = np.nan, 0.0, [np.inf, np.nan], False
     scans = read_sequence(save(tmp_path, "a.npz", points=holed, mask=mask))
-    assert not scans.mask[[0, 1, 2], [1, 2, 3]].any()
-    assert scans.mask.sum() == 6 * NUM_BEAMS - 3
+    assert not scans.mask[[0, 1, 2, 4], [1, 2, 3, 0]].any()
+    assert scans.mask.sum() == 6 * NUM_BEAMS - 4
     assert (scans.points[~scans.mask] == 0).all()
-
-
-def test_points_of_infinite_ranges_are_no_echo(tmp_path):
-    ranges = np.linalg.norm(POINTS, axis=2)
-    ranges[1, 0], ranges[2, 3] = np.inf, -np.inf
-    with np.errstate(invalid="ignore"):
-        points = POINTS / np.linalg.norm(POINTS, axis=2)[..., None] * ranges[..., None]
-    scans = read_sequence(save(tmp_path, "a.npz", points=points))
-    np.testing.assert_array_equal(np.argwhere(~scans.mask), [[1, 0], [2, 3]])
 
 
 def with_value(index, value):
@@ -132,17 +121,6 @@ def test_missing_empty_and_foreign_files_are_refused(tmp_path, name, content):
         read_sequence(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("content", "found"), [(b"", "an empty file of 0 bytes; copy it again"), (b"1 2 3\n", "it has no header of NumPy")]
-)
-def test_an_empty_file_and_a_text_are_named(tmp_path, content, found):
-    (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(InputError, match=found):
-        load_arrays(tmp_path / "a.npy")
-    with pytest.raises(InputError, match="a folder; give one file"):
-        load_arrays(tmp_path)
 
 
 def test_a_single_scan_is_named(tmp_path):
@@ -213,14 +191,6 @@ def test_sequence_refuses_shapes_that_do_not_belong_together(as_user, change):
     assert len(whole.take(slice(1, 4))) == 3
     with pytest.raises(ValueError, match=next(iter(change))):
         ScanSequence(**(fields | change))
-
-
-def test_a_scan_in_millimetres_is_warned_of(tmp_path, caplog):
-    with caplog.at_level(logging.WARNING):
-        read_sequence(save(tmp_path, points=POINTS))
-        assert not caplog.records
-        read_sequence(save(tmp_path, points=POINTS * 40))
-    assert "are these millimetres or centimetres?" in caplog.text
 
 
 def test_import_is_light():

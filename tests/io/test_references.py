@@ -131,14 +131,6 @@ def test_numbers_of_rows_are_no_times(folder: Path, first: int) -> None:
     np.testing.assert_array_equal(open_lidar_sequence(folder).times, np.arange(float(NUM)))
 
 
-def test_a_refused_reference_tells_what_is_wrong_with_the_times(folder: Path, caplog) -> None:
-    (folder / "times.txt").write_text("".join(f"{row:06}.pcd {0.1 * row}\n" for row in range(NUM)))
-    write_tum(folder / "groundtruth.txt", drive_along(np.arange(30.0)), times=0.01 * np.arange(30))
-    with pytest.raises(InputError, match="the scans have no times"):
-        open_lidar_sequence(folder)
-    assert "times.txt: line 1, column 1: '000000.pcd' is not a number; these times are not used" in caplog.text
-
-
 def test_stamps_may_be_the_numbers_of_scans(folder: Path) -> None:
     poses = drive_along(0.1 * np.arange(NUM))
     write_times(folder, 0.1 * np.arange(NUM))
@@ -214,13 +206,6 @@ def test_a_stray_map_is_named_and_left_out(folder: Path) -> None:
     assert strays_among([Path("a.pcd"), Path("b.pcd"), Path("c1.pcd")]) == []
 
 
-def test_scans_of_two_lidars_in_one_folder_are_named(folder: Path) -> None:
-    for file in sorted(folder.glob("*.pcd"))[:2]:
-        file.rename(file.with_name(f"left_{file.name}"))
-    (note,) = (note.text for note in open_lidar_sequence(folder).notes if "kinds" in note.text)
-    assert f"names of 2 kinds, {NUM - 2} *, 2 left_*;" in note
-
-
 @pytest.mark.parametrize("suffix", [".npy", ".bin", ".npz"])
 @pytest.mark.parametrize("num", [2, NUM])
 def test_labels_beside_scans_are_left_out_and_named(folder: Path, suffix: str, num: int) -> None:
@@ -229,26 +214,3 @@ def test_labels_beside_scans_are_left_out_and_named(folder: Path, suffix: str, n
     drive = open_lidar_sequence(folder)
     assert {Path(source).suffix for source in drive.sources} == {".pcd"}
     assert f"{num} {suffix} left out beside {NUM} .pcd" in drive.notes[0].text
-
-
-def test_kitti_folders_take_rows_of_tum_by_time(tmp_path: Path) -> None:
-    (tmp_path / "velodyne").mkdir()
-    rng = np.random.default_rng(0)
-    for index in range(NUM):
-        rows = np.column_stack([rng.normal(size=(40, 3)) * [10, 10, 1], np.ones(40)])
-        rows.astype("<f4").tofile(tmp_path / "velodyne" / f"{index:06d}.bin")
-    (tmp_path / "velodyne" / "map.bin").write_bytes(b"0" * 160)
-    times, fine = 0.1 * np.arange(NUM), 0.01 * np.arange(10 * NUM)
-    write_times(tmp_path, times)
-    for name in ("poses_lidar.txt", "groundtruth.txt"):
-        write_tum(tmp_path / name, drive_along(fine), times=fine)
-        drive = open_lidar_sequence(tmp_path)
-        np.testing.assert_allclose(drive.T_world_lidar, drive_along(times), atol=1e-4)
-        assert "map.bin is no scan" in drive.notes[0].text
-        (tmp_path / name).unlink()
-
-
-def test_real_reference_of_another_rate(real_data: Path) -> None:
-    drive = open_lidar_sequence(real_data / "field_3d" / "tum_reference_of_another_rate")
-    rows = np.loadtxt(real_data / "field_3d" / "tum_reference_of_another_rate" / "groundtruth.txt")
-    np.testing.assert_allclose(drive.T_world_lidar[:, :3, 3], rows[::10, 1:4], atol=1e-5)

@@ -58,13 +58,6 @@ def test_tum_tells_its_frame_and_keeps_the_digits(tmp_path):
         read_planar_poses(tmp_path / "t.txt", 9, "m")
 
 
-def test_kitti_rows_are_twelve_bare_numbers(tmp_path):
-    text = write_kitti(tmp_path / "k.txt", POSES).read_text()
-    assert all(len(line.split(" ")) == 12 for line in text.splitlines())
-    assert text.endswith("\n")
-    assert not text.endswith("\n\n")
-
-
 def test_planar_columns_are_read_with_comments(tmp_path):
     path = tmp_path / "start.txt"
     path.write_text("# x_px y_px theta_rad\n\n1 2 0.5\n3, 4, -0.5\n")
@@ -95,18 +88,6 @@ def test_the_names_of_the_columns_order_the_quaternion(tmp_path, names, is_w_fir
     found = read_stamped_poses(tmp_path / "a.txt")
     np.testing.assert_allclose(found.poses, poses, atol=1e-8)
     np.testing.assert_array_equal(found.stamps, np.arange(5))
-
-
-def test_a_row_of_nan_is_named(tmp_path):
-    (tmp_path / "a.txt").write_text("0 1 2 3 0 0 0 1\n1 nan nan nan nan nan nan nan\n")
-    with pytest.raises(InputError, match=r"in pose 1; .*remove its line"):
-        read_stamped_poses(tmp_path / "a.txt")
-
-
-def test_homogeneous_planar_matrices_are_read(tmp_path):
-    matrices = planar_to_homogeneous(POSES)[:, [0, 1, 3]][:, :, [0, 1, 3]]
-    np.save(tmp_path / "m.npy", matrices)
-    np.testing.assert_allclose(read_planar_poses(tmp_path / "m.npy", 9, "m"), POSES, atol=1e-12)
 
 
 @pytest.mark.parametrize(

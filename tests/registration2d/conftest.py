@@ -13,8 +13,8 @@ from dpmjax.simulation import simulate_sequence
 NUM_SCANS, NUM_BEAMS = 24, 128
 
 
-def scans_of(sequence: ScanSequence) -> PlanarScans:
-    return planar_scans(sequence.points, sequence.mask)
+def scans_of(sequence: ScanSequence, *, is_ordered: bool = True) -> PlanarScans:
+    return planar_scans(sequence.points, sequence.mask, is_ordered=is_ordered)
 
 
 def ate(poses: np.ndarray, reference: np.ndarray) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from dpmjax.io import ScanSequence
 from dpmjax.registration2d import GlobalConfig, PlanarScans, incremental_icp, planar_scans, register_globally
 from dpmjax.registration2d.pair_search import CorrelativeConfig, search_pairs
 from dpmjax.registration2d.range_profiles import make_profiles
-from dpmjax.registration2d.wall_directions import WallDirections
 from dpmjax.simulation import simulate_sequence
 from tests.registration2d.conftest import ate, scans_of
 
@@ -72,47 +70,6 @@ def test_a_robot_may_go_out_and_back_between_two_keyframes(there, monkeypatch: p
     scans, config = planar_scans(turned.astype(np.float32), out.mask[rows]), GlobalConfig(max_keyframes=2)
     assert ate(register_globally(scans, config).poses, poses) < 2.0
     assert ate(register_as_set(scans, config, monkeypatch), poses) < 4.0
-
-
-@pytest.mark.slow
-def test_half_circles_that_look_to_different_sides_have_a_likely_turn(there) -> None:
-    """Two views of 180 degrees from one place, 60 to 90 degrees apart: half or less of each is seen by the other."""
-    turns = np.radians([-90.0, -60.0, 60.0, 90.0])
-    turned = [se2.transform_points(np.array([0.0, 0.0, -turn]), there.points) for turn in turns]
-    points = np.concatenate([there.points, *turned]).astype(np.float32)
-    ahead = np.abs(np.arctan2(points[..., 1], points[..., 0])) < np.pi / 2
-    walls = WallDirections(planar_scans(points, np.tile(there.mask, (5, 1)) & ahead))
-    num = len(there)
-    source, target = np.arange(num, 5 * num), np.tile(np.arange(num), 4)
-    likely = walls.likely_turns(source, target, 120, 6)
-    true = np.round(np.repeat(turns, num) * 120 / (2 * np.pi)).astype(int) % 120
-    assert likely[np.arange(len(source)), true].mean() > 0.85
-    assert likely.mean() < 0.3
-
-
-def peak_bytes(run) -> int:
-    tracemalloc.start()
-    try:
-        run()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-@pytest.mark.slow
-def test_memory_of_the_search_grows_with_the_scans_not_with_their_pairs(there, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("dpmjax.registration2d.wall_directions")
-    monkeypatch.setattr(module, "_BLOCK", 1 << 14)
-    walls = WallDirections(scans_of(there))
-
-    def search(count: int) -> None:
-        everyone = np.arange(count)
-        monkeypatch.setattr(walls, "_spectra", np.resize(walls._spectra, (count, *walls._spectra.shape[1:])))
-        assert walls.most_similar(everyone, everyone, 3).shape == (count, 3)
-
-    small, large = peak_bytes(lambda: search(200)), peak_bytes(lambda: search(800))
-    assert large < 4.5 * small
-    assert large < 4 * 800**2
 
 
 @pytest.mark.slow

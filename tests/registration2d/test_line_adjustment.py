@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
-from dpmjax.metrics import absolute_trajectory_error, position_bound
-from dpmjax.registration2d import planar_scans
+from dpmjax.metrics import position_bound
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.simulation import cast_scans, make_world
-
-
-def ate(poses: np.ndarray, reference: np.ndarray) -> float:
-    return absolute_trajectory_error(poses[:, :2], reference[:, :2])
+from tests.registration2d.conftest import ate
 
 
 @pytest.fixture(scope="module")
@@ -55,16 +51,6 @@ def test_lines_do_not_depend_on_the_order_of_scans(noisy_walk_scans, start, alig
     order = np.concatenate([[0], np.random.default_rng(3).permutation(np.arange(1, len(start)))])
     shuffled = adjust_to_lines(noisy_walk_scans.take(order), start[order])
     np.testing.assert_allclose(shuffled, aligned[order], atol=2e-3)
-
-
-@pytest.mark.slow
-def test_lines_never_use_masked_beams(noisy_walk, start) -> None:
-    mask = noisy_walk.mask & (np.random.default_rng(2).uniform(size=noisy_walk.mask.shape) < 0.9)
-    results = []
-    for filling in (0.0, np.nan):
-        points = np.where(mask[..., None], noisy_walk.points, np.float32(filling))
-        results.append(adjust_to_lines(planar_scans(points, mask), start))
-    np.testing.assert_array_equal(results[0], results[1])
 
 
 def test_lines_leave_alone_what_has_no_noise_or_no_neighbour(noisy_walk_scans, start) -> None:

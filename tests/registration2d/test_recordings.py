@@ -12,7 +12,6 @@ from dpmjax.registration2d import planar_scans
 from dpmjax.registration2d.recordings import align_between, choose_by_motion, choose_scans, fill_between
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
-from tests.registration2d.conftest import scans_of
 
 
 def drive(num_scans: int = 60, *, seed: int = 0) -> np.ndarray:
@@ -45,16 +44,6 @@ def test_every_scan_is_near_a_chosen_one(seed: int, distance: float) -> None:
         assert np.abs(se2.wrap_angle(between[:, 2])).max() < 0.5
 
 
-def test_right_odometry_stays_whatever_the_world_frame() -> None:
-    odometry = drive()
-    T_world_odometry = np.array([100.0, -30.0, 2.0])
-    true = np.asarray(se2.compose(T_world_odometry, odometry))
-    chosen = choose_by_motion(odometry, 1.0, 1.0)
-    filled = fill_between(chosen, true[chosen], odometry)
-    np.testing.assert_allclose(filled[:, :2], true[:, :2], atol=1e-6)
-    np.testing.assert_allclose(se2.wrap_angle(filled[:, 2] - true[:, 2]), 0, atol=1e-6)
-
-
 def test_a_wheel_that_is_too_large_is_corrected_everywhere() -> None:
     """Ways of an odometry that is 10 % too long, straight ahead."""
     true = np.column_stack([0.1 * np.arange(41.0), np.zeros(41), np.zeros(41)])
@@ -81,13 +70,6 @@ def test_rows_that_do_not_span_the_recording_are_refused(chosen: list[int]) -> N
         fill_between(np.array(chosen), np.zeros((len(chosen), 3)), drive())
 
 
-def test_a_single_scan_is_a_recording() -> None:
-    chosen = choose_by_motion(np.zeros((1, 3)), 1.0, 1.0)
-    np.testing.assert_array_equal(
-        fill_between(chosen, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3))), [[1.0, 2.0, 3.0]]
-    )
-
-
 @pytest.mark.slow
 def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     """A dense walk whose odometry wanders between the chosen scans, which are right."""
@@ -100,16 +82,6 @@ def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     np.testing.assert_array_equal(aligned[chosen], true[chosen])
     before, after = (np.hypot(*(some - true)[:, :2].T)[1:-1].mean() for some in (poses, aligned))
     assert after < 0.2 * before
-
-
-@pytest.mark.slow
-def test_a_scan_whose_wheels_were_read_in_another_moment_of_a_turn_is_turned_back() -> None:
-    sequence = simulate_sequence(0, 21, num_beams=128, seed=5, range_noise_px=0.5)
-    true = np.asarray(sequence.reference_poses)
-    poses, turned = true.copy(), np.array([3, 8, 13, 18])
-    poses[turned, 2] += [0.12, -0.12, 0.1, -0.1]
-    aligned = align_between(scans_of(sequence), np.array([0, 5, 10, 15, 20]), poses)
-    np.testing.assert_allclose(aligned[turned, 2], true[turned, 2], atol=0.01)
 
 
 @pytest.mark.slow
@@ -136,9 +108,3 @@ def test_scans_recorded_twice_and_a_standing_robot_add_no_scan() -> None:
     found = choose_scans(ScanSet(noisy, walk.mask[standing]), true[standing], 1.0, 0.5)
     np.testing.assert_array_equal(standing[found.chosen], np.arange(12))
     np.testing.assert_allclose(found.between(true), true[standing], atol=1e-9)
-
-
-def test_equal_scans_are_refused(as_user) -> None:
-    points = np.repeat(np.random.default_rng(0).normal(size=(1, 40, 2)), 3, axis=0).astype(np.float32)
-    with pytest.raises(ValueError, match="^scans: expected two different ones, got 3"):
-        choose_scans(ScanSet(points, np.ones((3, 40), bool)), None, 1.0, 1.0)

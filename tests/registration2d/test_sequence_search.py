@@ -12,7 +12,7 @@ from dpmjax.io.carmen import read_carmen_log
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
 from dpmjax.registration2d.planar_scans import PlanarScans
-from dpmjax.registration2d.range_profiles import make_profiles, pair_scores, weak_steps
+from dpmjax.registration2d.range_profiles import make_profiles, weak_steps
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_search import align_arcs
 from dpmjax.registration2d.steps import MotionPrior
@@ -75,25 +75,6 @@ def test_right_steps_are_strong_and_torn_ones_weak(log) -> None:
     assert np.flatnonzero(weak_steps(profiles, torn, rows)).tolist() == [9]
 
 
-def test_a_scan_agrees_with_itself_best(log) -> None:
-    scans, _ = log
-    profiles, row = make_profiles(scans), np.arange(NUM_SCANS)
-    same = pair_scores(profiles, row, row, np.zeros((NUM_SCANS, 3)))
-    turned = pair_scores(profiles, row, row, np.tile([0.0, 0.0, 0.5], (NUM_SCANS, 1)))
-    assert (same > turned + 0.2).all()
-
-
-def test_usual_motion_surprises_least() -> None:
-    steps = np.array([[1.0, 0.0, 0.1], [1.1, 0.1, 0.0], [0.9, 0.0, -0.1]])
-    prior = MotionPrior.of(steps, typical_range=5.0)
-    ways = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [4.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 0.0, 2.0]])
-    surprise = prior.surprise(ways, np.ones(len(ways), np.int64))
-    assert surprise.argmin() == 0
-    assert (surprise[1:] > 0.5).all()
-    np.testing.assert_allclose(prior.expected(2), [2.0, 0.0, 0.0], atol=0.05)
-    assert MotionPrior.of(np.zeros((0, 3)), 5.0).forward == 0.0
-
-
 def test_arcs_bend_by_half_their_turn_and_have_the_usual_lengths() -> None:
     prior = MotionPrior(1.0, 0.9)
     arcs = prior.arcs()
@@ -103,13 +84,6 @@ def test_arcs_bend_by_half_their_turn_and_have_the_usual_lengths() -> None:
     assert straight.min() == 0.0
     assert straight.max() > 1.0
     np.testing.assert_allclose(MotionPrior(1.0, -0.9).arcs()[:, :2], -arcs[:, :2], atol=1e-12)
-
-
-def test_clear_steps_have_no_hypotheses_of_arcs(log) -> None:
-    scans, _ = log
-    found = align_arcs(scans, make_profiles(scans), np.zeros(0, np.int64), MotionPrior(1.0, 1.0))
-    assert found.poses.shape == (0, 3)
-    assert found.source.shape == found.target.shape == found.scores.shape == (0,)
 
 
 @pytest.mark.slow

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +15,9 @@ from dpmjax.registration_rgbd import (
     DepthScans,
     DepthSearchConfig,
     as_depth_scans,
-    depth_search,
     initialize_depth,
-    projective_consistency,
-    trajectory_search,
 )
-from dpmjax.registration_rgbd.depth_images import PixelSample, SampledImages, Views
+from dpmjax.registration_rgbd.depth_images import SampledImages, Views
 from dpmjax.registration_rgbd.motion_search import (
     MAX_TRANSLATION,
     SearchCamera,
@@ -30,8 +25,6 @@ from dpmjax.registration_rgbd.motion_search import (
     surface_directions,
 )
 from dpmjax.registration_rgbd.projective_consistency import adjust_poses
-from dpmjax.registration_rgbd.trajectory_search import _best_that_differ, _explained, _window
-from tests.tolerances import ROUNDING
 
 KEY = jax.random.key(0)
 ALONG, ACROSS = np.array([0.8, 0.0, 0.6]), np.array([0.6, 0.0, -0.8])
@@ -47,10 +40,6 @@ def walk() -> io.DepthSequence:
 @pytest.fixture(scope="module")
 def scans(walk) -> DepthScans:
     return as_depth_scans(walk.points, walk.mask)
-
-
-def take(sample: PixelSample, count: int) -> PixelSample:
-    return PixelSample(sample.points[:count], sample.mask[:count])
 
 
 def moved(T: np.ndarray, spread: float, motion: str, seed: int = 0) -> np.ndarray:
@@ -78,52 +67,6 @@ def test_adjusted_poses_come_back_to_the_truth(walk, scans, motion: str) -> None
     before, after = (absolute_trajectory_error(X[:, :3, 3], truth[:, :3, 3]) for X in (start, T))
     assert after < 0.3 * before
     np.testing.assert_allclose(T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_adjusted_poses_are_never_less_consistent(walk, scans) -> None:
-    unit = typical_range(scans.points, scans.mask)
-    for seed in range(5):
-        start = moved(walk.T_world_camera, 0.2, "planar", seed)
-        motions = adjust_poses(
-            jnp.asarray(start, jnp.float32),
-            SampledImages(scans, scans.pixels, unit),
-            0.02,
-            num_iterations=4,
-            motion="planar",
-        )
-        before, after = (
-            float(projective_consistency(scans, T, 0.02)) for T in (start, start @ np.asarray(motions, np.float64))
-        )
-        assert after >= before - 1e-4
-
-
-def test_images_without_a_pose_count_nothing(walk, scans) -> None:
-    T = walk.T_world_camera[:3]
-    rows, window = _window(3, SampledImages(scans, scans.pixels, 1.0), 24)
-    share = _explained(jnp.asarray(T[rows], jnp.float32)[None], window, jnp.asarray(0.02))
-    alone = SampledImages(DepthScans(scans.points[:3], scans.mask[:3], scans.pinhole), take(scans.pixels, 3), 1.0)
-    np.testing.assert_allclose(
-        share, _explained(jnp.asarray(T, jnp.float32)[None], alone, jnp.asarray(0.02)), **ROUNDING
-    )
-    assert _window(3, SampledImages(scans, scans.pixels, 1.0), 2)[0].tolist() == [1, 2]
-
-
-def test_of_alike_trajectories_the_best_goes_on(walk, scans, monkeypatch) -> None:
-    truth = walk.T_world_camera
-    far, turned, near = truth.copy(), truth.copy(), truth.copy()
-    far[1:, 0, 3] += 0.2
-    turned[3] = turned[3] @ np.asarray(motion_matrices(jnp.array([[0.0, 0.0, 0.3]])))[0]
-    near[1:, 0, 3] += 0.02
-    candidates = np.stack([near, far, turned, truth])[None]
-    images, config = SampledImages(scans, scans.pixels, 1.0), depth_search("planar")
-    monkeypatch.setattr(trajectory_search, "_MARGIN", 100.0)
-    kept = _best_that_differ(candidates, images, config)
-    np.testing.assert_array_equal(kept[0], truth)
-    assert {T.tobytes() for T in kept} == {T.tobytes() for T in (far, turned, truth)}
-    assert len(_best_that_differ(candidates, images, replace(config, num_trajectories=2))) == 2
-    monkeypatch.setattr(trajectory_search, "_MARGIN", 1e-6)
-    assert len(_best_that_differ(candidates, images, config)) == 1
 
 
 @pytest.mark.slow

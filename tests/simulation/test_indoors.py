@@ -5,9 +5,6 @@ import numpy as np
 import pytest
 
 from dpmjax.simulation import BuildingConfig, LidarSensor, WalkConfig, make_building, scan_town, walk
-from dpmjax.simulation.building import _furniture, _put_rack
-from dpmjax.simulation.floor_plan import Room
-from dpmjax.simulation.town.objects import Collection, Place
 
 SENSOR = LidarSensor("test", tuple(np.linspace(20.0, -20.0, 16)), 360, min_range_m=0.2, drop_rate=0.0, mixed_rate=0.0)
 KINDS = ("office", "hall", "flat", "corridor", "tunnel", "garage", "stairs")
@@ -69,40 +66,6 @@ def test_a_lidar_sees_the_rooms_and_nothing_outside_of_the_walls(building):
     assert world[:, 2].min() > -0.15
     assert world[:, 2].max() < max(room.height for room in building.plan.rooms) + 0.15
     assert inside_of_rooms(building.plan, world, margin=-0.15).mean() > 0.995
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_shelves_hang_between_uprights_that_stand_on_the_floor(seed):
-    into, place = Collection(), Place(3.0, -2.0, 0.7, 0.4)
-    _put_rack(into, np.random.default_rng(seed), place)
-    boxes = np.array(into.boxes)
-    along = (boxes[:, :2] - [3.0, -2.0]) @ [np.cos(0.4), np.sin(0.4)]
-    low, high = boxes[:, 2] - boxes[:, 5] - 0.7, boxes[:, 2] + boxes[:, 5] - 0.7
-    is_upright, is_shelf = boxes[:, 3] == 0.04, np.isclose(boxes[:, 5], 0.025)
-    assert (is_upright.sum(), is_shelf.sum() > 1) == (2, True)
-    (length,) = set(np.round(2 * boxes[is_shelf, 3], 9))
-    np.testing.assert_allclose(along[is_upright], [-length / 2, length / 2])
-    np.testing.assert_allclose(low[is_upright], 0.0, atol=1e-9)
-    assert high[is_upright].min() >= high[is_shelf].max()
-    # What lies on a shelf begins at its upper side, and does not stand out at the ends.
-    goods = ~is_upright & ~is_shelf
-    np.testing.assert_allclose(low[goods], high[is_shelf])
-    assert (np.abs(along[goods]) + boxes[goods, 3] <= length / 2 + 1e-9).all()
-
-
-def test_columns_stand_a_metre_from_the_walls_of_a_hall() -> None:
-    low, high, into = np.array([-4.0, 10.0]), np.array([4.0, 20.0]), Collection()
-    for seed in range(20):
-        _furniture(into, np.random.default_rng(seed), Room((*low,), (*high,), 6.0), np.full((9, 2), 1e3), is_hall=True)
-    # Nothing else is 11 m high.
-    bodies = np.array([*into.boxes, *into.cylinders])
-    columns = bodies[bodies[:, 5] > 5.0, :2]
-    assert len(columns) > 10
-    assert (columns >= low + 1.0).all()
-    assert (columns <= high - 1.0).all()
-    # They stand on all sides of the middle.
-    assert (columns < 0.5 * (low + high)).any(axis=0).all()
-    assert (columns > 0.5 * (low + high)).any(axis=0).all()
 
 
 def test_stairs_are_climbed_with_the_lidar_above_their_steps() -> None:

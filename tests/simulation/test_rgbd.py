@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-from PIL import Image
-from scipy.io import savemat
 
 from dpmjax import io, simulation
 from dpmjax.io import InputError
 from dpmjax.io.depth import Camera, back_project
 from dpmjax.simulation.apartments import cast_depth
+from tests.io.depth_files import write_png, write_pose_folder, write_scene
 from tests.tolerances import ROUNDING
 
 CAMERA = Camera(8, 6, 6.0, 6.5, 3.5, 2.5)
@@ -107,27 +104,14 @@ def test_noise_and_missing_pixels_grow_with_the_square_of_the_depth():
         assert (~noisy.mask[among]).mean() == pytest.approx(expected, rel=0.2)
 
 
-def test_a_walk_that_no_apartment_has_room_for_is_refused():
-    with pytest.raises(ValueError, match="min_spread_m: no walk of 2 views"):
-        simulation.simulate_depth_sequence(0, 2, config=simulation.DepthWalkConfig(min_spread_m=2.0))
-
-
-def write_png(path, depth_mm):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.asarray(depth_mm, np.uint16)).save(path)
+@pytest.fixture
+def pose_folder(tmp_path):
+    return write_pose_folder(tmp_path)
 
 
 @pytest.fixture
-def pose_folder(tmp_path):
-    np.savetxt(tmp_path / "camera-intrinsics.txt", [[6.0, 0, 3.5], [0, 6.5, 2.5], [0, 0, 1]])
-    for index in (2, 10):
-        depth = np.full((6, 8), 1000 * index // 2)
-        depth[0, 0], depth[0, 1] = 0, 65535
-        write_png(tmp_path / f"frame-{index}.depth.png", depth)
-        pose = np.eye(4)
-        pose[0, 3] = index
-        np.savetxt(tmp_path / f"frame-{index}.pose.txt", pose)
-    return tmp_path
+def scene(tmp_path):
+    return write_scene(tmp_path)
 
 
 def test_pose_folders_are_read_in_natural_order(pose_folder):
@@ -180,35 +164,6 @@ def test_depth_of_another_unit_is_refused_where_an_image_is_empty(pose_folder, s
         io.read_pose_folder(pose_folder, height=6, width=8)
 
 
-def test_depth_of_another_unit_is_warned_of(pose_folder, caplog):
-    """A quarter of the pixels is near."""
-    for index in (2, 10):
-        write_png(pose_folder / f"frame-{index}.depth.png", np.where(np.arange(8) < 2, 3000, 9000) + np.zeros((6, 1)))
-    assert io.read_pose_folder(pose_folder, height=6, width=8).mask.mean() == 0.25
-    assert "the median depth is 9 m" in caplog.text
-
-
-@pytest.fixture
-def scene(tmp_path):
-    """Four views in the layout of the Active Vision Dataset: two places, two directions."""
-    folder = tmp_path / "Home_999_1"
-    names = [f"0009990000{k}0101.png".replace(".png", ".jpg") for k in range(4)]
-    turn = np.array([[np.cos(0.5), 0, np.sin(0.5)], [0, 1, 0], [-np.sin(0.5), 0, np.cos(0.5)]])
-    structs = np.zeros(4, [("image_name", object), ("R", object), ("t", object)])
-    for k, name in enumerate(names):
-        R, position = (turn if k % 2 else np.eye(3)), np.array([0.1 * (k // 2), 0.0, 0.0])
-        structs[k] = (name, R.T, -R.T @ position)
-        write_png(folder / "high_res_depth" / f"{name[:-6]}03.png", np.full((6, 8), 2000 + k))
-    savemat(folder / "image_structs.mat", {"image_structs": structs, "scale": 3000.0})
-    links = {
-        name: {"forward": "", "rotate_cw": names[k ^ 1], "rotate_ccw": "", "left": names[k ^ 2]}
-        for k, name in enumerate(names)
-    }
-    (folder / "annotations.json").write_text(json.dumps(links))
-    (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 8 6 6.0 6.5 3.5 2.5 0 0 0 0\n")
-    return folder
-
-
 def test_active_vision_scenes_are_walked_along_their_links(scene):
     sequence = io.read_active_vision(scene, 8, seed=3, height=6, width=8)
     assert sequence.is_planar
@@ -246,5 +201,7 @@ def test_bad_arguments_are_named():
         simulation.make_apartment(-1)
     with pytest.raises(ValueError, match="dropout_share"):
         simulation.DepthWalkConfig(dropout_share=2.0)
+    with pytest.raises(ValueError, match="min_spread_m: no walk of 2 views"):
+        simulation.simulate_depth_sequence(0, 2, config=simulation.DepthWalkConfig(min_spread_m=2.0))
     with pytest.raises(ValueError, match="depth_m: expected"):
         back_project(np.ones((3, 3)), CAMERA, height=2, width=2, max_depth_m=5.0)

@@ -232,18 +232,6 @@ def test_padding_takes_no_part(turn):
     np.testing.assert_array_equal(look(town, pose).ranges, look(garbage, pose).ranges)
 
 
-def test_an_empty_town_is_ground_only(turn):
-    look, town, _, _ = turn
-    empty = town._replace(
-        boxes=town.boxes._replace(mask=jnp.zeros_like(town.boxes.mask)),
-        cylinders=town.cylinders._replace(mask=jnp.zeros_like(town.cylinders.mask)),
-        spheroids=town.spheroids._replace(mask=jnp.zeros_like(town.spheroids.mask)),
-    )
-    hits = look(empty, jnp.asarray(tilted_pose(), jnp.float32))
-    assert set(np.unique(hits.surfaces)) == {NOTHING, GROUND}
-    assert np.isinf(np.asarray(hits.ranges)[np.asarray(hits.surfaces) == NOTHING]).all()
-
-
 def test_windows_lie_behind_their_wall(turn):
     look, town, _, _ = turn
     pose = jnp.asarray(tilted_pose(), jnp.float32)
@@ -259,16 +247,3 @@ def test_windows_lie_behind_their_wall(turn):
     assert 0.05 < (deeper > 0).mean() < 0.6
     glass = np.asarray(fronts.is_glass)[is_wall]
     np.testing.assert_allclose((deeper * cosines)[glass], depth, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_foliage_is_met_inside_of_it():
-    rng = np.random.default_rng(0)
-    rays = directions(rng, 500)
-    depths = rng.exponential(size=500)
-    crossing = cross_spheroid(jnp.asarray(rays, jnp.float32), hull([8.0, 0, 0], [3.0, 3, 2], [1.0, 0]))
-    inside = np.asarray(crossing.entry + 0.8 * depths)
-    is_met = np.isfinite(inside) & (inside <= np.asarray(crossing.exit)) & (np.asarray(crossing.entry) > 0)
-    points = inside[is_met, None] * rays[is_met] - [8, 0, 0]
-    assert is_met.sum() > 20
-    assert (((points / [3, 3, 2]) ** 2).sum(1) <= 1 + 1e-4).all()

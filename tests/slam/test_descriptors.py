@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
-from dpmjax import load_model
 from dpmjax.cli.slam import SlamOptions, slam_methods
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
@@ -27,12 +25,12 @@ from dpmjax.slam import (
     slam_preset,
     step_slam,
 )
-from dpmjax.slam.descriptor_loops import disjoint_neighbours, find_loop_targets, verify_match
-from dpmjax.slam.descriptor_odometry import neighbours_of, next_ratio
+from dpmjax.slam.descriptor_loops import find_loop_targets, verify_match
+from dpmjax.slam.descriptor_odometry import neighbours_of
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, steps_from
 from dpmjax.slam.loops import Loop
-from dpmjax.slam.model_methods import UNKNOWN, point_information, without_regression
+from dpmjax.slam.model_methods import UNKNOWN, point_information
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose, scans_of
 
 PAPER = slam_preset("paper")
@@ -92,20 +90,6 @@ def test_the_preset_has_the_published_numbers() -> None:
     assert PAPER.method == "descriptors"
     numbers = PAPER.descriptors
     assert (numbers.min_confidence, numbers.max_rmse_m, numbers.min_overlap, numbers.keyframe_m) == (0.6, 0.5, 0.7, 10)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_factor_of_the_keyframe_distance_is_its_formula(seed) -> None:
-    rng, ratio, expected = np.random.default_rng(seed), 1.0, 1.0
-    for rmse in [*rng.uniform(0, 0.7, 50), *[0.0] * 60, *[0.5] * 60]:
-        ratio = next_ratio(ratio, rmse, 0.5)
-        share = rmse / 0.5 if rmse < 0.5 else 1.0
-        expected = 0.9 * expected + 0.1 * 2 * (1 - share) * (1 - share)
-        expected = min(max(expected, 0.0), 2.0)
-        assert ratio == pytest.approx(expected, abs=1e-12)
-        assert 0 <= ratio <= 2
-    # Exact registrations double the distance in the end, poor ones bring it to nothing.
-    assert ratio < 0.01
 
 
 @pytest.mark.parametrize("rmse", [0.05, 0.2, 0.45])
@@ -249,17 +233,6 @@ def test_neighbours_and_candidates_are_those_of_a_slow_search(seed) -> None:
     assert 0 in expected
 
 
-def test_frames_that_both_ends_share_belong_to_the_nearer_one() -> None:
-    positions = np.array([[4.0 * row, 0.0] for row in range(8)])
-    slam_map = map_of(positions, np.zeros(8), [(row + 1, row) for row in range(7)])
-    of_row, of_target = disjoint_neighbours(slam_map, 6, 2)
-    assert of_row[0] == 6
-    assert of_target[0] == 2
-    assert not set(of_row) & set(of_target)
-    assert sorted(of_row) == [4, 5, 6, 7]
-    assert sorted(of_target) == [0, 1, 2, 3]
-
-
 @pytest.mark.parametrize(
     ("off", "num_steps", "status"),
     [
@@ -344,14 +317,6 @@ def test_a_later_drive_extends_a_map_as_soon_as_it_meets_it() -> None:
     assert np.linalg.norm(second.T_world_scan[:, :3, 3] - expected, axis=1).max() < 2.0
 
 
-def test_the_head_predicts_overlap_where_it_is_trained(caplog) -> None:
-    model = load_model("dpm_small")
-    trained = getattr(model.config, "trained", ())
-    found = without_regression(model)
-    assert (found.config.overlap is None) == ("overlap" in trained)
-    assert ("overlap head of these weights is untrained" in caplog.text) == ("overlap" not in trained)
-
-
 def test_options_of_one_method_are_refused_with_the_other(as_user) -> None:
     with pytest.raises(ValueError, match="--odometry"):
         SlamOptions(preset="paper", odometry="network")
@@ -359,21 +324,3 @@ def test_options_of_one_method_are_refused_with_the_other(as_user) -> None:
         SlamOptions(max_rmse=2.5)
     given = slam_methods(SlamOptions(preset="paper", max_rmse=2.5))
     assert given.config.descriptors == DescriptorConfig(max_rmse_m=2.5)
-
-
-def test_submaps_are_in_the_frame_of_their_first_keyframe() -> None:
-    truth = laps(1, side_m=40.0, step_m=2.0)
-    for T_submap_keyframe in itertools.islice(_submaps_of(truth), 20):
-        np.testing.assert_allclose(T_submap_keyframe[0], np.eye(4), atol=1e-12)
-
-
-def _submaps_of(truth: np.ndarray):
-    seen = []
-
-    class Watching(PlainMatcher):
-        def match(self, source, target):
-            seen.append(target.T_submap_keyframe)
-            return super().match(source, target)
-
-    run(truth, Watching(truth))
-    return iter(seen)

@@ -5,23 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from dpmjax.deeppointmap.prepared_scans import compact_elements
 from dpmjax.geometry import rigid
-from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.slam import KeyframeMap, OdometryConfig
-from dpmjax.slam.keyframe_map import Keyframe, MapEdge, Submap, add_keyframe
+from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe
 from dpmjax.slam.local_map import (
     RECENT_SHARE,
     PlacedElements,
     joined_surface,
     local_map_of,
-    placed_keyframes,
-    placed_scan,
     with_scan,
 )
-from dpmjax.types import SurfaceElements
 from tests.slam.truth import compact_of, laps, number_of, pose
 
 CONFIG = OdometryConfig(num_keyframes=5)
@@ -109,25 +103,8 @@ def test_the_oldest_of_too_many_scans_leaves() -> None:
     assert sorted(surface.samples) == list(range(11))
 
 
-def test_a_placed_scan_has_the_flat_elements() -> None:
-    rough = SurfaceElements(np.eye(4)[:, :3], np.eye(4)[:, :3], np.array([1.0, 0.05, 0.5, 1.0]), np.arange(4) < 3)
-    expanded = compact_of(0)._replace(elements=compact_elements(rough))
-    placed_keyframe, *_ = placed_keyframes(Submap((expanded,), pose(1, 0, 0)[None]))
-    for placed in (placed_scan(surface_of_elements(rough), pose(1, 0, 0)), placed_keyframe):
-        np.testing.assert_allclose(placed.positions, np.eye(3)[[0, 2]], atol=1e-4)
-        np.testing.assert_allclose(placed.planarity, [1.0, 0.5], atol=1 / 255)
-        assert placed.positions.dtype == placed.normals.dtype == placed.planarity.dtype == np.float32
-
-
 def test_elements_of_a_turned_scan_are_turned() -> None:
     wall = placed_at(pose(1.0, 2.0, np.pi / 2), 5.0)._replace(normals=np.float32([[1, 0, 0]]))
     joined = joined_surface([wall])
     np.testing.assert_allclose(joined.points, [[1.0, 7.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(joined.normals, [[0.0, 1.0, 0.0]], atol=1e-6)
-
-
-@pytest.mark.parametrize("row", range(5))
-def test_the_nearest_keyframe_is_nearest(row: int) -> None:
-    local_map = local_map_of(chain(TRUTH), (), CONFIG)
-    position = local_map.keyframes[row].T_map_scan[:3, 3] + [0.3, -0.4, 0.2]
-    assert local_map.nearest(position) == row

@@ -46,18 +46,3 @@ def test_reliability_puts_each_bin_at_its_means():
     np.testing.assert_allclose(y, [0.5, 1.0])
     assert "4 pairs" in figure.axes[0].get_title()
     assert viz.reliability_figure([], [], title="t").axes
-
-
-def test_figure_14_marks_the_ends_of_both_forms():
-    x = np.linspace(-6.0, 6.0, 101)
-    visited = np.array([3.0, 1.0, -1.4]), np.array([5.0, 2.0, -23.0])
-    figure = viz.toy_figure((x, x**2), (x, np.cos(x)), visited=visited, direct_end=(3.4, 1.0), network_end_z=0.7)
-    (axes,) = figure.axes
-    drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
-    np.testing.assert_array_equal(drawn["L(x)"], np.stack([x, x**2], -1))
-    np.testing.assert_array_equal(drawn["x visited by the network"], np.stack(visited, -1))
-    np.testing.assert_array_equal(drawn["direct descent ends"], [[3.4, 1.0]])
-    np.testing.assert_array_equal(drawn["x* = f(z*)"], [[-1.4, -23.0]])
-    np.testing.assert_array_equal(drawn["z* of the network"], [[0.7, -23.0]])
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == list(drawn)
-    assert axes.get_xlim() == (-6.0, 6.0)

@@ -48,13 +48,6 @@ def test_the_highest_point_of_a_cell_is_seen():
     assert labels(figure) == ["path of the lidar"]
 
 
-def test_colours_rise_with_height_and_end_at_the_bounds():
-    colors = viz.height_colors(np.array([-100.0, -2.5, 5.5, 100.0]))
-    np.testing.assert_array_equal(colors[0], colors[1])
-    np.testing.assert_array_equal(colors[2], colors[3])
-    assert colors.dtype == np.uint8
-
-
 def test_a_roof_over_the_path_is_left_out():
     rng = np.random.default_rng(0)
     points = np.vstack([rng.uniform(-25, 25, (20000, 3)), rng.uniform(-25, 25, (500, 3))])
@@ -130,14 +123,6 @@ def test_a_quarter_turn_of_the_world_turns_the_occupancy():
     assert free > 240
     assert wall < 20
     assert unseen == pytest.approx(255 * UNEXPLORED_GREY, abs=2)
-
-
-def test_wrong_shapes_of_an_occupancy_are_refused():
-    picture = (np.zeros((4, 5)), np.ones((3, 3), bool), (0, 1, 0, 1))
-    with pytest.raises(ValueError, match=r"\(3, 3\)"):
-        viz.occupancy_figure(
-            picture, np.zeros((1, 2)), "px", T_view_world=np.eye(3), limits=viz.Limits(0.0, 1.0, 0.0, 1.0)
-        )
 
 
 def test_images_from_above_lie_where_their_poses_say_and_the_ceiling_is_left_out():

@@ -197,8 +197,9 @@ def register_depth(
     fitted = fit_deepmapping(scans, config, key=key, start=start, engine=engine)
     poses = {"fit": fitted.T_world_scan, "start": np.asarray(start, np.float64)}
     misfits = {name: 1.0 - float(projective_consistency(scans, T)) for name, T in poses.items()}
-    # The comparison is False for a misfit that is not finite, so the start is kept then.
-    kept: Literal["fit", "start"] = "fit" if fitted.num_steps > 0 and misfits["fit"] < misfits["start"] else "start"
+    # Images at poses that are not finite contradict nothing.
+    is_better = bool(np.isfinite(poses["fit"]).all()) and misfits["fit"] < misfits["start"]
+    kept: Literal["fit", "start"] = "fit" if fitted.num_steps > 0 and is_better else "start"
     return Registered(poses[kept], kept, misfits["fit"], misfits["start"], poses["start"], fitted)
 
 
