@@ -94,6 +94,7 @@ def test_only_a_calibrated_model_is_checked(weights, tmp_path, capsys) -> None:
     assert run(dpm_calibrate, weights, "--check", "--evidence") == EXIT_BAD_INPUT
 
 
+@pytest.mark.slow
 def test_a_check_has_a_row_for_each_pair_that_there_is(weights, kinds, tmp_path, monkeypatch) -> None:
     model = dpmjax.load_model(weights)
     of_scans = LogisticModel(SCAN_FEATURES, (0.0,) * 9, 5.0)

@@ -13,10 +13,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dpmjax import io
+from dpmjax import io, metrics
 from dpmjax.cli.machine import git_hash
 from dpmjax.cli.run import Run
-from dpmjax.metrics import wilson_interval
 
 Row = dict[str, Any]
 
@@ -78,7 +77,7 @@ def _summary(rows: list[Row], columns: Sequence[str]) -> Row:
     for name in columns:
         values = [row[name] for row in rows if row.get(name) is not None]
         if values and all(isinstance(value, bool) for value in values):
-            interval = wilson_interval(sum(values), len(values))
+            interval = metrics.wilson_interval(sum(values), len(values))
             found |= {name: interval.share, f"{name}_low": interval.low, f"{name}_high": interval.high}
         else:
             found[name] = statistics.median(values) if values else None
