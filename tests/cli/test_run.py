@@ -84,6 +84,17 @@ def test_earlier_run_is_refused_resumed_or_replaced(start, tmp_path):
     assert not Path("results").exists()
 
 
+def test_a_run_that_has_ended_meanwhile_is_not_replaced(start, tmp_path):
+    late = Run("toy", ToyOptions(output=tmp_path / "out"))  # reads its input
+    first = start(output=tmp_path / "out")
+    write_json(first / "metrics.json", {"ate_px": 1.0})
+    first.close()
+    with pytest.raises(ValueError, match="holds an earlier run"):
+        late.open()
+    late.close()
+    assert (first / "metrics.json").exists()
+
+
 def test_no_second_process_may_write_a_run_before_the_first_one_ends(start, tmp_path):
     run = start(output=tmp_path / "out")
     program = (

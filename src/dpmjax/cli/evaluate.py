@@ -72,6 +72,7 @@ def main(options: EvaluateOptions, run: cli.Run) -> cli.Row:
     overlap = fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
     summary = summarize_pairs(rows, overlap, STAGES, COLUMNS)
     numbers = {"weights": options.weights, **rate_confidence(model, rows), **cli.write_summary(run, summary)}
+    run.write_numbers(numbers)  # also where a picture fails
     draw_evaluation(run, model, pairs, rows, Path(options.weights).stem)
     return numbers
 

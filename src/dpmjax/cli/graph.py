@@ -57,12 +57,19 @@ def main(options: GraphOptions, run: Run) -> Numbers:
     poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
     io.write_g2o(run / "graph.g2o", found.graph)
     io.write_tum(run / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
+    numbers = graph_numbers(options, found)
+    run.write_numbers(numbers)  # also where a picture fails
     title = f"{options.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
     tracks = [
         viz.Track(positions(graph.poses), viz.ODOMETRY, f"before, chi2 {found.chi2_initial:.4g}"),
         viz.Track(positions(poses), viz.PATH, f"optimised, chi2 {found.chi2:.4g}"),
     ]
     viz.save_figure(viz.trajectory_figure(title, tracks), run / "trajectory.png")
+    return numbers
+
+
+def graph_numbers(options: GraphOptions, found: pose_graph.OptimizedPoseGraph) -> Numbers:
+    """Returns the numbers of an optimisation, with its status and verdict."""
     num_let_go = int((found.weights < LET_GO).sum())
     verdict = f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations"
     verdict += f", {num_let_go} edges let go" if num_let_go else ""

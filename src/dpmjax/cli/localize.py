@@ -149,17 +149,12 @@ def as_localization(row: dict[str, str]) -> slam.Localization:
 def write_found(run: Run, options: LocalizeOptions, case: Case, rows: list[dict[str, str]]) -> Numbers:
     """Writes trajectory and picture; returns the numbers."""
     results = [as_localization(row) for row in rows]
-    numbers = [number for number, result in enumerate(results) if result.is_in_map]
-    T = np.array([results[number].T_world_scan for number in numbers]).reshape(-1, 4, 4)
-    stamps = numbers if case.drive.times is None else case.drive.times[numbers]
+    rows_found = [number for number, result in enumerate(results) if result.is_in_map]
+    T = np.array([results[number].T_world_scan for number in rows_found]).reshape(-1, 4, 4)
+    stamps = rows_found if case.drive.times is None else case.drive.times[rows_found]
     io.write_tum(run / "trajectory_tum.txt", T, times=np.asarray(stamps, float), frame="T_map_scan")
     errors, is_wrong = error_numbers(case, results)
-    found = f"{len(numbers)} of {len(rows)} scans found"
-    title = f"{case.drive.name} in {options.map.name}: {found}"
-    figure = viz.localization_figure(
-        map_points(case.slam_map), case.slam_map.T_world_keyframe, T, is_wrong=is_wrong, title=title
-    )
-    viz.save_figure(figure, run / "map.png")
+    found = f"{len(rows_found)} of {len(rows)} scans found"
     if errors:
         found += f"; {errors['num_inside']} are within {REACH_M:g} m of a keyframe; "
         found += f"{errors['num_right']} right, {errors['num_wrong']} wrong"
@@ -169,11 +164,11 @@ def write_found(run: Run, options: LocalizeOptions, case: Case, rows: list[dict[
     num_empty = sum(result.status == "empty" for result in results)
     if is_failed := bool(rows) and num_empty == len(rows):
         found = f"{len(rows)} of {len(rows)} scans without enough points: check that the scans are 3-D and in metres"
-    return {
+    numbers = {
         "status": "failed" if is_failed else "done",
         "verdict": found,
         "num_scans": len(rows),
-        "num_found": len(numbers),
+        "num_found": len(rows_found),
         "num_empty": num_empty,
         "num_keyframes": len(case.slam_map),
         "is_calibrated": case.is_calibrated,
@@ -181,6 +176,13 @@ def write_found(run: Run, options: LocalizeOptions, case: Case, rows: list[dict[
         "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
         **errors,
     }
+    run.write_numbers(numbers)  # also where a picture fails
+    title = f"{case.drive.name} in {options.map.name}: {len(rows_found)} of {len(rows)} scans found"
+    figure = viz.localization_figure(
+        map_points(case.slam_map), case.slam_map.T_world_keyframe, T, is_wrong=is_wrong, title=title
+    )
+    viz.save_figure(figure, run / "map.png")
+    return numbers
 
 
 def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[Numbers, np.ndarray | None]:

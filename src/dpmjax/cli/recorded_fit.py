@@ -46,6 +46,7 @@ class FitRecorder:
         """
         self._run, self._length, self._max_s = run, length, max_s
         self.steps, self.run_s, self.compile_s, self.has_map = 0, 0.0, 0.0, False
+        self._begun: tuple[float, float] | None = None
 
     def __call__(
         self,
@@ -102,7 +103,7 @@ class FitRecorder:
     def _show(self, progress: Progress, ate: float, bar: tqdm) -> None:
         """Moves the bar to the share that is done; the remaining time is that of the last calls."""
         seconds, share = progress.run_s, progress.share
-        self._begun = getattr(self, "_begun", (seconds, share))
+        self._begun = self._begun or (seconds, share)
         pace_s = (seconds - self._begun[0]) / max(share - self._begun[1], 1e-9)
         left = f", {pace_s * (1 - share):.0f} s left" if share > self._begun[1] else ""
         ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""

@@ -59,21 +59,19 @@ def main(options: RegisterOptions, run: Run) -> Numbers:
     found = deeppointmap.register(model, source, target, refine=options.refine)
     T = np.asarray(found.T_target_source, np.float64)
     write_motion(run, T, source, target)
-    motions = {"before registration": np.eye(4), f"registered, confidence {float(found.confidence):.2f}": T}
     # Files of the same name are told apart by their folders.
     num_parts = 1 if options.source.name != options.target.name else 2
     files = (str(Path(*options.source.parts[-num_parts:])), str(Path(*options.target.parts[-num_parts:])))
+    is_calibrated = model.config.calibration is not None
+    named = {"source": files[0], "target": files[1], "weights": options.weights}
+    numbers = named | motion_numbers(T) | verdict_numbers(found, is_calibrated)
+    run.write_numbers(numbers)  # also where a picture fails
+    motions = {"before registration": np.eye(4), f"registered, confidence {float(found.confidence):.2f}": T}
     pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
     viz.save_figure(viz.registered_pairs_figure([pair]), run / "registration.png")
     print(f"T_target_source, which maps points of {files[0]} to the frame of {files[1]}:")
     print("\n".join("  " + " ".join(f"{value:12.6f}" for value in row) for row in T))
-    return {
-        "source": files[0],
-        "target": files[1],
-        "weights": options.weights,
-        **motion_numbers(T),
-        **verdict_numbers(found, model.config.calibration is not None),
-    }
+    return numbers
 
 
 def verdict_numbers(found: Registration, is_calibrated: bool) -> Numbers:

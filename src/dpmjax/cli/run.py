@@ -185,6 +185,7 @@ class Run:
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock = _lock(self.path)
             if output is not None and not self.is_resumed:
+                _check_replaceable(self.path, self._options)  # another run may have ended here meanwhile
                 for entry in self.path.iterdir():
                     shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
             write_json(self / CONFIG, self._options)
@@ -517,6 +518,7 @@ def _lock(path: Path) -> int | None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
+        os.close(handle)
         raise ValueError(f"{path}: another process is writing this run; let it end, or stop it") from error
     except OSError:
         pass  # a network file system without locks
