@@ -8,15 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from dpmjax.checks import as_float
-from dpmjax.geometry.rigid import SERIES_BELOW, namespace_of
-from dpmjax.types import AnyArray
+from dpmjax.geometry.rigid import namespace_of
 
 Poses = NDArray[np.float64]
 
@@ -97,6 +92,25 @@ def is_within(motions: Any, length: Any, angle: Any) -> Any:
     xp = namespace_of(motions)
     is_short = xp.hypot(motions[..., 0], motions[..., 1]) < length
     return is_short & (xp.abs(wrap_angle(motions[..., 2])) < angle)
+
+
+def share_of(pose_a_b: Any, share: Any) -> Any:
+    """Computes the part of a motion along its arc: the power `T_a_b ** share`.
+
+    Args:
+        pose_a_b: (..., 3), headings in [-pi, pi].
+        share: (...) 0: identity, 1: the motion itself.
+
+    Returns:
+        (..., 3).
+    """
+    xp = namespace_of(pose_a_b, share)
+    angle = wrap_angle(pose_a_b[..., 2])
+    # The chord of an arc is turned by half its angle; sinc(x) is sin(pi x) / (pi x).
+    length = share * xp.sinc(share * angle / (2 * np.pi)) / xp.sinc(angle / (2 * np.pi))
+    half = 0.5 * (share - 1.0) * angle
+    cos, sin, x, y = length * xp.cos(half), length * xp.sin(half), pose_a_b[..., 0], pose_a_b[..., 1]
+    return xp.stack([cos * x - sin * y, sin * x + cos * y, share * angle], axis=-1)
 
 
 def chain(steps: Poses) -> Poses:
@@ -223,31 +237,3 @@ def adjoint(pose_a_b: Any) -> Any:
     zero, one = xp.zeros_like(cos), xp.ones_like(cos)
     rows = ((cos, -sin, pose_a_b[..., 1]), (sin, cos, -pose_a_b[..., 0]), (zero, zero, one))
     return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-@jax.jit
-def log(pose_a_b: Float[AnyArray, "... 3"]) -> Float[Array, "... 3"]:
-    """The planar twist (vx, vy, angle) of a pose (x, y, heading), the inverse of `rigid.exp`.
-
-    Args:
-        pose_a_b: (..., 3).
-
-    Returns:
-        (..., 3), the angle in [-pi, pi].
-    """
-    pose_a_b = as_float("pose_a_b", pose_a_b)
-    x, y, angle = pose_a_b[..., 0], pose_a_b[..., 1], wrap_angle(pose_a_b[..., 2])
-    share, half = 1 - angle**2 * _missing_cotangent(angle), angle / 2
-    return jnp.stack([share * x + half * y, share * y - half * x, angle], axis=-1)
-
-
-def _missing_cotangent(angle: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Returns (1 - h / tan(h)) / angle^2 with h = angle / 2; by a series where the difference would lose digits."""
-    squared = angle**2
-    is_small = squared < SERIES_BELOW
-    half = jnp.where(is_small, 1, angle) / 2
-    return jnp.where(
-        is_small,
-        1 / 12 + squared / 720 + squared**2 / 30240 + squared**3 / 1209600,
-        (1 - half / jnp.tan(half)) / (4 * half**2),
-    )

@@ -52,6 +52,19 @@ def join_rows(*records: Rows) -> Rows:
     return jax.tree.map(lambda *parts: np.concatenate(parts), *records)
 
 
+def take_rows(record: Rows, rows: NDArray[Any]) -> Rows:
+    """Returns some rows of a record of arrays, such as a list of edges.
+
+    Args:
+        record: the record.
+        rows: row numbers, or a mask that is True for the rows.
+
+    Returns:
+        A record with these rows.
+    """
+    return jax.tree.map(lambda values: values[rows], record)
+
+
 def label_parts(size: int, source: NDArray[np.integer], target: NDArray[np.integer]) -> Indices:
     """Labels the connected parts of a graph.
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import scipy.spatial
 from jaxtyping import Float
@@ -30,7 +29,7 @@ from dpmjax.registration2d.pair_search import (
     search_pairs,
 )
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, spread_evenly
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, weak_steps
+from dpmjax.registration2d.range_profiles import compare_pairs, weak_steps
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Numbers of search partners of a scan that is no keyframe: keyframes with the most similar views, and, without an
@@ -80,7 +79,7 @@ class GlobalRegistration(NamedTuple):
 class _Task(NamedTuple):
     """The scans to be registered, the same for all stages."""
 
-    profiles: RangeProfiles
+    scans: PlanarScans
     walls: WallDirections
     keyframes: Indices
     is_ordered: bool
@@ -89,18 +88,17 @@ class _Task(NamedTuple):
     @property
     def others(self) -> Indices:
         """Rows of the scans that are no keyframes."""
-        return np.setdiff1d(np.arange(len(self.profiles)), self.keyframes)
+        return np.setdiff1d(np.arange(len(self.scans)), self.keyframes)
 
     def search(self, source: Indices, target: Indices, turns: Booleans | None = None) -> Candidates:
         """Returns candidates of pairs."""
-        return search_pairs(self.profiles, source, target, self.config.search, turns=turns)
+        return search_pairs(self.scans, source, target, self.config.search, turns=turns)
 
     def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> Booleans:
         """Returns the headings of T_target_source at which the wall directions of both scans agree."""
         return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
 
 
-@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) -> GlobalRegistration:
     """Registers all scans without initial poses.
 
@@ -112,12 +110,12 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     Returns:
         GlobalRegistration.
     """
-    config, profiles, everyone = config or GlobalConfig(), make_profiles(scans), np.arange(len(scans))
+    config, everyone = config or GlobalConfig(), np.arange(len(scans))
     if scans.is_ordered and scans.noise <= _MAX_NOISE * scans.typical_range:
         poses = incremental_icp(scans).poses
         # Few scans are searched all against all as soon as one step is weak.
         allowed = _MAX_WEAK if len(scans) > config.max_keyframes else 0.0
-        if weak_steps(profiles, poses, everyone).sum() <= allowed * len(scans):
+        if weak_steps(scans, poses, everyone).sum() <= allowed * len(scans):
             return GlobalRegistration(poses, everyone[:0])
     walls = WallDirections(scans)
     if scans.is_ordered:
@@ -125,17 +123,17 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
     else:
         eligible = spread_evenly(len(scans), _MAX_ELIGIBLE)
         keyframes = eligible[most_typical(walls.best_similarity(everyone, eligible), config.max_keyframes)]
-    task = _Task(profiles, walls, keyframes, scans.is_ordered, config)
+    task = _Task(scans, walls, keyframes, scans.is_ordered, config)
     first, second = np.tril_indices(len(keyframes), k=-1)
     pairs = keyframes[first], keyframes[second]
     found = task.search(*pairs, task.likely_turns(*pairs, _NUM_KEYFRAME_TURNS))
     inside = found._replace(source=first, target=second)
     poses = np.zeros((len(scans), 3))
-    poses[keyframes] = assemble(profiles.take(keyframes), inside, is_ordered=scans.is_ordered)
+    poses[keyframes] = assemble(scans.take(keyframes), inside, is_ordered=scans.is_ordered)
     if len(keyframes) < len(scans):
-        key_edges = agreeing_edges(poses, found, profiles)
+        key_edges = agreeing_edges(poses, found, scans)
         poses, more = place_others(task, poses, found, task.search(*_similar_pairs(task)))
-        edges = join_rows(key_edges, agreeing_edges(poses, more, profiles))
+        edges = join_rows(key_edges, agreeing_edges(poses, more, scans))
         poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
 
@@ -169,7 +167,7 @@ def _similar_pairs(task: _Task) -> tuple[Indices, Indices, Booleans]:
         after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
         near = np.stack([keyframes[after - 1], keyframes[after]], axis=1)
     else:  # Scans with the most similar views are likely to be near.
-        near = task.walls.most_similar(others, np.arange(len(task.profiles)), _NUM_NEAREST_VIEWS)
+        near = task.walls.most_similar(others, np.arange(len(task.scans)), _NUM_NEAREST_VIEWS)
     pairs = np.concatenate([task.walls.most_similar(others, keyframes, _NUM_ANCHORS), near], axis=1)
     # Each pair once, with one scan that is turned for all its partners.
     ends = np.stack([pairs.reshape(-1), np.repeat(others, pairs.shape[1])], axis=-1)
@@ -194,7 +192,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     # A scan that overlaps with no keyframe has its neighbours among the remaining scans; so has a keyframe that
     # overlaps with no other keyframe.
     for partners in (task.keyframes, task.others):
-        lost = find_unregistered(task.profiles, poses)
+        lost = find_unregistered(task.scans, poses)
         if not len(lost):
             break
         # The likely turns of these scans were wrong, so all turns are tried, with the most similar partners.
@@ -208,7 +206,7 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
 def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> Floats:
     """Places each other scan at its hypothesis with the best score against the keyframes, and revises all poses."""
     candidates = join_rows(found, more)
-    scorer = PoseScorer(task.profiles, chance_level(found), noisy_share(task.profiles, candidates), task.is_ordered)
+    scorer = PoseScorer(task.scans, chance_level(found), noisy_share(task.scans, candidates), task.is_ordered)
     hypotheses, keyframes = Hypotheses.of(candidates, 0.0).in_both_directions(), task.keyframes
     is_fresh = np.isin(hypotheses.target, keyframes) & ~np.isin(hypotheses.source, keyframes)
     fresh = hypotheses.take(np.flatnonzero(is_fresh))
@@ -222,14 +220,14 @@ def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> F
     return settle(poses, hypotheses, scorer)
 
 
-def find_unregistered(profiles: RangeProfiles, poses: Floats) -> Indices:
+def find_unregistered(scans: PlanarScans, poses: Floats) -> Indices:
     """Finds unregistered scans: they match far fewer beams than usual with any scan outside their cluster.
 
     A small cluster of scans that match each other and no other scan is unregistered too: its scans must not support
     each other.
 
     Args:
-        profiles: n scans.
+        scans: n scans.
         poses: (n, 3) T_world_scan.
 
     Returns:
@@ -239,7 +237,7 @@ def find_unregistered(profiles: RangeProfiles, poses: Floats) -> Indices:
     num_near = min(7, num_scans)
     near = scipy.spatial.cKDTree(poses[:, :2]).query(poses[:, :2], k=num_near)[1]
     scan, other = np.repeat(np.arange(num_scans), num_near), near.reshape(-1).astype(np.int64)
-    views = compare_pairs(profiles, scan, other, se2.relative(poses[other], poses[scan]))
+    views = compare_pairs(scans, scan, other, se2.relative(poses[other], poses[scan]))
     matched = np.where(scan == other, 0.0, views.matched)
     usual = float(np.median(matched.reshape(near.shape).max(axis=1)))
     is_linked = matched > _MIN_LINK * usual

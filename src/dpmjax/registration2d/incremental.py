@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from dpmjax.geometry import se2
@@ -39,7 +38,6 @@ class IncrementalResult(NamedTuple):
     steps: PairMatches
 
 
-@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def incremental_icp(
     scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None, prior: StepPrior | None = None
 ) -> IncrementalResult:
@@ -71,8 +69,8 @@ def incremental_icp(
         loose = prior.as_pair_prior(_COARSE_RESIDUAL * unit)
         rough = match_pairs(source, target, guesses, COARSE, loose, metric=metric)
     # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
-    num_beams = np.maximum(np.asarray(source.is_on_line.sum(1)), 1)
-    is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams / COARSE.source_stride
+    num_beams = source.num_on_line
+    is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams * COARSE.source_share(source)
     belief = prior.as_pair_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
     predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)

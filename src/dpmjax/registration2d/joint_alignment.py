@@ -10,29 +10,21 @@ refinement and not after it. The pose graph is solved again with the previous re
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_rows
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.pair_alignment import PairSystem, Schedule, linearise_pair
-from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans, rounded_up
-from dpmjax.registration2d.range_profiles import WEAK_SCORE, RangeProfiles, make_profiles, pair_scores
+from dpmjax.registration2d.pair_alignment import Schedule, linearise_pairs
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
+from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
 from dpmjax.registration2d.steps import StepPrior, held_steps, pose_steps, prior_steps, slide_steps
 
 # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
-# Pairs that are linearised side by side: few enough for the cache, enough for all cores.
-_PAIRS_AT_ONCE = 128
-# The number of pairs is rounded up to a power of two up to this one, then to its multiples, so that few shapes compile.
-_PAIRS_ROUNDED = 1024
 # Gates and kernels of the rounds, and number of rounds after which the neighbours are chosen anew.
 _ROUNDS, _REFRESH = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14), 4
 # Gauss-Newton steps that restore unconstrained directions after the adjustment to lines, and torn steps.
@@ -59,13 +51,13 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
     Returns:
         (n, 3) poses.
     """
-    scales, profiles = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise), make_profiles(scans)
+    scales = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
     expected = pose_steps(poses, scans.typical_range) if prior is None else prior_steps(prior)
     # In units of one beam's information, as the systems of the pairs are.
     trust = 1e-9 if prior is None else max(scans.noise, 0.00075 * scans.typical_range) ** 2
-    for round_number, scale in enumerate(zip(*scales, strict=True)):
+    for round_number, scale in enumerate(scales):
         if round_number % _REFRESH == 0:
-            pairs = _choose_aligned(profiles, poses, radius, prior)
+            pairs = _choose_aligned(scans, poses, radius, prior)
             steps = join_rows(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
         edges, gradient = _linearise(scans, pairs, poses, scale)
@@ -74,11 +66,11 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
     return poses
 
 
-def restore_open(profiles: RangeProfiles, aligned: Floats, adjusted: Floats, radius: float, prior: StepPrior) -> Floats:
+def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: float, prior: StepPrior) -> Floats:
     """Restores relative poses along their unconstrained directions after an adjustment without constraints there.
 
     Args:
-        profiles: n scans in time order.
+        scans: n scans in time order.
         aligned: (n, 3) poses before the adjustment.
         adjusted: (n, 3) poses after it.
         radius: largest distance of neighbours in space, typical ranges.
@@ -87,11 +79,11 @@ def restore_open(profiles: RangeProfiles, aligned: Floats, adjusted: Floats, rad
     Returns:
         (n, 3) adjusted poses; along the unconstrained directions the relative poses are those of `aligned`.
     """
-    scans, pairs = profiles.scans, _choose_aligned(profiles, aligned, radius, prior)
+    pairs = _choose_aligned(scans, aligned, radius, prior)
     if not len(pairs.held.source):
         return adjusted
-    gates, kernels = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)
-    edges, _ = _linearise(scans, pairs, adjusted, (gates[-1], kernels[-1]))
+    scale = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)[-1]
+    edges, _ = _linearise(scans, pairs, adjusted, scale)
     kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
     # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
@@ -100,12 +92,12 @@ def restore_open(profiles: RangeProfiles, aligned: Floats, adjusted: Floats, rad
 
 
 def restore_torn(
-    profiles: RangeProfiles, steps: Floats, poses: Floats, radius: float, prior: StepPrior
+    scans: PlanarScans, steps: Floats, poses: Floats, radius: float, prior: StepPrior
 ) -> Floats | None:
     """Restores torn steps and distributes the difference over the pairs that constrain the map.
 
     Args:
-        profiles: n scans in time order.
+        scans: n scans in time order.
         steps: (n - 1, 3) T_scan_next before the refinement.
         poses: (n, 3) T_world_scan after the refinement.
         radius: largest distance of neighbours in space, typical ranges.
@@ -115,27 +107,27 @@ def restore_torn(
         (n, 3) T_world_scan, to be aligned again; None where no step is torn.
     """
     later, kept = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
-    before, after = (pair_scores(profiles, later, later - 1, found) for found in (steps, kept))
+    before, after = (pair_scores(scans, later, later - 1, found) for found in (steps, kept))
     is_lost = (before > WEAK_SCORE) & (after < before - _LOST_SCORE)
-    slides = slide_steps(profiles, kept, prior)
+    slides = slide_steps(scans, kept, prior)
     is_slid = slides.is_torn & (slides.scores > WEAK_SCORE) & ~is_lost
     if not (is_lost | is_slid).any():
         return None
     weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
     restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
-    edges = join_rows(_fitting_pairs(profiles, poses, radius), Edges(later, later - 1, restored, weights))
-    scale = np.diag([1.0, 1.0, profiles.scans.typical_range**2])
+    edges = join_rows(_fitting_pairs(scans, poses, radius), Edges(later, later - 1, restored, weights))
+    scale = np.diag([1.0, 1.0, scans.typical_range**2])
     edges = edges._replace(information=edges.information[:, None, None] * scale)
     return _relax(edges, poses, _NUM_TORN_ROUNDS)
 
 
-def _fitting_pairs(profiles: RangeProfiles, poses: Floats, radius: float) -> Edges:
+def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
     """Returns edges of the pairs that fit, without steps; their information is the scores (e,)."""
-    source, target = choose_pairs(profiles.scans, poses, radius)
+    source, target = choose_pairs(scans, poses, radius)
     is_pair = source != target + 1
     source, target = source[is_pair], target[is_pair]
     relative = np.asarray(se2.relative(poses[target], poses[source]))
-    scores = pair_scores(profiles, source, target, relative)
+    scores = pair_scores(scans, source, target, relative)
     fits = scores > WEAK_SCORE
     return Edges(source[fits], target[fits], relative[fits], scores[fits])
 
@@ -170,17 +162,17 @@ class _AlignedPairs(NamedTuple):
     held: Edges
 
 
-def _choose_aligned(profiles: RangeProfiles, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
+def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
-    source, target = choose_pairs(profiles.scans, poses, radius)
+    source, target = choose_pairs(scans, poses, radius)
     if prior is None:
         return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
-    slides = slide_steps(profiles, se2.relative(poses[:-1], poses[1:]), prior)
+    slides = slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
     is_kept = (crossed[source] == crossed[target]) | (source - target > max(_TEMPORAL))
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
-    across = np.eye(3) - slide_steps(profiles, relative, pairs=(source, target)).open_directions(relative)
+    across = np.eye(3) - slide_steps(scans, relative, pairs=(source, target)).open_directions(relative)
     return _AlignedPairs(source, target, across, held_steps(slides, poses))
 
 
@@ -229,29 +221,10 @@ def choose_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Pairs:
     return np.concatenate(source).astype(np.int64), np.concatenate(target).astype(np.int64)
 
 
-@partial(jax.jit, static_argnames="source_stride")
-def _linearise_pairs(
-    scans: PlanarScans, pairs: tuple[Array, Array, Array], scale: tuple[Array, Array], *, source_stride: int
-) -> PairSystem:
-    thinned = scans.thin(source_stride)
-
-    def linearise(pair: tuple[Array, Array, Array]) -> PairSystem:
-        return linearise_pair(thinned.take(pair[0]), scans.take(pair[1]), pair[2], scale, metric="plane")
-
-    return jax.lax.map(linearise, pairs, batch_size=_PAIRS_AT_ONCE)
-
-
-def _linearise(
-    scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: tuple[Array, Array]
-) -> tuple[Edges, Floats]:
-    """Linearises all pairs at these poses, gate and kernel; their number is rounded up, so that few shapes compile."""
+def _linearise(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: Floats) -> tuple[Edges, Floats]:
+    """Linearises all pairs at these poses, gate and kernel."""
     source, target, across, _ = pairs
     relative = se2.relative(poses[target], poses[source])
-    if not len(source):
-        return Edges(source, target, relative, np.zeros((0, 3, 3))), np.zeros((0, 3))
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
-    filled = np.resize(np.arange(len(source)), rounded_up(len(source), _PAIRS_AT_ONCE, _PAIRS_ROUNDED))
-    rows = source[filled], target[filled], relative[filled].astype(np.float32)
-    system = _linearise_pairs(replace(scans, is_ordered=False), rows, scale, source_stride=stride)
-    information, gradient, _ = (np.asarray(x, np.float64)[: len(source)] for x in system)
+    information, gradient = linearise_pairs(scans, source, target, relative, scale, stride=stride)
     return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)

@@ -7,7 +7,6 @@ because its noise is parallel to the wall. The lines are eliminated, so each res
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -15,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans
 
 _einsum = partial(jnp.einsum, precision="highest")
 
@@ -73,11 +72,16 @@ def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
     return jnp.stack([-points[..., 1], points[..., 0]], -1)
 
 
-def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Array) -> _Beams:
+@jax.jit
+def _find_nearest(own: Lines, others: Lines, poses: Float[Array, "s 3"]) -> Int[Array, "b s"]:
+    """Finds the beam of each neighbouring scan that ends nearest to each beam."""
+    search = jax.vmap(lambda some, mask: k_nearest(own.points, some, 1, mask=mask).indices[:, 0], out_axes=1)
+    return search(se2.transform_points(poses, others.points), others.mask)
+
+
+def _gather_beams(own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Array, noise: Array) -> _Beams:
     """Gathers, for each beam, the beams of nearby scans that hit the same side of the same surface."""
-    noise = own.noises
-    rotation = se2.rotation(poses[:, 2])
-    turn = partial(_einsum, "sij,skj->ski", rotation)
+    turn = partial(_einsum, "sij,skj->ski", se2.rotation(poses[:, 2]))
     points = se2.transform_points(poses, others.points)
     index = nearest[..., None] + jnp.arange(-_NUM_BESIDE, _NUM_BESIDE + 1)
     is_inside = (index >= 0) & (index < points.shape[1])
@@ -90,7 +94,7 @@ def _gather_beams(own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b 
     # The beam itself is left out.
     is_near = (squared < (_WINDOW * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
     slant, levers = (turn(x)[scan, index] for x in (others.points / reach, _levers(others.points)))
-    mask = others.is_on_line[scan, index] & is_inside & is_near & faces_same_way
+    mask = others.mask[scan, index] & is_inside & is_near & faces_same_way
     return _Beams(offsets, slant, levers, mask)
 
 
@@ -126,19 +130,19 @@ def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, 
     return _Lines(normals, shares, 1.0 / total + here**2 / length, is_line)
 
 
+@jax.jit
 def _linearise(
-    own: PlanarScans, others: PlanarScans, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"]
+    own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"], noise: Float[Array, ""]
 ) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
     """Computes J^T W J and J^T W r of one scan; the first of `others` is the scan itself, at pose zero."""
-    noise = own.noises
-    beams = _gather_beams(own, others, nearest, poses)
+    beams = _gather_beams(own, others, nearest, poses, noise)
     lines = _fit_lines(beams, own.normals, noise)
     normals = lines.normals
     residual = -_einsum("bsk,bski,bi->b", lines.shares, beams.offsets, normals)
     squared_slant = (normals * own.points).sum(-1) ** 2 / jnp.maximum((own.points**2).sum(-1), 1e-12)
     variance = noise**2 * (squared_slant + _ROUGHNESS**2) + lines.variance
     robust = 1.0 / (1.0 + residual**2 / (_OUTLIER**2 * variance)) ** 2
-    weight = jnp.where(own.is_on_line & lines.is_line, robust / variance, 0.0)
+    weight = jnp.where(own.mask & lines.is_line, robust / variance, 0.0)
     rotation = se2.rotation(poses[:, 2])
     shift = lines.shares.sum(2)[..., None] * _einsum("bi,sij->bsj", normals, rotation)
     turn = _einsum("bsk,bski,bi->bs", lines.shares, beams.levers, normals)
@@ -148,43 +152,21 @@ def _linearise(
     return information, _einsum("b,b,bsi->si", weight, residual, jacobian)
 
 
-@jax.jit
-def _find_nearest(scans: PlanarScans, around: Int[Array, "n s"], poses: Float[Array, "n s 3"]) -> Int[Array, "n b s"]:
-    """Finds the beam of each neighbouring scan that ends nearest to each beam."""
-
-    def find(one: tuple[Array, Array]) -> Array:
-        rows, relative = one
-        points = se2.transform_points(relative, scans.points[rows])
-        own = scans.points[rows[0]]
-        search = jax.vmap(lambda some, mask: k_nearest(own, some, 1, mask=mask).indices[:, 0], out_axes=1)
-        return search(points, scans.is_on_line[rows])
-
-    return jax.lax.map(find, (around, poses))
-
-
-@jax.jit
-def _linearise_all(
-    scans: PlanarScans, around: Int[Array, "n s"], nearest: Int[Array, "n b s"], poses: Float[Array, "n s 3"]
-) -> tuple[Float[Array, "n s s 3 3"], Float[Array, "n s 3"]]:
-    def linearise(one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        rows, nearest, relative = one
-        return _linearise(scans.take(rows[0]), scans.take(rows), nearest, relative)
-
-    return jax.lax.map(linearise, (around, nearest, poses))
-
-
 def _choose_around(poses: Floats, radius: float) -> Indices:
-    """Returns the row of each scan and those of neighbours within the radius, spread evenly by nearness."""
+    """Returns the row of each scan and those of neighbours within the radius, spread evenly by nearness.
+
+    Where there are too few neighbours, the row of the scan itself fills the remaining places.
+    """
     num_scans = len(poses)
     count = min(_NUM_NEIGHBOURS, num_scans - 1)
     tree = scipy.spatial.cKDTree(poses[:, :2])
-    around = np.empty((num_scans, count + 1), np.int64)
+    around = np.repeat(np.arange(num_scans)[:, None], _NUM_NEIGHBOURS + 1, axis=1)
     for scan, pose in enumerate(poses):
         num_within = tree.query_ball_point(pose[:2], radius, return_length=True)
         near = np.atleast_1d(tree.query(pose[:2], k=min(num_scans, max(num_within, count + 1)))[1])
         # Scans at the same position have no defined order.
         near = near[near != scan]
-        around[scan] = [scan, *near[np.linspace(0, len(near) - 1, count).astype(np.int64)]]
+        around[scan, 1 : count + 1] = near[np.linspace(0, len(near) - 1, count).astype(np.int64)]
     return around
 
 
@@ -200,15 +182,24 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
     """
     if len(poses) < 2 or scans.noise <= 0:
         return poses
-    radius, scans = _RADIUS * scans.typical_range, replace(scans, is_ordered=False)
     for _ in range(_NUM_ROUNDS):
-        around = _choose_around(poses, radius)
-        nearest = _find_nearest(scans, around, _relative_to_own(poses, around))
+        around = _choose_around(poses, _RADIUS * scans.typical_range)
+        pairs = [_lines_around(scans, rows) for rows in around]
+        relative = _relative_to_own(poses, around)
+        nearest = [_find_nearest(*lines, T) for lines, T in zip(pairs, relative, strict=True)]
         for _ in range(_NUM_ITERATIONS):
-            system = _linearise_all(scans, around, nearest, _relative_to_own(poses, around))
-            blocks, gradient = (np.asarray(x, np.float64) for x in system)
+            relative, noise = _relative_to_own(poses, around), np.float32(scans.noise)
+            systems = [_linearise(*x, near, T, noise) for x, near, T in zip(pairs, nearest, relative, strict=True)]
+            blocks, gradient = (np.stack(x).astype(np.float64) for x in zip(*systems, strict=True))
             poses = se2.compose(poses, solve_blocks(around, blocks, gradient, len(poses)))
     return poses
+
+
+def _lines_around(scans: PlanarScans, rows: Indices) -> tuple[Lines, Lines]:
+    """Returns the lines of the first scan, and those of all; repetitions of the first scan have none."""
+    others = scans.lines(rows)
+    is_other = (rows != rows[0]) | (np.arange(len(rows)) == 0)
+    return scans.lines(rows[0]), others._replace(mask=others.mask & is_other[:, None])
 
 
 def _relative_to_own(poses: Floats, around: Indices) -> Float[np.ndarray, "n s 3"]:

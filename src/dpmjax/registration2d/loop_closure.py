@@ -7,25 +7,22 @@ contradict it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, PoseGraph, join_rows
+from dpmjax.pose_graph.graph import Edges, PoseGraph, join_rows, take_rows
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior, Schedule, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans, batches
-from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles, weak_steps
+from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
+from dpmjax.registration2d.range_profiles import contradicted_share, weak_steps
 from dpmjax.registration2d.steps import BEAM_DEVIATION, pose_steps
 
-_SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_stride=5, target_stride=3)
-_REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, target_stride=2)
+_SEARCH = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=7, source_beams=36, target_beams=300)
+_REFINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.0045), num_iterations=10, source_beams=180, target_beams=450)
 # Number of candidates that are matched at a time, all batches of one shape.
 _BATCH = 512
 # Two views that overlap well are nearer than twice this, in typical ranges, in addition to the drift.
@@ -34,6 +31,8 @@ _NEARBY = 0.15
 _MAX_RADIUS, _MIN_WAY = 2.25, 2.25
 # Largest number of candidates in a round.
 _MAX_CANDIDATES = 2000
+# A pair is matched again where its relative pose was corrected by more than `_NEARBY`, or by this turn.
+_MOVED_TURN = 0.15
 # Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
 # Least robust share of matched beams, and largest share of beams that contradict their partner scan.
@@ -90,12 +89,18 @@ def correct_by_loops(
     """
     config = config or LoopConfig()
     steps = steps or pose_steps(poses, scans.typical_range)
+    loops = take_rows(steps, np.zeros(0, np.int64))
     # The graph may reject a step with a weak score like a loop.
-    is_weak = weak_steps(make_profiles(scans), poses, np.arange(len(poses)))
+    is_weak = weak_steps(scans, poses, np.arange(len(poses)))
     step_trust = np.where(is_weak, 1.0, _STEP_TRUST)
+    found, weights, tried = loops, np.zeros(0), dict[tuple[int, int], Floats]()
     for _ in range(config.num_rounds):
-        loops, weights = _find_loops(scans, poses, config), np.zeros(0)
-        if not len(loops.source):
+        new = _untried(find_candidates(poses, config, scans.typical_range), poses, tried, scans.typical_range)
+        more = _find_loops(scans, poses, new, config)
+        is_matched_again = np.isin(found.source * len(poses) + found.target, more.source * len(poses) + more.target)
+        found = join_rows(take_rows(found, ~is_matched_again), more)
+        loops = take_rows(found, count_support(found, poses, scans.typical_range) >= _MIN_SUPPORT)
+        if not len(more.source) or not len(loops.source):
             break
         trust = np.append(step_trust, np.ones(len(loops.source)))
         solved = optimize_pose_graph(PoseGraph.create(poses, join_rows(steps, loops)), ROBUST, trust=trust)
@@ -103,22 +108,32 @@ def correct_by_loops(
     return LoopResult(poses, loops, weights)
 
 
-def _find_loops(scans: PlanarScans, poses: Floats, config: LoopConfig) -> Edges:
-    """Finds loops between scans of one trajectory, each supported by neighbouring loops."""
-    unit = scans.typical_range
-    source, target = find_candidates(poses, config, unit)
+def _untried(pairs: Pairs, poses: Floats, tried: dict[tuple[int, int], Floats], typical_range: float) -> Pairs:
+    """Returns the pairs that were not matched from a similar relative pose before, and records them in `tried`."""
+    source, target = pairs
+    predicted = se2.relative(poses[target], poses[source])
+    names = list(zip(source.tolist(), target.tolist(), strict=True))
+    before = np.array([tried.get(name, np.full(3, np.inf)) for name in names]).reshape(-1, 3)
+    with np.errstate(invalid="ignore"):
+        is_new = ~se2.is_within(predicted - before, _NEARBY * typical_range, _MOVED_TURN)
+    tried.update((name, pose) for name, pose, new in zip(names, predicted, is_new, strict=True) if new)
+    return source[is_new], target[is_new]
+
+
+def _find_loops(scans: PlanarScans, poses: Floats, pairs: Pairs, config: LoopConfig) -> Edges:
+    """Matches pairs of scans of one trajectory and returns those that fit."""
+    unit, (source, target) = scans.typical_range, pairs
     matches = PairMatches(np.zeros((len(source), 3)), np.zeros(len(source)), np.zeros((len(source), 3, 3)))
-    for part, rows in batches(len(source), _BATCH):
-        for kept, found in zip(matches, _match(scans, poses, source[rows], target[rows], config), strict=True):
-            kept[part] = found[: part.stop - part.start]
-    contradicted = contradicted_share(make_profiles(scans), source, target, matches.poses)
-    num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[source], 1)
-    is_held = matches.weakest_eigenvalue() / num_beams > _MIN_EIGENVALUE
-    fits = (matches.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED) & is_held
-    information = matches.information[fits] / (BEAM_DEVIATION * unit) ** 2
-    edges = Edges(source[fits], target[fits], matches.poses[fits], information)
-    is_supported = count_support(edges, poses, unit) >= _MIN_SUPPORT
-    return jax.tree.map(lambda x: x[is_supported], edges)
+    for start in range(0, len(source), _BATCH):
+        part = slice(start, start + _BATCH)
+        for kept, found in zip(matches, _match(scans, poses, source[part], target[part], config), strict=True):
+            kept[part] = found
+    fits = matches.fitness > _MIN_FITNESS
+    fits &= matches.weakest_eigenvalue() > _MIN_EIGENVALUE * scans.num_on_line[source] * _REFINE.source_share(scans)
+    fits[fits] = contradicted_share(scans, source[fits], target[fits], matches.poses[fits]) < _MAX_CONTRADICTED
+    # A beam that was left out would measure as much as those beside it.
+    information = matches.information[fits] / _REFINE.source_share(scans) / (BEAM_DEVIATION * unit) ** 2
+    return Edges(source[fits], target[fits], matches.poses[fits], information)
 
 
 def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> Pairs:
@@ -147,9 +162,15 @@ def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, 
     sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
     belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
     prior = PairPrior(predicted, (0.015 * unit) ** 2 * belief)
-    rough = match_pairs(ones, submaps, _guesses(predicted, unit), _SEARCH, prior)
-    prior = PairPrior(predicted, (3.0 * scans.noise) ** 2 * belief)
-    return match_pairs(ones, submaps, rough.poses[:, None], _REFINE, prior)
+    matches = match_pairs(ones, submaps, _guesses(predicted, unit), _SEARCH, prior)
+    # A finer kernel lowers the fitness.
+    rows = np.flatnonzero(matches.fitness > _MIN_FITNESS)
+    prior = PairPrior(predicted[rows], (3.0 * scans.noise) ** 2 * belief[rows])
+    fine = match_pairs(ones.take(rows), submaps.take(rows), matches.poses[rows][:, None], _REFINE, prior)
+    for kept, found in zip(matches, fine, strict=True):
+        kept[rows] = found
+    matches.fitness[matches.fitness <= _MIN_FITNESS] = 0.0
+    return matches
 
 
 def _guesses(predicted: Floats, typical_range: float) -> Floats:
@@ -165,22 +186,12 @@ def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> Plana
     rows = centres[:, None] + np.array(sorted(range(-_SUBMAP_WIDTH, _SUBMAP_WIDTH + 1), key=abs))
     is_there = (rows >= 0) & (rows < len(poses))
     rows = np.clip(rows, 0, len(poses) - 1)
-    relative = se2.relative(poses[centres][:, None], poses[rows]).astype(np.float32)
-    return _merge_scans(replace(scans, is_ordered=False), rows, is_there, relative)
-
-
-@jax.jit
-def _merge_scans(
-    scans: PlanarScans, rows: Int[Array, "p w"], is_there: Bool[Array, "p w"], poses: Float[Array, "p w 3"]
-) -> PlanarScans:
-    """Merges w scans into each submap; poses are T_submap_scan."""
-    some, there = scans.take(rows), is_there[..., None]
-    points, centroids = (se2.transform_points(poses, x) for x in (some.points, some.centroids))
-    normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), some.normals)
-    arrays = points, some.mask & there, normals, centroids, some.is_on_line & there
-    points, mask, normals, centroids, is_on_line = (x.reshape(len(rows), -1, *x.shape[3:]) for x in arrays)
-    noises, lengths = some.noises[:, 0], some.typical_ranges[:, 0]
-    return PlanarScans(points, mask, normals, centroids, is_on_line, noises, lengths, is_ordered=False)
+    relative, there = se2.relative(poses[centres][:, None], poses[rows]).astype(np.float32), is_there[..., None]
+    points, centroids = (se2.transform_points(relative, x[rows]) for x in (scans.points, scans.centroids))
+    normals = se2.transform_points(relative * np.float32([0.0, 0.0, 1.0]), scans.normals[rows])
+    arrays = points, scans.mask[rows] & there, normals, centroids, scans.is_on_line[rows] & there
+    merged = (x.reshape(len(rows), -1, *x.shape[3:]) for x in arrays)
+    return PlanarScans(*merged, scans.noise, scans.typical_range, is_ordered=False)
 
 
 def count_support(edges: Edges, poses: Floats, typical_range: float) -> Indices:

@@ -22,8 +22,8 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.pair_search import Candidates, Hypotheses, chance_level, noisy_share
-from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
+from dpmjax.registration2d.range_profiles import compare_pairs
 
 # A pair agrees with a map within this: translation in typical ranges, radians.
 _AGREEMENT = (0.06, 0.1)
@@ -50,13 +50,13 @@ class PoseScorer(NamedTuple):
     """Scores poses of scans against placed scans.
 
     Attributes:
-        profiles: n scans.
+        scans: n scans.
         chance: number of beams that two scans of different places match by chance, which is subtracted.
         noisy_share: share of visible beams that range noise makes contradictory, which is subtracted.
         is_ordered: True where neighbours in the array are neighbours in time.
     """
 
-    profiles: RangeProfiles
+    scans: PlanarScans
     chance: float
     noisy_share: float
     is_ordered: bool
@@ -64,7 +64,7 @@ class PoseScorer(NamedTuple):
     @property
     def radius(self) -> float:
         """Distance within which scans score each other, unit of the points."""
-        return _RADIUS * self.profiles.scans.typical_range
+        return _RADIUS * self.scans.typical_range
 
     def score(self, scan: Indices, candidates: Floats, placed: Indices, poses: Floats) -> Floats:
         """Scores (m,) each `scan` at its candidate pose (m, 3) against all of `placed`, which are at `poses`."""
@@ -89,7 +89,7 @@ class PoseScorer(NamedTuple):
 
     def score_pairs(self, source: Indices, target: Indices, poses: Floats) -> Floats:
         """Computes matched beams above chance less weighted contradicting beams (p,) of pairs at T_target_source."""
-        views = compare_pairs(self.profiles, source, target, poses, stride=4)
+        views = compare_pairs(self.scans, source, target, poses, stride=4)
         # Without this, chance matches would favour poses with more overlap, such as one room on top of another.
         is_next = self.is_ordered & (np.abs(source - target) == 1)
         matched = np.maximum(views.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
@@ -128,32 +128,32 @@ def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
 
-def assemble(profiles: RangeProfiles, candidates: Candidates, *, is_ordered: bool) -> Floats:
+def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) -> Floats:
     """Assembles one map of all scans from candidates of their pairs, without initial poses.
 
     Args:
-        profiles: n scans.
+        scans: n scans.
         candidates: of pairs that connect all scans.
         is_ordered: True where neighbours in the array are neighbours in time, so likely to overlap.
 
     Returns:
         (n, 3) T_world_scan; the first pose is zero.
     """
-    scorer = PoseScorer(profiles, chance_level(candidates), noisy_share(profiles, candidates), is_ordered)
-    hypotheses, everyone = Hypotheses.of(candidates, 0.0).in_both_directions(), np.arange(len(profiles))
+    scorer = PoseScorer(scans, chance_level(candidates), noisy_share(scans, candidates), is_ordered)
+    hypotheses, everyone = Hypotheses.of(candidates, 0.0).in_both_directions(), np.arange(len(scans))
     maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
     scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
-    poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(profiles), 3))
+    poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(scans), 3))
     poses, num_moved = move_blocks(poses, hypotheses, scorer)
     poses = settle(poses, hypotheses, scorer) if num_moved else poses
-    edges = agreeing_edges(poses, candidates, profiles)
+    edges = agreeing_edges(poses, candidates, scans)
     poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
     return np.asarray(se2.relative(poses[0], poses))
 
 
-def agreeing_edges(poses: Floats, candidates: Candidates, profiles: RangeProfiles) -> Edges:
+def agreeing_edges(poses: Floats, candidates: Candidates, scans: PlanarScans) -> Edges:
     """Returns edges of the pairs with a candidate that agrees with the map; of each pair the nearest candidate."""
-    typical_range, num_beams = profiles.scans.typical_range, np.asarray(profiles.scans.mask.sum(1), np.float64)
+    typical_range, num_beams = scans.typical_range, scans.mask.sum(1)
     beams = num_beams[candidates.source] + num_beams[candidates.target]
     shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
     here = se2.relative(poses[candidates.target], poses[candidates.source])
@@ -183,7 +183,7 @@ def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
 
 def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
     """Places all scans one by one, from the anchor of one hypothesis."""
-    scan, anchor, num_scans = hypotheses.source, hypotheses.target, len(scorer.profiles)
+    scan, anchor, num_scans = hypotheses.source, hypotheses.target, len(scorer.scans)
     poses, is_placed = np.zeros((num_scans, 3)), np.zeros(num_scans, bool)
     # World pose of each usable hypothesis, and its score against each placed scan.
     worlds, scores = np.zeros((len(scan), 3)), np.zeros((len(scan), num_scans))
@@ -227,7 +227,7 @@ def _revise(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> tuple[
         score = scorer.score(np.full(len(candidates), scan), candidates, everyone, poses)
         best = int(score.argmax())
         if is_firmly_more(score[best], score[0]):
-            far = _AGREEMENT[0] * scorer.profiles.scans.typical_range
+            far = _AGREEMENT[0] * scorer.scans.typical_range
             num_moved += bool(np.hypot(*(candidates[best] - poses[scan])[:2]) > far)
             poses[scan] = candidates[best]
     return poses, num_moved

@@ -16,7 +16,6 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import match_near
 from dpmjax.registration2d.pair_alignment import COARSE, FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
-from dpmjax.registration2d.range_profiles import make_profiles
 from dpmjax.registration2d.steps import StepPrior, slide_steps
 
 # Score above which a step is clear.
@@ -125,7 +124,7 @@ def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
     rough = match_pairs(source, target, np.where(is_within[..., None], told, 0.0), COARSE).poses
     guesses = np.stack([match_near(source, target, "plane").poses, rough], axis=1)
     steps = match_pairs(source, target, guesses, FINE).poses
-    slides = slide_steps(make_profiles(scans), steps)
+    slides = slide_steps(scans, steps)
     is_clear = (slides.scores > _CLEAR_SCORE) & ~slides.is_torn & ~slides.is_open
     return ClearSteps(np.flatnonzero(is_clear), steps[is_clear])
 

@@ -17,13 +17,11 @@ from jaxtyping import Array, Float
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
-from dpmjax.registration2d.planar_scans import Floats, PlanarScans, batches
+from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans, batches
 from dpmjax.types import AnyArray
 
-# GPUs multiply in TF32 by default, with errors of centimetres at a hundred metres.
-_matmul = partial(jnp.matmul, precision="highest")
-# Largest number of distances of one batch of pairs: 128 MB of float32 with the temporaries of XLA.
-_LIVE_DISTANCES = 1 << 24
+# Number of distances of one batch of pairs, few enough for the cache, and the largest number of pairs in it.
+_LIVE_DISTANCES, _MAX_BATCH = 1 << 22, 256
 
 Metric = Literal["point", "plane"]
 
@@ -36,25 +34,41 @@ class Schedule:
         gate: largest distance of matched points, first and last iteration.
         kernel: scale of the robust weight, first and last iteration; never below twice the range noise.
         num_iterations: iterations of Gauss-Newton.
-        source_stride: every `source_stride`-th beam of the source is used.
-        target_stride: every `target_stride`-th beam of the target is used.
+        source_beams: about this number of beams of the source is used, evenly spread; None: all.
+        target_beams: the same for the target.
     """
 
     gate: tuple[float, float]
     kernel: tuple[float, float]
     num_iterations: int
-    source_stride: int = 1
-    target_stride: int = 1
+    source_beams: int | None = None
+    target_beams: int | None = None
 
-    def gates_and_kernels(self, typical_range: float, noise: float) -> tuple[jax.Array, jax.Array]:
-        """Returns gate and kernel of each iteration in the unit of the points, bounded below by the range noise."""
-        gates, kernels = (typical_range * np.geomspace(*x, self.num_iterations) for x in (self.gate, self.kernel))
-        gates, kernels = np.maximum(gates, 4.0 * noise), np.maximum(kernels, 2.0 * noise)
-        return jnp.asarray(gates, jnp.float32), jnp.asarray(kernels, jnp.float32)
+    def gates_and_kernels(self, typical_range: float, noise: float) -> Floats:
+        """Returns gate and kernel (i, 2) of the iterations in the unit of the points, bounded by the range noise."""
+        scales = typical_range * np.stack([np.geomspace(*x, self.num_iterations) for x in (self.gate, self.kernel)], 1)
+        return np.maximum(scales, np.array([4.0, 2.0]) * noise)
+
+    def source_share(self, scans: PlanarScans) -> float:
+        """Returns the share of the beams of these sources that is used."""
+        return 1.0 / _stride(scans, self.source_beams)
 
 
-COARSE = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=8, source_stride=3)
+COARSE = Schedule(gate=(0.18, 0.045), kernel=(0.09, 0.0225), num_iterations=8, source_beams=60)
 FINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.00225), num_iterations=12)
+
+
+# Of many guesses, this share is aligned further after some iterations, at least the second number.
+_KEPT_SHARE, _LEAST_KEPT, _FIRST_ITERATIONS = 0.25, 4, 3
+
+
+def _thinned(scans: PlanarScans, num_beams: int | None) -> Lines:
+    """Returns about `num_beams` beams of each scan."""
+    return scans.lines(stride=_stride(scans, num_beams))
+
+
+def _stride(scans: PlanarScans, num_beams: int | None) -> int:
+    return max(1, round(scans.mask.shape[1] / (num_beams or scans.mask.shape[1])))
 
 
 class PairMatches(NamedTuple):
@@ -102,7 +116,7 @@ class PairSystem(NamedTuple):
 
 
 def linearise_pair(
-    source: PlanarScans, target: PlanarScans, pose: Float[Array, " 3"], scale: tuple[Array, Array], *, metric: Metric
+    source: Lines, target: Lines, pose: Float[Array, " 3"], scale: Float[Array, " 2"], *, metric: Metric
 ) -> PairSystem:
     """Pairs every source beam with its nearest target beam and linearises the distances.
 
@@ -117,61 +131,113 @@ def linearise_pair(
     Returns:
         PairSystem at this pose.
     """
-    (gate, kernel), rotation = scale, se2.rotation(pose[2])
+    (gate, kernel), cos, sin = scale, jnp.cos(pose[2]), jnp.sin(pose[2])
     points = se2.transform_points(pose, source.points)
-    nearest = k_nearest(points, target.points, 1, mask=target.is_on_line).indices[:, 0]
-    matched, normals = target.points[nearest], target.normals[nearest]
-    faces_same_way = (_matmul(source.normals, rotation.T) * normals).sum(-1) > 0.7
-    near = ((points - matched) ** 2).sum(-1) < gate**2
-    counts = source.is_on_line & target.is_on_line[nearest] & near & faces_same_way
-    lever = _matmul(jnp.stack([-source.points[:, 1], source.points[:, 0]], -1), rotation.T)
-    # Distances along the normal to the line, or along both axes to the point: (b, k, 2) and (b, 2).
+    nearest = k_nearest(points, target.points, 1, mask=target.mask).indices[:, 0]
+    (x, y), (matched_x, matched_y), (normal_x, normal_y) = points.T, target.points[nearest].T, target.normals[nearest].T
+    source_x, source_y = source.normals[:, 0], source.normals[:, 1]
+    cosine = (cos * source_x - sin * source_y) * normal_x + (sin * source_x + cos * source_y) * normal_y
+    is_near = (x - matched_x) ** 2 + (y - matched_y) ** 2 < gate**2
+    counts = source.mask & target.mask[nearest] & is_near & (cosine > 0.7)
+    # Distances along the normal to the line, or along both axes to the point.
     if metric == "plane":
-        axes, goal = normals[:, None], target.centroids[nearest]
+        goal_x, goal_y = target.centroids[nearest].T
+        axes = [(normal_x, normal_y)]
     else:
-        axes, goal = jnp.broadcast_to(jnp.eye(2), (len(points), 2, 2)), matched
-    residual = ((points - goal)[:, None] * axes).sum(-1)
-    jacobian = jnp.concatenate([_matmul(axes, rotation), (axes * lever[:, None]).sum(-1, keepdims=True)], -1)
-    weight = jnp.where(counts, (kernel**2 / (kernel**2 + (residual**2).sum(-1))) ** 2, 0.0)
-    weighted = weight[:, None, None] * jacobian
-    information = jnp.einsum("bki,bkj->ij", weighted, jacobian, precision="highest")
-    gradient = jnp.einsum("bki,bk->i", weighted, residual, precision="highest")
+        goal_x, goal_y, zero = matched_x, matched_y, jnp.zeros_like(x)
+        axes = [(zero + 1.0, zero), (zero, zero + 1.0)]
+    residuals = [(x - goal_x) * axis_x + (y - goal_y) * axis_y for axis_x, axis_y in axes]
+    squared = sum(residual**2 for residual in residuals)
+    weight = jnp.where(counts, (kernel**2 / (kernel**2 + squared)) ** 2, 0.0)
+    information, gradient = jnp.zeros((3, 3)), jnp.zeros(3)
+    # Sums of products, because products of small matrices are slow on a CPU.
+    for residual, (axis_x, axis_y) in zip(residuals, axes, strict=True):
+        lever = (x - pose[0]) * axis_y - (y - pose[1]) * axis_x
+        jacobian = jnp.stack([axis_x * cos + axis_y * sin, axis_y * cos - axis_x * sin, lever])
+        weighted = weight * jacobian
+        information += (weighted[:, None] * jacobian).sum(-1)
+        gradient += (weighted * residual).sum(-1)
     return PairSystem(information, gradient, weight.sum())
 
 
-def _move(pose: Float[Array, " 3"], delta: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """Applies a small step in the frame of the pose, to first order."""
-    return pose + jnp.append(_matmul(se2.rotation(pose[2]), delta[:2]), delta[2])
-
-
-def _solve(system: PairSystem, pose: Float[Array, " 3"], prior: PairPrior) -> Float[Array, " 3"]:
-    """Computes the Gauss-Newton step of the scans and the prior together."""
-    offset = pose - prior.mean
-    offset = offset.at[2].set(se2.wrap_angle(offset[2]))
-    rotation = jnp.eye(3).at[:2, :2].set(se2.rotation(pose[2]))
-    pull = _matmul(rotation.T, prior.information * offset)
-    belief = _matmul(rotation.T, prior.information[:, None] * rotation)
-    # Damping in proportion to each axis: a pair in a corridor moves along its constrained direction alone.
-    diagonal = jnp.diagonal(system.information)
-    damping = 1e-3 * diagonal + 1e-6 * diagonal.max() + 1e-9
-    return jnp.linalg.solve(system.information + belief + jnp.diag(damping), -system.gradient - pull)
-
-
 @partial(jax.jit, static_argnames="metric")
-def _align(
-    pairs: tuple[PlanarScans, PlanarScans, Array, PairPrior], scales: tuple[Array, Array], *, metric: Metric
-) -> tuple[Float[Array, "p 3"], PairSystem]:
-    """Aligns pairs (source, target, guess, prior) by ICP; `scales` are gate and kernel of each iteration."""
+def _linearise(
+    source: Lines, target: Lines, poses: Float[Array, "p 3"], scale: Float[Array, " 2"], *, metric: Metric
+) -> PairSystem:
+    return jax.vmap(partial(linearise_pair, metric=metric), in_axes=(0, 0, 0, None))(source, target, poses, scale)
 
-    def align(source: PlanarScans, target: PlanarScans, guess: Array, prior: PairPrior) -> tuple[Array, PairSystem]:
-        def iterate(pose: Array, scale: tuple[Array, Array]) -> tuple[Array, None]:
-            system = linearise_pair(source, target, pose, scale, metric=metric)
-            return _move(pose, _solve(system, pose, prior)), None
 
-        pose, _ = jax.lax.scan(iterate, guess, scales)
-        return pose, linearise_pair(source, target, pose, (scales[0][-1], scales[1][-1]), metric=metric)
+def _step(system: PairSystem, poses: Floats, prior: PairPrior | None) -> Floats:
+    """Computes the poses (p, 3) after a Gauss-Newton step of the scans and the prior together."""
+    information, gradient = (np.asarray(x, np.float64) for x in system[:2])
+    # Damping in proportion to each axis: a pair in a corridor moves along its constrained direction alone.
+    diagonal = np.einsum("pii->pi", information)
+    damping = 1e-3 * diagonal + 1e-6 * diagonal.max(axis=1, keepdims=True) + 1e-9
+    matrix = information + damping[:, None] * np.eye(3)
+    turn = np.zeros((len(poses), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = se2.rotation(poses[:, 2]), 1.0
+    if prior is not None:
+        offset = poses - prior.mean
+        offset[:, 2] = se2.wrap_angle(offset[:, 2])
+        weighted = prior.information[..., None] * turn
+        matrix = matrix + np.swapaxes(turn, 1, 2) @ weighted
+        gradient = gradient + np.einsum("pij,pi->pj", weighted, offset)
+    return np.asarray(poses - np.einsum("pij,pj->pi", turn, np.linalg.solve(matrix, gradient[..., None])[..., 0]))
 
-    return jax.vmap(align)(*pairs)
+
+class _Aligned(NamedTuple):
+    """Poses (t, 3) of aligned pairs and their systems, on the host."""
+
+    poses: Floats
+    information: Floats
+    gradient: Floats
+    weight: Floats
+
+
+def _align_batches(
+    pairs: tuple[Lines, Lines], rows: tuple[Indices, Indices], guesses: Floats, prior: PairPrior | None, scales: Floats,
+    *, metric: Metric = "plane",
+) -> _Aligned:  # fmt: skip
+    """Aligns t pairs, rows of the sources and of the targets, in batches of one shape.
+
+    Gate and kernel of the last row of `scales` (i, 2) are those of the result: with one row, no pair moves.
+    """
+    found = _Aligned(*(np.zeros((len(guesses), *size)) for size in ((3,), (3, 3), (3,), ())))
+    batch = _LIVE_DISTANCES // (pairs[0].mask.shape[1] * pairs[1].mask.shape[1])
+    for part, some in batches(len(guesses), 1 << int(np.log2(np.clip(batch, 1, _MAX_BATCH)))):
+        source, target = (
+            Lines(*(jax.device_put(x[end[some]]) for x in lines)) for lines, end in zip(pairs, rows, strict=True)
+        )
+        belief = None if prior is None else PairPrior(*(x[some] for x in prior))
+        poses = guesses[some]
+        for number, scale in enumerate(scales.astype(np.float32)):
+            system = _linearise(source, target, poses.astype(np.float32), scale, metric=metric)
+            if number < len(scales) - 1:
+                poses = _step(system, poses, belief)
+        for kept, values in zip(found, (poses, *system), strict=True):
+            kept[part] = np.asarray(values)[: part.stop - part.start]
+    return found
+
+
+def linearise_pairs(
+    scans: PlanarScans, source: Indices, target: Indices, poses: Floats, scale: Floats, *, stride: int = 1
+) -> tuple[Floats, Floats]:
+    """Linearises p pairs of scans at T_target_source.
+
+    Args:
+        scans: n scans.
+        source: (p,) rows.
+        target: (p,) rows.
+        poses: (p, 3) T_target_source.
+        scale: gate and kernel, as `linearise_pair`.
+        stride: every `stride`-th beam of the sources is used.
+
+    Returns:
+        Information (p, 3, 3) and gradient (p, 3).
+    """
+    lines = scans.lines(stride=stride), scans.lines()
+    found = _align_batches(lines, (source, target), poses, None, np.asarray(scale)[None])
+    return found.information, found.gradient
 
 
 def match_pairs(
@@ -191,25 +257,26 @@ def match_pairs(
     Returns:
         PairMatches of the guess with the best fitness for each pair.
     """
-    num_pairs, num_guesses = guesses.shape[:2]
-    if not num_pairs:
-        return PairMatches(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 3)))
-    prior = prior or PairPrior(np.zeros((num_pairs, 3)), np.zeros((num_pairs, 3)))
     scales = schedule.gates_and_kernels(source.typical_range, source.noise)
-    source, target = source.thin(schedule.source_stride), target.thin(schedule.target_stride)
-    distances = num_guesses * source.mask.shape[1] * target.mask.shape[1]
-    # A power of two whatever the number of pairs: calls of about the same size share one compiled program.
-    batch = 1 << int(np.log2(np.clip(_LIVE_DISTANCES // distances, 1, max(2 * num_pairs - 1, 1))))
-    poses, weight = np.zeros((num_pairs, num_guesses, 3)), np.zeros((num_pairs, num_guesses))
-    information = np.zeros((num_pairs, num_guesses, 3, 3))
-    for part, rows in batches(num_pairs, batch):
-        repeated = np.repeat(rows, num_guesses)
-        belief = PairPrior(*(np.asarray(x, np.float32)[repeated] for x in prior))
-        start = guesses[rows].reshape(-1, 3).astype(np.float32)
-        pairs = source.take(repeated), target.take(repeated), start, belief
-        aligned, system = _align(pairs, scales, metric=metric)
-        for kept, found in ((poses, aligned), (weight, system.weight), (information, system.information)):
-            kept[part] = np.asarray(found).reshape(batch, *kept.shape[1:])[: part.stop - part.start]
-    row, best = np.arange(num_pairs), weight.argmax(axis=1)
-    num_beams = np.minimum(np.asarray(source.is_on_line.sum(1)), np.asarray(target.is_on_line.sum(1)))
-    return PairMatches(poses[row, best], weight[row, best] / np.maximum(num_beams, 1), information[row, best])
+    scales = np.concatenate([scales, scales[-1:]])
+    lines = _thinned(source, schedule.source_beams), _thinned(target, schedule.target_beams)
+    row = np.arange(len(guesses))[:, None]
+    if guesses.shape[1] > 2 * _LEAST_KEPT:
+        rough = _align_guesses(lines, guesses, prior, scales[: _FIRST_ITERATIONS + 1], metric)
+        count = max(_LEAST_KEPT, int(np.ceil(_KEPT_SHARE * guesses.shape[1])))
+        guesses = rough.poses[row, np.argsort(-rough.weight, axis=1, kind="stable")[:, :count]]
+        scales = scales[_FIRST_ITERATIONS:]
+    found = _align_guesses(lines, guesses, prior, scales, metric)
+    best = found.weight.argmax(axis=1)
+    poses, information, _, weight = (x[row[:, 0], best] for x in found)
+    return PairMatches(poses, weight / np.maximum(np.minimum(*(x.mask.sum(1) for x in lines)), 1), information)
+
+
+def _align_guesses(
+    lines: tuple[Lines, Lines], guesses: Floats, prior: PairPrior | None, scales: Floats, metric: Metric
+) -> _Aligned:
+    """Aligns each pair from each of its guesses (p, h, 3); arrays of the result are (p, h, ...)."""
+    rows = np.repeat(np.arange(len(guesses)), guesses.shape[1])
+    belief = None if prior is None else PairPrior(*(np.asarray(x)[rows] for x in prior))
+    found = _align_batches(lines, (rows, rows), guesses.reshape(-1, 3), belief, scales, metric=metric)
+    return _Aligned(*(x.reshape(*guesses.shape[:2], *x.shape[1:]) for x in found))

@@ -13,18 +13,17 @@ The noise is estimated from the scans.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import flax.struct
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from dpmjax.checks import as_mask
 from dpmjax.geometry.sampling import typical_range
+from dpmjax.registration2d.views import Views, make_views
 from dpmjax.sequences import has_angular_order
 from dpmjax.types import AnyArray, ScanSet
 
@@ -38,8 +37,12 @@ Pairs = tuple[Indices, Indices]
 _BEND = 5e-4
 # Approximate number of beams in the median of the noise: a sort of millions would take longer than all other steps.
 _NOISE_SAMPLES = 65536
-# The widest run of beams that competes has 2 ** (this + 1) beams.
-_NUM_DOUBLINGS = 4
+# Numbers of beams of the runs that compete.
+_WIDTHS = (3, 4, 8, 16, 32)
+# Numbers of bearings of the views.
+_NUM_BEARINGS, _NUM_FINE_BEARINGS = 512, 4096
+# Scans that lines are fitted to at a time, few enough for the cache.
+_BLOCK = 256
 
 
 class Tolerances(NamedTuple):
@@ -51,18 +54,35 @@ class Tolerances(NamedTuple):
         jump: least difference of the ranges of two neighbouring beams that end on two surfaces.
     """
 
-    match: float | Float[Array, ""]
-    contradict: float | Float[Array, ""]
-    jump: float | Float[Array, ""]
+    match: float
+    contradict: float
+    jump: float
 
     @classmethod
-    def of(cls, match: float | Float[Array, ""], contradict: float | Float[Array, ""]) -> Tolerances:
+    def of(cls, match: float, contradict: float) -> Tolerances:
         """Makes tolerances with the usual jump."""
         return cls(match, contradict, 10.0 * match)
 
 
-class PlanarScans(flax.struct.PyTreeNode):
-    """Planar scans with a line fitted at every beam, each in its own sensor frame. Made by `planar_scans`.
+class Lines(NamedTuple):
+    """Lines of scans, the input of alignments: arrays (n, b, ...) of NumPy or of JAX.
+
+    Attributes:
+        points: beam end points.
+        normals: unit normals of the fitted lines.
+        centroids: a point on each fitted line.
+        mask: True where the beam lies on a line.
+    """
+
+    points: Float[AnyArray, "*n b 2"]
+    normals: Float[AnyArray, "*n b 2"]
+    centroids: Float[AnyArray, "*n b 2"]
+    mask: Bool[AnyArray, "*n b"]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarScans:
+    """Planar scans with a line fitted at every beam, each in its own sensor frame, on the host. By `planar_scans`.
 
     Attributes:
         points: measured beam end points, in the order of their angles; zero where `mask` is False.
@@ -70,32 +90,37 @@ class PlanarScans(flax.struct.PyTreeNode):
         normals: unit normals of the fitted lines, turned towards the sensor; zero without a line.
         centroids: a point on each fitted line: the mean of its beams.
         is_on_line: True where the beam lies on a straight piece (valid, not a corner, not alone).
-        noises: `noise`, repeated for each scan, so that rows can be taken in traced code.
-        typical_ranges: `typical_range`, repeated likewise.
+        noise: standard deviation of the range noise of all scans together, in the unit of the points.
+        typical_range: range that nine in ten beams on a line stay below, median over the scans: the unit of settings.
         is_ordered: True where neighbours in the array are neighbours in time.
     """
 
-    points: Float[Array, "*n b 2"]
-    mask: Bool[Array, "*n b"]
-    normals: Float[Array, "*n b 2"]
-    centroids: Float[Array, "*n b 2"]
-    is_on_line: Bool[Array, "*n b"]
-    noises: Float[Array, "*n"]
-    typical_ranges: Float[Array, "*n"]
-    is_ordered: bool = flax.struct.field(pytree_node=False, default=True)
+    points: Float[np.ndarray, "n b 2"]
+    mask: Bool[np.ndarray, "n b"]
+    normals: Float[np.ndarray, "n b 2"]
+    centroids: Float[np.ndarray, "n b 2"]
+    is_on_line: Bool[np.ndarray, "n b"]
+    noise: float
+    typical_range: float
+    is_ordered: bool = True
 
     def __len__(self) -> int:
-        return self.mask.shape[0]
+        return len(self.mask)
+
+    @cached_property
+    def views(self) -> Views:
+        """Ranges of the scans by the bearing, made once."""
+        return make_views(self, _NUM_BEARINGS)
+
+    @cached_property
+    def fine_views(self) -> Views:
+        """Views for the comparison of noise-free scans to a thousandth of the typical range, made once."""
+        return make_views(self, _NUM_FINE_BEARINGS)
 
     @property
-    def noise(self) -> float:
-        """Standard deviation of the range noise of all scans together, in the unit of the points."""
-        return float(self.noises.reshape(-1)[0])
-
-    @property
-    def typical_range(self) -> float:
-        """Range that nine in ten beams on a line stay below, median over the scans: the unit of all settings."""
-        return float(self.typical_ranges.reshape(-1)[0])
+    def num_on_line(self) -> Indices:
+        """Number (n,) of beams on a line of each scan, at least 1."""
+        return np.maximum(self.is_on_line.sum(1), 1)
 
     @property
     def tolerances(self) -> Tolerances:
@@ -104,18 +129,16 @@ class PlanarScans(flax.struct.PyTreeNode):
         return Tolerances.of(match=max(0.006 * reach, 0.5 * noise), contradict=max(0.018 * reach, 5.0 * noise))
 
     def take(self, rows: Any) -> PlanarScans:
-        """Returns the scans of these rows (an index, a slice, a list or an array), without an order in time."""
-        index = np.array(rows) if isinstance(rows, list) else rows
-        return replace(jax.tree.map(lambda x: x[index], self), is_ordered=False)
-
-    def thin(self, stride: int) -> PlanarScans:
-        """Returns the same scans with every `stride`-th beam."""
-        kept = (slice(None),) * (self.mask.ndim - 1) + (slice(None, None, stride),)
+        """Returns the scans of these rows (a slice, a list or an array), without an order in time."""
         names = ("points", "mask", "normals", "centroids", "is_on_line")
-        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+        return replace(self, **{name: getattr(self, name)[rows] for name in names}, is_ordered=False)
+
+    def lines(self, rows: Any = slice(None), stride: int = 1) -> Lines:
+        """Returns every `stride`-th beam of the scans of these rows."""
+        arrays = self.points, self.normals, self.centroids, self.is_on_line
+        return Lines(*(x[rows, ::stride] if stride > 1 else x[rows] for x in arrays))
 
 
-@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is_ordered: bool = True) -> PlanarScans:
     """Prepares planar scans for registration: fits lines, measures noise and typical range.
 
@@ -149,11 +172,14 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
         order = np.argsort(angle, axis=1, kind="stable")
         values = np.take_along_axis(values, order[..., None], axis=1)
         valid = np.take_along_axis(valid, order, axis=1)
-    fitted = _fit_lines(ScanSet(points=jnp.asarray(values), mask=jnp.asarray(valid)))
+    # Rounding of float32 coordinates looks like noise of this size, a lower bound of the noise.
+    noise = max(range_noise(values, valid), 1e-6 * float(np.linalg.norm(values, axis=-1).max()))
+    blocks = [slice(first, first + _BLOCK) for first in range(0, len(values), _BLOCK)]
+    fitted = [_fit_lines(values[block], valid[block], noise) for block in blocks]
+    normals, centroids, is_on_line = (np.concatenate(parts) for parts in zip(*fitted, strict=True))
     # Beams on lines end on walls; with all beams, people and clutter would change the unit.
-    is_used = np.asarray(fitted.is_on_line if fitted.is_on_line.any() else fitted.mask)
-    length = jnp.full(len(values), typical_range(np.asarray(fitted.points), is_used), jnp.float32)
-    return replace(fitted, typical_ranges=length, is_ordered=is_ordered)
+    unit = typical_range(values, is_on_line if is_on_line.any() else valid)
+    return PlanarScans(values, valid, normals, centroids, is_on_line, noise, unit, is_ordered)
 
 
 def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
@@ -171,136 +197,69 @@ def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
         yield slice(start, stop), np.resize(np.arange(start, stop), size)
 
 
-def rounded_up(count: int, least: int, largest: int) -> int:
-    """Rounds a number of rows up so that few shapes compile.
-
-    Args:
-        count: number of rows.
-        least: least result, a power of two.
-        largest: largest power of two; beyond it, the result is a multiple of it.
-
-    Returns:
-        The padded number.
-    """
-    if count > largest:
-        return largest * -(-count // largest)
-    return max(least, 1 << max(count - 1, 0).bit_length())
-
-
 def spread_evenly(num_scans: int, count: int) -> Indices:
     """Returns up to `count` evenly spaced rows, the first and the last among them."""
     return np.unique(np.round(np.linspace(0, num_scans - 1, min(num_scans, count))).astype(np.int64))
 
 
-def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-@jax.jit
-def range_noise(scans: ScanSet) -> Float[Array, ""]:
+def range_noise(points: Float[np.ndarray, "n b 2"], mask: Bool[np.ndarray, "n b"]) -> float:
     """Estimates the standard deviation of the range noise from the scans alone.
 
     A beam between two others that hit the same straight wall must end on their chord. The noise follows from the median
     over all beams of the distance along the beam to that chord, which is robust to corners and depth jumps.
 
     Args:
-        scans: organised planar scans (n, b, 2).
+        points: organised planar scans.
+        mask: True for valid beams.
 
     Returns:
         The noise in the unit of the points; about rounding error for noise-free scans, 0 when no beam has two
         neighbours.
     """
-    before, here, after = scans.points[:, :-2], scans.points[:, 1:-1], scans.points[:, 2:]
-    usable = scans.mask[:, :-2] & scans.mask[:, 1:-1] & scans.mask[:, 2:]
-    reach = jnp.linalg.norm(here, axis=-1)
-    direction = here / jnp.where(usable, reach, 1.0)[..., None]
-    chord = after - before
+    usable = mask[:, :-2] & mask[:, 1:-1] & mask[:, 2:]
+    scan, beam = np.nonzero(usable)
+    stride = max(1, len(scan) // _NOISE_SAMPLES)
+    before, here, after = (points[scan[::stride], beam[::stride] + k].astype(np.float64) for k in range(3))
+    reach = np.linalg.norm(here, axis=-1)
+    direction, chord = here / np.maximum(reach, 1e-12)[:, None], after - before
     slope = _cross(direction, chord)
-    along = _cross(before, chord) / jnp.where(jnp.abs(slope) > 1e-9, slope, 1.0)
-    usable &= (jnp.abs(slope) > 1e-9) & (along > 0)
-    deviation = jnp.where(usable, jnp.abs(reach - along), jnp.nan).reshape(-1)
-    deviation = jnp.nanmedian(deviation[:: max(1, deviation.size // _NOISE_SAMPLES)])
+    is_crossed = np.abs(slope) > 1e-9
+    along = _cross(before, chord) / np.where(is_crossed, slope, 1.0)
+    deviation = np.abs(reach - along)[is_crossed & (along > 0)]
     # A mean of two ends has variance 1/2, so the deviation has 3/2 of that of one beam; 1.4826: median to sigma.
-    return jnp.nan_to_num(1.4826 * deviation / jnp.sqrt(1.5))
+    return 1.4826 * float(np.median(deviation)) / 1.5**0.5 if len(deviation) else 0.0
 
 
-@flax.struct.dataclass
-class _Moments:
-    """First and second moments of runs of beams: (..., b) arrays, one run for each first beam."""
-
-    count: float = flax.struct.field(pytree_node=False)
-    mean: Float[Array, "... b 2"]
-    scatter: Float[Array, "... b 2 2"]
-    is_complete: Bool[Array, "... b"]
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def _shift(values: Any, offset: int) -> tuple[Any, Booleans]:
-    """Shifts arrays (n, b, ...) so that beam i is beam i + offset; the mask (b,) is True where this is in the scan."""
-    moved = jax.tree.map(lambda x: jnp.roll(x, -offset, axis=1), values)
-    size = jax.tree.leaves(values)[0].shape[1]
-    beam = np.arange(size) + offset
-    return moved, (beam >= 0) & (beam < size)
-
-
-def _join(first: _Moments, second: _Moments, offset: int) -> _Moments:
-    """Joins the moments of disjoint runs, the second ones `offset` beams later; incomplete outside the scan."""
-    # Stable, because only the difference of the means enters.
-    second, is_inside = _shift(second, offset)
-    count = first.count + second.count
-    step = second.mean - first.mean
-    spread = (first.count * second.count / count) * step[..., :, None] * step[..., None, :]
-    return _Moments(
-        count=count,
-        mean=first.mean + step * (second.count / count),
-        scatter=first.scatter + second.scatter + spread,
-        is_complete=first.is_complete & second.is_complete & is_inside,
-    )
-
-
-def _runs(scans: ScanSet) -> list[_Moments]:
-    """Returns runs of 3, 4, 8, 16 and further powers of two beams, each run joined from two shorter ones."""
-    one = _Moments(1.0, scans.points, jnp.zeros((*scans.mask.shape, 2, 2)), scans.mask)
-    two = _join(one, one, 1)
-    runs = [_join(two, one, 2)]
-    for k in range(1, _NUM_DOUBLINGS + 1):
-        two = _join(two, two, 2**k)
-        runs.append(two)
-    return runs
-
-
-def _line_of(run: _Moments, noise: Float[Array, ""]) -> tuple[Float[Array, "... b 2"], Float[Array, "... b"]]:
-    """Computes the direction of the line through each run, and its error in radians: infinite if not straight."""
-    xx, xy, yy = run.scatter[..., 0, 0], run.scatter[..., 0, 1], run.scatter[..., 1, 1]
-    half_difference, half_sum = 0.5 * (xx - yy), 0.5 * (xx + yy)
-    radius = jnp.sqrt(half_difference**2 + xy**2)
-    along, across = half_sum + radius, jnp.maximum(half_sum - radius, 0.0)
-    angle = 0.5 * jnp.arctan2(xy, half_difference)
-    deviation = jnp.sqrt(across / (run.count - 2.0))
-    length = jnp.sqrt(along / run.count)
-    allowed = noise * (1.0 + 2.0 / run.count**0.5) + _BEND * length
-    is_straight = run.is_complete & (deviation <= allowed) & (along > 4.0 * across)
-    error = jnp.maximum(deviation, noise) / jnp.sqrt(jnp.maximum(along, 1e-20))
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1), jnp.where(is_straight, error, jnp.inf)
-
-
-@jax.jit
-def _fit_lines(scans: ScanSet) -> PlanarScans:
-    """Fits a line at each beam with a straight run; typical ranges are set to 1."""
-    # Rounding of float32 coordinates looks like noise of this size, a lower bound of the noise.
-    reach = jnp.max(jnp.where(scans.mask, jnp.linalg.norm(scans.points, axis=-1), 0.0))
-    noise = jnp.maximum(range_noise(scans), 1e-6 * reach)
-    tangent, centroid = jnp.zeros_like(scans.points), scans.points
-    error = jnp.full(scans.mask.shape, jnp.inf, scans.points.dtype)
-    for run in _runs(scans):
-        width = int(run.count)
-        for start in (0, 1 - width, -(width // 2)):
-            found, is_inside = _shift((*_line_of(run, noise), run.mean), start)
-            better = is_inside & (found[1] < error)
-            error = jnp.where(better, found[1], error)
-            tangent = jnp.where(better[..., None], found[0], tangent)
-            centroid = jnp.where(better[..., None], found[2], centroid)
-    is_on_line = jnp.isfinite(error)
-    normal = jnp.stack([-tangent[..., 1], tangent[..., 0]], -1)
-    towards_sensor = jnp.where((normal * centroid).sum(-1, keepdims=True) > 0, -normal, normal)
-    noises, ones = jnp.full(len(scans.mask), noise), jnp.ones(len(scans.mask))
-    return PlanarScans(scans.points, scans.mask, towards_sensor, centroid, is_on_line, noises, ones)
+def _fit_lines(
+    points: Float[np.ndarray, "n b 2"], mask: Bool[np.ndarray, "n b"], noise: float
+) -> tuple[Float[np.ndarray, "n b 2"], Float[np.ndarray, "n b 2"], Bool[np.ndarray, "n b"]]:
+    """Fits a line at each beam with a straight run; returns normals, centroids, and True for beams on a line."""
+    x, y = np.moveaxis(points.astype(np.float64), -1, 0)
+    sums = [np.cumsum(np.pad(z, ((0, 0), (1, 0))), axis=1) for z in (mask * 1.0, x, y, x * x, x * y, y * y)]
+    error = np.full(mask.shape, np.inf)
+    best = np.stack([np.zeros(mask.shape), x, y])
+    for width in (width for width in _WIDTHS if width <= mask.shape[1]):
+        count, x, y, xx, xy, yy = (z[:, width:] - z[:, :-width] for z in sums)
+        xx, xy, yy = xx - x * x / width, xy - x * y / width, yy - y * y / width
+        half_sum, half_difference = 0.5 * (xx + yy), 0.5 * (xx - yy)
+        radius = np.hypot(half_difference, xy)
+        along, across = half_sum + radius, np.maximum(half_sum - radius, 0.0)
+        deviation, length = np.sqrt(across / (width - 2.0)), np.sqrt(along / width)
+        allowed = noise * (1.0 + 2.0 / width**0.5) + _BEND * length
+        is_straight = (count == width) & (deviation <= allowed) & (along > 4.0 * across)
+        found = np.stack([0.5 * np.arctan2(xy, half_difference), x / width, y / width])
+        off = np.where(is_straight, np.maximum(deviation, noise) / np.sqrt(np.maximum(along, 1e-20)), np.inf)
+        # The run begins at the beam, ends at it, or has it in the middle.
+        for first in (0, width - 1, width // 2):
+            beams = slice(first, first + off.shape[1])
+            is_better = off < error[:, beams]
+            np.copyto(error[:, beams], off, where=is_better)
+            np.copyto(best[:, :, beams], found, where=is_better)
+    is_on_line, centroids = np.isfinite(error), np.moveaxis(best[1:], 0, -1)
+    normals = np.stack([-np.sin(best[0]), np.cos(best[0])], axis=-1) * is_on_line[..., None]
+    normals *= np.where((normals * centroids).sum(-1, keepdims=True) > 0, -1.0, 1.0)
+    return normals.astype(np.float32), centroids.astype(np.float32), is_on_line

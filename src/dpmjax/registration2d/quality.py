@@ -26,7 +26,7 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.pair_search import Hypotheses
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
-from dpmjax.registration2d.range_profiles import RangeProfiles, compare_pairs, make_profiles, pair_scores
+from dpmjax.registration2d.range_profiles import compare_pairs, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, slide_steps
 
 # Maps whose code lengths differ by less than this share are compared by their misfits, because the position of the
@@ -43,8 +43,6 @@ _GRID_TURNS = (0.2, 0.5, 0.9, 1.3)
 _CELL = 0.015
 # Least tolerance of the misfit, in typical ranges; a larger range noise replaces it.
 _LEAST_TOLERANCE = 0.001
-# Number of bearings of the profiles of the misfit, exact to less than that tolerance.
-_NUM_BEARINGS = 4096
 # Number of nearest scans, by position and once more by position and heading, that each scan is compared with.
 _NUM_NEAREST = 12
 # Typical ranges that a radian of heading equals in the second of these searches.
@@ -152,9 +150,9 @@ def map_code_length(scans: PlanarScans, poses: Floats) -> float:
     Returns:
         Code length divided by the number of beams; comparable among poses of one set of scans.
     """
-    points, mask = np.asarray(scans.points), np.asarray(scans.is_on_line)
+    points, mask = scans.points, scans.is_on_line
     if not mask.any():
-        mask = np.asarray(scans.mask)
+        mask = scans.mask
     world = se2.transform_points(poses, points)
     sensors = np.broadcast_to(poses[:, None, :2], world.shape)
     stride = max(1, int(np.ceil(mask.sum() / _MAX_BEAMS)))
@@ -203,8 +201,8 @@ def view_misfit(scans: PlanarScans, poses: Floats) -> float:
     """
     tolerance = max(scans.noise, _LEAST_TOLERANCE * scans.typical_range)
     source, target = near_pairs(poses, scans.typical_range)
-    profiles, relative = make_profiles(scans, _NUM_BEARINGS), se2.relative(poses[target], poses[source])
-    views = compare_pairs(profiles, source, target, relative, match_tolerance=tolerance)
+    tolerances, relative = scans.tolerances._replace(match=tolerance), se2.relative(poses[target], poses[source])
+    views = compare_pairs(scans, source, target, relative, tolerances=tolerances, views=scans.fine_views)
     return 1.0 - float(np.sum(views.matched) / max(float(np.sum(views.visible)), 1.0))
 
 
@@ -261,10 +259,10 @@ def assess_trajectory(
     Returns:
         Assessment.
     """
-    profiles, (source, target) = make_profiles(scans), near_pairs(poses, scans.typical_range)
+    source, target = near_pairs(poses, scans.typical_range)
     relative = np.asarray(se2.relative(poses[target], poses[source]))
-    pairs = Hypotheses(source, target, relative, pair_scores(profiles, source, target, relative))
-    views = compare_pairs(profiles, source, target, relative)
+    pairs = Hypotheses(source, target, relative, pair_scores(scans, source, target, relative))
+    views = compare_pairs(scans, source, target, relative)
     best = np.full(len(poses), -np.inf)
     np.maximum.at(best, np.concatenate([source, target]), np.tile(pairs.scores, 2))
     is_used = (best[source] > _LEAST_SCORE) & (best[target] > _LEAST_SCORE)
@@ -284,8 +282,8 @@ def assess_trajectory(
     if prior is not None:
         lost = np.convolve(is_alone, np.ones(_MAX_ALONE + 1))
         is_whole &= bool(lost.max(initial=0.0) <= _MAX_ALONE)
-    steps = None if prior is None else slide_steps(profiles, se2.relative(poses[:-1], poses[1:]), prior)
-    deviations = _deviations(profiles, len(poses), pairs, steps)
+    steps = None if prior is None else slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
+    deviations = _deviations(scans, len(poses), pairs, steps)
     if steps is not None:
         later = np.arange(1, len(poses))
         is_torn = steps.is_torn & (steps.scores > _MIN_CONNECTION) & ~is_alone[later] & ~is_alone[later - 1]
@@ -315,14 +313,14 @@ def _turns_freely(scans: PlanarScans) -> Bool[np.ndarray, " n"]:
     return (left < _LEAST_TURN) & (num[:, 0, 0] > 1)
 
 
-def _deviations(profiles: RangeProfiles, num_scans: int, pairs: Hypotheses, steps: Slides | None) -> Floats:
+def _deviations(scans: PlanarScans, num_scans: int, pairs: Hypotheses, steps: Slides | None) -> Floats:
     """Returns the standard deviation (n,) of each scan's position relative to the largest fully constrained part.
 
     A pair is closed where its shift along the weak direction is constrained. Other pairs enter with the variance of
     this shift. These variances, and those of the n - 1 steps with a prior, are the resistances of a network. The
     variance of a scan is the resistance between the scan and that part, infinite where they are not connected.
     """
-    slides = slide_steps(profiles, pairs.poses, pairs=(pairs.source, pairs.target))
+    slides = slide_steps(scans, pairs.poses, pairs=(pairs.source, pairs.target))
     is_used = ~slides.is_torn & (pairs.scores > _MIN_CONNECTION)
     if steps is not None:
         # A step between neighbours in time counts with its prior.

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.checks import require_positive
-from dpmjax.geometry import rigid, se2
+from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, PlanarScans, planar_scans
-from dpmjax.registration2d.range_profiles import contradicted_share, make_profiles
+from dpmjax.registration2d.range_profiles import contradicted_share
 from dpmjax.types import ScanSet
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
@@ -171,8 +171,7 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     # In the frame of the chosen scan before: the next chosen scan by odometry, and the error of odometry there.
     T_before_after = se2.relative(odometry[start], odometry[end])
     error = se2.relative(T_before_after, se2.relative(poses[before], poses[after]))
-    part = _share_of_way(odometry, start, end)[:, None] * np.asarray(se2.log(error), np.float64)
-    part = se2.from_matrix(np.asarray(rigid.exp(part), np.float64))
+    part = se2.share_of(error, _share_of_way(odometry, start, end))
     correction = se2.compose(se2.compose(T_before_after, part), se2.inverse(T_before_after))
     T_before_scan = se2.compose(correction, se2.relative(odometry[start], odometry))
     filled = np.asarray(se2.compose(poses[before], T_before_scan), np.float64)
@@ -231,8 +230,8 @@ def _align_with(
     prior = PairPrior(expected, np.broadcast_to((3.0 * scans.noise / spread) ** 2, expected.shape))
     guesses = expected[:, None] + np.outer(turns, [0.0, 0.0, 1.0])
     found = match_pairs(scans.take(source), scans.take(target), guesses, FINE, prior)
-    profiles, rows = make_profiles(scans.take(np.concatenate([source, target]))), np.arange(len(source))
-    contradicted = contradicted_share(profiles, rows, len(source) + rows, found.poses)
+    both, rows = scans.take(np.concatenate([source, target])), np.arange(len(source))
+    contradicted = contradicted_share(both, rows, len(source) + rows, found.poses)
     fits = (found.fitness > _MIN_FITNESS) & (contradicted < _MAX_CONTRADICTED)
     return np.asarray(se2.compose(poses[target], found.poses)), fits
 
@@ -247,6 +246,6 @@ def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
 
 def distinct_rows(scans: PlanarScans) -> Indices:
     """Returns rows of the scans that differ from the scan before; all rows for scans without noise."""
-    is_new = np.asarray((np.abs(np.diff(np.asarray(scans.points), axis=0)) > 0).any(axis=(1, 2)))
+    is_new = (np.diff(scans.points, axis=0) != 0).any(axis=(1, 2))
     is_new = is_new | (scans.noise < _LEAST_NOISE * scans.typical_range)
     return np.flatnonzero(np.append(True, is_new))

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,7 +21,7 @@ from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores
+from dpmjax.registration2d.range_profiles import pair_scores
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps
 from dpmjax.types import ScanSet
@@ -68,7 +67,6 @@ class Refined(NamedTuple):
         return se2.to_matrix(self.poses)
 
 
-@jax.enable_x64(False)  # float32, also where JAX has 64 bits
 @runs_on_host("call icp there")
 def refine(
     scans: PlanarScans | ScanSet | ArrayLike,
@@ -119,7 +117,7 @@ def refine(
         edges = matched_steps(settled, slides)
         candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), config.loops, steps=edges)
         num_loops["loops"] = int((weights > 0.25).sum())
-        fitting_steps = _better_steps(make_profiles(scans), fitting_steps, settled.poses)
+        fitting_steps = _better_steps(scans, fitting_steps, settled.poses)
     aligned: dict[str, Floats] = {}
     for name, candidate in candidates.items():
         on_progress(_LOOPS_SHARE + (_ALIGNED_SHARE - _LOOPS_SHARE) * len(aligned) / len(candidates))
@@ -129,7 +127,7 @@ def refine(
     best = aligned[kept]
     if scans.noise > _MIN_NOISE * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
-        best = adjusted if prior is None else restore_open(make_profiles(scans), best, adjusted, config.radius, prior)
+        best = adjusted if prior is None else restore_open(scans, best, adjusted, config.radius, prior)
         best = best if prior is None else _put_back(scans, fitting_steps, best, config, prior)
     return Refined(best, num_loops[kept])
 
@@ -142,7 +140,7 @@ def _align(
     if prior is None:
         return best
     for _ in range(_NUM_REPAIRS):
-        restored = restore_torn(make_profiles(scans), steps, best, config.radius, prior)
+        restored = restore_torn(scans, steps, best, config.radius, prior)
         if restored is None:
             break
         again = align_all(scans, restored, config.radius, prior)
@@ -154,15 +152,15 @@ def _align(
 
 def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
     """Restores torn steps, unless the code length of the map grows."""
-    restored = restore_torn(make_profiles(scans), steps, poses, config.radius, prior)
+    restored = restore_torn(scans, steps, poses, config.radius, prior)
     is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
     return restored if restored is not None and is_better else poses
 
 
-def _better_steps(profiles: RangeProfiles, steps: Floats, others: Floats) -> Floats:
+def _better_steps(scans: PlanarScans, steps: Floats, others: Floats) -> Floats:
     """Returns, for each of n - 1 steps, the one of two relative poses with the higher score."""
     later = np.arange(1, len(steps) + 1)
-    scores = [pair_scores(profiles, later, later - 1, found) for found in (steps, others)]
+    scores = [pair_scores(scans, later, later - 1, found) for found in (steps, others)]
     return np.where((scores[1] > scores[0])[:, None], others, steps)
 
 
@@ -170,5 +168,5 @@ def _is_sound(scans: PlanarScans, poses: Floats) -> bool:
     """Returns True if all steps fit and are constrained in every direction, so that their chain has little drift."""
     guesses = se2.relative(poses[:-1], poses[1:])[:, None]
     steps = match_pairs(scans.take(slice(1, None)), scans.take(slice(len(poses) - 1)), guesses, FINE)
-    share = steps.weakest_eigenvalue() / np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
+    share = steps.weakest_eigenvalue() / scans.num_on_line[1:]
     return bool((steps.fitness > _MIN_FITNESS).all() and (share > _MIN_EIGENVALUE).all())

@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, search_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, planar_scans, spread_evenly
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles, pair_scores, weak_steps
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans, spread_evenly
+from dpmjax.registration2d.range_profiles import pair_scores, weak_steps
 from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.registration2d.wall_directions import WallDirections
 
@@ -46,7 +45,7 @@ _NUM_BEAMS, _NUM_MEMBERS = 360, 12
 class _Sequence(NamedTuple):
     """A sequence of scans, of which `rows` are registered at `poses` (n, 3)."""
 
-    profiles: RangeProfiles
+    scans: PlanarScans
     poses: Floats
     rows: Indices
     prior: MotionPrior
@@ -55,19 +54,19 @@ class _Sequence(NamedTuple):
 class _Submaps(NamedTuple):
     """Submaps along a sequence: rows of the centres, their parts, and the path length up to them."""
 
-    profiles: RangeProfiles
+    scans: PlanarScans
     centres: Indices
     parts: Indices
     ways: Floats
 
 
 def join_parts(
-    profiles: RangeProfiles, poses: Floats, rows: Indices, prior: MotionPrior, config: CorrelativeConfig
+    scans: PlanarScans, poses: Floats, rows: Indices, prior: MotionPrior, config: CorrelativeConfig
 ) -> Floats:
     """Corrects each weak step to the relative pose that most scans support.
 
     Args:
-        profiles: n scans in time order.
+        scans: n scans in time order.
         poses: (n, 3) T_world_scan.
         rows: (k,) the registered scans.
         prior: motion prior of the registered scans.
@@ -76,8 +75,8 @@ def join_parts(
     Returns:
         (n, 3) poses; unchanged where no step is weak.
     """
-    sequence = _Sequence(profiles, poses.copy(), rows, prior)
-    steps = np.flatnonzero(weak_steps(profiles, poses, rows))
+    sequence = _Sequence(scans, poses.copy(), rows, prior)
+    steps = np.flatnonzero(weak_steps(scans, poses, rows))
     if not len(steps):
         return poses
     _search_across(sequence, steps, config)
@@ -92,24 +91,24 @@ def join_parts(
 
 def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfig) -> None:
     """Corrects each weak step by a search of the submap after it against the submap before it."""
-    poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
+    poses, rows, unit = sequence.poses, sequence.rows, sequence.scans.typical_range
     ends = np.concatenate([[-1], steps, [len(rows) - 1]])
     sides = []
     for number, step in enumerate(steps):
         before, after = rows[ends[number] + 1 : step + 1], rows[step + 1 : ends[number + 2] + 1]
         sides += [side[se2.driven_lengths(poses[side]) <= _SIDE_LENGTH * unit] for side in (before[::-1], after)]
     centres = np.array([side[0] for side in sides])
-    profiles, target = _submap_profiles(sequence, centres, sides), 2 * np.arange(len(steps))
+    submaps, target = _merge_scans(sequence, centres, sides), 2 * np.arange(len(steps))
     config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
     turns = np.abs(se2.wrap_angle(2 * np.pi * np.arange(config.num_turns) / config.num_turns)) < _MAX_TURN
-    found = search_pairs(profiles, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
+    found = search_pairs(submaps, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
     for number, step in enumerate(steps):
         before, after = rows[step], rows[step + 1]
         gap, here = int(after - before), se2.relative(poses[before], poses[after])
         candidates = found.poses[number][np.isfinite(found.scores[number])]
         ways = np.concatenate([[here, sequence.prior.expected(gap)], candidates])
         pairs = np.full(len(ways), 2 * number + 1), np.full(len(ways), 2 * number)
-        score = pair_scores(profiles, *pairs, ways)
+        score = pair_scores(submaps, *pairs, ways)
         score -= _PRIOR_WEIGHT * sequence.prior.surprise(ways, np.full(len(ways), gap))
         _move_behind(sequence, int(step), ways[score.argmax()])
 
@@ -123,7 +122,7 @@ def _move_behind(sequence: _Sequence, step: int, way: Floats) -> None:
 
 def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
     """Makes submaps about a typical range apart, none across a weak step."""
-    poses, rows, unit = sequence.poses, sequence.rows, sequence.profiles.scans.typical_range
+    poses, rows, unit = sequence.poses, sequence.rows, sequence.scans.typical_range
     way = se2.driven_lengths(poses[rows])
     spacing = max(unit, way[-1] / _MAX_SUBMAPS)
     middles, members = [], []
@@ -134,12 +133,12 @@ def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
             middles.append(own[np.abs(way[own] - place).argmin()])
             members.append(rows[own[np.abs(way[own] - way[middles[-1]]) < unit]])
     middle = np.array(middles)
-    profiles = _submap_profiles(sequence, rows[middle], members)
-    return _Submaps(profiles, rows[middle], part[middle], way[middle])
+    submaps = _merge_scans(sequence, rows[middle], members)
+    return _Submaps(submaps, rows[middle], part[middle], way[middle])
 
 
-def _submap_profiles(sequence: _Sequence, centres: Indices, members: list[Indices]) -> RangeProfiles:
-    """Makes a scan with a full field of view of each submap, and its profile.
+def _merge_scans(sequence: _Sequence, centres: Indices, members: list[Indices]) -> PlanarScans:
+    """Makes a scan with a full field of view of each submap.
 
     A scan of a limited field of view shares few beams with the scan before where the robot turns or passes a door.
     Merged scans on either side share more. Of each submap, the nearest hit at each bearing of the centre is kept.
@@ -150,11 +149,11 @@ def _submap_profiles(sequence: _Sequence, centres: Indices, members: list[Indice
         members: rows of the scans of each submap, s arrays.
 
     Returns:
-        Profiles of s scans in no order, with the noise and the typical range of the scans.
+        s scans in no order, with the noise and the typical range of the scans.
     """
-    scans, poses = sequence.profiles.scans, sequence.poses
+    scans, poses = sequence.scans, sequence.poses
     points, mask = np.zeros((len(centres), _NUM_BEAMS, 2), np.float32), np.zeros((len(centres), _NUM_BEAMS), bool)
-    hits, valid = np.asarray(scans.points, np.float64), np.asarray(scans.mask)
+    hits, valid = np.asarray(scans.views.points, np.float64), scans.mask
     for row, (centre, rows) in enumerate(zip(centres, members, strict=True)):
         used = rows[spread_evenly(len(rows), _NUM_MEMBERS)]
         seen = se2.transform_points(se2.relative(poses[centre], poses[used]), hits[used])[valid[used]]
@@ -164,13 +163,12 @@ def _submap_profiles(sequence: _Sequence, centres: Indices, members: list[Indice
         beams, first = np.unique(beam[order], return_index=True)
         points[row, beams], mask[row, beams] = seen[order[first]], True
     made = planar_scans(points, mask, is_ordered=False)
-    ones = jnp.ones(len(centres))
-    return make_profiles(replace(made, noises=scans.noise * ones, typical_ranges=scans.typical_range * ones))
+    return replace(made, noise=scans.noise, typical_range=scans.typical_range)
 
 
 def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfig) -> Hypotheses:
     """Finds relative poses of submaps of different parts that may overlap: the votes."""
-    unit, poses = sequence.profiles.scans.typical_range, sequence.poses[submaps.centres]
+    unit, poses = sequence.scans.typical_range, sequence.poses[submaps.centres]
     later, earlier = np.tril_indices(len(poses), k=-1)
     way, crossed = submaps.ways[later] - submaps.ways[earlier], submaps.parts[later] - submaps.parts[earlier]
     reach = _NEAR * unit + _DRIFT * way + _WEAK_STEP * unit * crossed
@@ -179,16 +177,16 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
     later, earlier = later[keep], earlier[keep]
     if not len(later):
         return Hypotheses(later, earlier, np.zeros((0, 3)), np.zeros(0))
-    turns = WallDirections(submaps.profiles.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
-    found = search_pairs(submaps.profiles, later, earlier, replace(config, num_candidates=4), turns=turns)
+    turns = WallDirections(submaps.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
+    found = search_pairs(submaps.scans, later, earlier, replace(config, num_candidates=4), turns=turns)
     votes = Hypotheses.of(found)
-    votes = votes._replace(scores=pair_scores(submaps.profiles, votes.source, votes.target, votes.poses))
+    votes = votes._replace(scores=pair_scores(submaps.scans, votes.source, votes.target, votes.poses))
     return votes.take(votes.scores > _LEAST_VOTE)
 
 
 def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: Hypotheses, step: int) -> None:
     """Corrects a weak step to the relative pose that most loops across it agree on."""
-    poses, unit, prior = sequence.poses, sequence.profiles.scans.typical_range, sequence.prior
+    poses, unit, prior = sequence.poses, sequence.scans.typical_range, sequence.prior
     before, after = sequence.rows[step], sequence.rows[step + 1]
     here, gap = se2.relative(poses[before], poses[after]), int(after - before)
     votes = votes._replace(source=submaps.centres[votes.source], target=submaps.centres[votes.target])
@@ -202,7 +200,7 @@ def _follow_votes(sequence: _Sequence, submaps: _Submaps, votes: Hypotheses, ste
     distance = np.hypot(off[..., 0], off[..., 1]) / (_AGREEMENT[0] * unit)
     total = np.exp(-0.5 * (distance**2 + (off[..., 2] / _AGREEMENT[1]) ** 2)) @ weight
     total -= _LOOP_PRIOR_WEIGHT * prior.surprise(ways, np.full(len(ways), gap))
-    own = pair_scores(sequence.profiles, np.array([after]), np.array([before]), here[None])
+    own = pair_scores(sequence.scans, np.array([after]), np.array([before]), here[None])
     total[0] += _OWN_WEIGHT * max(0.0, float(own[0]))
     best = int(total.argmax())
     is_far = not se2.is_within(off[0, best], _LEAST_MOVE[0] * unit, _LEAST_MOVE[1])

@@ -22,10 +22,8 @@ from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Planar
 from dpmjax.registration2d.range_profiles import (
     LEAST_VISIBLE,
     WEAK_SCORE,
-    RangeProfiles,
     contradicted_share,
     find_evidence,
-    make_profiles,
     pair_scores,
     weak_steps,
 )
@@ -72,16 +70,16 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
         (n, 3) T_world_scan, the first one zero; an interpolation for scans that fit none of the scans around them.
     """
     rows = distinct_rows(scans)
-    some, profiles = scans.take(rows), make_profiles(scans.take(rows))
+    some = scans.take(rows)
     # The scans between two of these rows are the first of the two.
     matched = PairMatches(*(x[rows[1:] - 1] for x in steps))
-    hypotheses = _find_hypotheses(some, profiles, matched)
+    hypotheses = _find_hypotheses(some, matched)
     is_clear = (hypotheses.source == hypotheses.target + 1) & (hypotheses.scores > _CLEAR_SCORE)
     prior = MotionPrior.of(hypotheses.poses[is_clear], scans.typical_range)
-    poses, is_registered = _Beam(profiles, hypotheses, prior).run()
+    poses, is_registered = _Beam(some, hypotheses, prior).run()
     kept = np.flatnonzero(is_registered)
-    kept = kept[~_is_alone(weak_steps(profiles, poses, kept))]
-    poses = join_parts(profiles, poses, kept, prior, _SEARCH)
+    kept = kept[~_is_alone(weak_steps(some, poses, kept))]
+    poses = join_parts(some, poses, kept, prior, _SEARCH)
     return interpolate(len(scans), rows[kept], poses[kept])
 
 
@@ -91,19 +89,19 @@ def _is_alone(is_weak: Booleans) -> Booleans:
     return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
 
 
-def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMatches) -> Hypotheses:
+def _find_hypotheses(scans: PlanarScans, steps: PairMatches) -> Hypotheses:
     """Returns the steps, and candidates of a search for steps that are not clear."""
     num_scans = len(scans)
     later = np.arange(1, num_scans)
-    scores = pair_scores(profiles, later, later - 1, steps.poses)
+    scores = pair_scores(scans, later, later - 1, steps.poses)
     best = scores.copy()
-    num_beams = np.maximum(np.asarray(scans.is_on_line.sum(1))[1:], 1)
+    num_beams = scans.num_on_line[1:]
     is_clear = (best > _CLEAR_SCORE) & (steps.fitness > _CLEAR_FITNESS)
-    is_clear &= contradicted_share(profiles, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
+    is_clear &= contradicted_share(scans, later, later - 1, steps.poses) < _CLEAR_CONTRADICTION
     is_clear &= steps.weakest_eigenvalue() > _CLEAR_EIGENVALUE * num_beams
     found = [Hypotheses(later, later - 1, steps.poses, scores)]
     usual = MotionPrior.of(steps.poses[is_clear], scans.typical_range)
-    found.append(align_arcs(scans, profiles, later[~is_clear & (scores < _CLEAR_SCORE)], usual))
+    found.append(align_arcs(scans, later[~is_clear & (scores < _CLEAR_SCORE)], usual))
     open_steps, searched = later[~is_clear], set[tuple[int, int]]()
     for span, limit in ((1, np.inf), (_WEAK_SPAN, WEAK_SCORE), (_BAD_SPAN, _BAD_SCORE)):
         open_steps = open_steps[best[open_steps - 1] < limit]
@@ -117,7 +115,7 @@ def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMat
         searched |= pairs
         if not len(new):
             break
-        found.append(_search(scans, profiles, new))
+        found.append(_search(scans, new))
         # A step is as good as the best hypothesis across it.
         for source, target, score in zip(found[-1].source, found[-1].target, found[-1].scores, strict=True):
             across = slice(target, source)
@@ -126,25 +124,24 @@ def _find_hypotheses(scans: PlanarScans, profiles: RangeProfiles, steps: PairMat
     return joined.take(np.lexsort((-joined.scores, joined.source)))
 
 
-def _search(scans: PlanarScans, profiles: RangeProfiles, pairs: Indices) -> Hypotheses:
+def _search(scans: PlanarScans, pairs: Indices) -> Hypotheses:
     """Finds candidates of pairs (p, 2), each aligned by ICP where the score does not fall."""
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(_SEARCH.num_turns) / _SEARCH.num_turns)
     turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
-    source, target, poses, _ = Hypotheses.of(search_pairs(profiles, source, target, _SEARCH, turns=turns))
+    source, target, poses, _ = Hypotheses.of(search_pairs(scans, source, target, _SEARCH, turns=turns))
     aligned = match_pairs(scans.take(source), scans.take(target), poses[:, None], FINE).poses
-    before, after = (pair_scores(profiles, source, target, x) for x in (poses, aligned))
+    before, after = (pair_scores(scans, source, target, x) for x in (poses, aligned))
     is_better = after > before - 0.02
     poses = np.where(is_better[:, None], aligned, poses)
     return Hypotheses(source, target, poses, np.where(is_better, after, before))
 
 
-def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usual: MotionPrior) -> Hypotheses:
+def align_arcs(scans: PlanarScans, later: Indices, usual: MotionPrior) -> Hypotheses:
     """Aligns steps from the arcs of the usual motion.
 
     Args:
         scans: n scans in time order.
-        profiles: of the scans.
         later: (k,) rows of the scans at the ends of the steps.
         usual: motion prior.
 
@@ -155,7 +152,7 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     source, guesses = np.repeat(later, len(arcs)), np.tile(arcs, (len(later), 1))
     poses = match_pairs(scans.take(source), scans.take(source - 1), guesses[:, None], FINE).poses
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
-    scores = pair_scores(profiles, source, source - 1, poses)
+    scores = pair_scores(scans, source, source - 1, poses)
     values = scores - _PRIOR_WEIGHT * usual.surprise(poses, np.ones(len(source), np.int64))
     values, off = values.reshape(len(later), len(arcs)), poses.reshape(len(later), len(arcs), 3)
     rows, kept = np.arange(len(later)), []
@@ -168,8 +165,8 @@ def align_arcs(scans: PlanarScans, profiles: RangeProfiles, later: Indices, usua
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
     # of two scans alone may lie beside the right pose, too: the last placed scans choose.
     near = Candidates(found.source, found.target, found.poses[:, None], found.scores[:, None])
-    shifted = refine_candidates(profiles, near, _SEARCH).poses[:, 0]
-    after = pair_scores(profiles, found.source, found.target, shifted)
+    shifted = refine_candidates(scans, near, _SEARCH).poses[:, 0]
+    after = pair_scores(scans, found.source, found.target, shifted)
     is_better = after > found.scores
     return join_rows(found, found._replace(poses=shifted, scores=after).take(is_better))
 
@@ -199,15 +196,15 @@ def _with_second_start(now: _Sequences) -> _Sequences:
 class _Beam:
     """The beam search over the hypotheses of a sequence."""
 
-    def __init__(self, profiles: RangeProfiles, hypotheses: Hypotheses, prior: MotionPrior) -> None:
-        self.profiles, self.hypotheses, self.prior = profiles, hypotheses, prior
-        self.unit = profiles.scans.typical_range
-        self.starts = np.searchsorted(hypotheses.source, np.arange(len(profiles) + 1))
+    def __init__(self, scans: PlanarScans, hypotheses: Hypotheses, prior: MotionPrior) -> None:
+        self.scans, self.hypotheses, self.prior = scans, hypotheses, prior
+        self.unit = scans.typical_range
+        self.starts = np.searchsorted(hypotheses.source, np.arange(len(scans) + 1))
 
     def run(self) -> tuple[Floats, Booleans]:
         """Runs the search over all scans and returns the best sequence: poses (n, 3), and True for registered scans."""
         now = _Sequences(np.zeros((1, 1, 3)), np.ones((1, 1), bool), np.zeros(1))
-        for scan in range(1, len(self.profiles)):
+        for scan in range(1, len(self.scans)):
             now = self.advance(now, scan)
             if scan == 1:
                 # The first scan may fit no other scan.
@@ -260,7 +257,7 @@ class _Beam:
         relative = np.asarray(se2.relative(placed, np.broadcast_to(pose[:, None], placed.shape)))
         row, column = np.nonzero(is_used)
         pairs = np.full(len(row), scan), first + column
-        evidence, visible = find_evidence(self.profiles, *pairs, relative[row, column])
+        evidence, visible = find_evidence(self.scans, *pairs, relative[row, column])
         # The newest scan has the largest weight, so that overlap with older scans does not favour short motions.
         weight = 1.0 / rank[parent][row, column]
         total, seen = (np.bincount(row, weight * x, len(parent)) for x in (evidence, visible))

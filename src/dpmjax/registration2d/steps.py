@@ -14,15 +14,14 @@ from __future__ import annotations
 import itertools
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges
+from dpmjax.pose_graph.graph import Edges, take_rows
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
-from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, RangeProfiles, find_evidence, make_profiles
+from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, find_evidence
 
 # Standard deviations of a step of poses of unknown accuracy: typical ranges, radians.
 _USUAL_DEVIATION = (0.0225, 0.15)
@@ -232,17 +231,17 @@ class Slides(NamedTuple):
 
 def weak_directions(scans: PlanarScans) -> Float[np.ndarray, "n 2"]:
     """Returns, for each scan, the unit direction of least translation information, in the frame of the scan."""
-    normals = np.where(np.asarray(scans.is_on_line)[..., None], np.asarray(scans.normals, np.float64), 0.0)
+    normals = scans.normals.astype(np.float64)
     return np.asarray(np.linalg.eigh(np.einsum("nbi,nbj->nij", normals, normals))[1][..., 0])
 
 
 def slide_steps(
-    profiles: RangeProfiles, steps: Floats, prior: StepPrior | None = None, *, pairs: Pairs | None = None
+    scans: PlanarScans, steps: Floats, prior: StepPrior | None = None, *, pairs: Pairs | None = None
 ) -> Slides:
     """Computes the posterior of shifts of steps along the weak directions of their targets.
 
     Args:
-        profiles: n scans.
+        scans: n scans.
         steps: (k, 3) T_target_source.
         prior: of these steps; None: the scores alone.
         pairs: (k,) rows of the sources, which are shifted, and of the targets, which they are compared with. None: the
@@ -251,18 +250,16 @@ def slide_steps(
     Returns:
         Slides.
     """
-    unit, count = profiles.scans.typical_range, round(_REACH / _SPACING)
-    source, target = pairs or (np.arange(1, len(profiles)), np.arange(len(profiles) - 1))
-    directions = weak_directions(profiles.scans)[target]
+    unit, count = scans.typical_range, round(_REACH / _SPACING)
+    source, target = pairs or (np.arange(1, len(scans)), np.arange(len(scans) - 1))
+    directions = weak_directions(scans)[target]
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
     places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
     places[..., :2] += shifts[:, None] * directions[:, None]
-    source, target = (np.repeat(rows, len(shifts)) for rows in (source, target))
-    agreement, visible = find_evidence(profiles, source, target, places.reshape(-1, 3))
+    agreement, visible = find_evidence(scans, source, target, places)
     # The number of visible beams must not favour short steps. Where all beams are visible, these scores equal
     # `pair_scores`.
     scores = agreement / (np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE))
-    scores = scores.reshape(len(steps), len(shifts))
     shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
     is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
@@ -331,7 +328,7 @@ def held_steps(slides: Slides, poses: Floats) -> Edges:
     information += np.where(slides.is_torn[:, None, None], across @ np.diag(firm**-2.0) @ across, 0.0)
     rows = np.flatnonzero(slides.is_torn | slides.is_open)
     held = steps._replace(measurements=slides.moved(steps.measurements), information=information)
-    return jax.tree.map(lambda x: x[rows], held)
+    return take_rows(held, rows)
 
 
 def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> tuple[PairMatches, Slides]:
@@ -345,8 +342,7 @@ def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> 
     Returns:
         The matches after the shift and alignment, and the Slides of these.
     """
-    profiles = make_profiles(scans)
-    slides = slide_steps(profiles, matches.poses, prior)
+    slides = slide_steps(scans, matches.poses, prior)
     rows = np.flatnonzero(slides.is_torn | slides.is_open)
     if not len(rows):
         return matches, slides
@@ -357,4 +353,4 @@ def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> 
     settled = PairMatches(*(x.copy() for x in matches))
     for kept, new in zip(settled, found, strict=True):
         kept[rows] = new
-    return settled, slide_steps(profiles, settled.poses, prior)
+    return settled, slide_steps(scans, settled.poses, prior)
