@@ -7,7 +7,6 @@ because its noise is parallel to the wall. The lines are eliminated, so each res
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,9 +19,6 @@ from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans
-
-_einsum = partial(jnp.einsum, precision="highest")
-
 
 # The nearest beam of a neighbour, and this number of beams to either side of it, may be part of the line.
 _NUM_BESIDE = 2
@@ -43,33 +39,39 @@ _NUM_ROUNDS, _NUM_ITERATIONS = 2, 2
 
 
 class _Beams(NamedTuple):
-    """Beams of the neighbours that may lie on the line of each beam of a scan, in its frame: (b, s, k)."""
+    """Beams of the neighbours that may lie on the line of each beam of a scan, in its frame: (b, s, k).
 
-    offsets: Float[Array, "b s k 2"]
-    slant: Float[Array, "b s k 2"]
-    levers: Float[Array, "b s k 2"]
+    Attributes:
+        x: position relative to the beam.
+        y: the same.
+        along_x: position relative to the sensor that measured it.
+        along_y: the same.
+        mask: True for beams near the beam, on the same side of a surface.
+    """
+
+    x: Float[Array, "b s k"]
+    y: Float[Array, "b s k"]
+    along_x: Float[Array, "b s k"]
+    along_y: Float[Array, "b s k"]
     mask: Bool[Array, "b s k"]
 
 
-class _Lines(NamedTuple):
+class _Fit(NamedTuple):
     """The line of each beam (b).
 
     Attributes:
-        normals: of the lines, on the same side as those of the beams.
+        x: normal of the line, on the same side as that of the beam.
+        y: the same.
         shares: weights of the surrounding beams; their weighted sum is the point where the beam meets the line.
         variance: of this point across the line.
         is_line: True where the line is straight and has enough beams.
     """
 
-    normals: Float[Array, "b 2"]
+    x: Float[Array, " b"]
+    y: Float[Array, " b"]
     shares: Float[Array, "b s k"]
     variance: Float[Array, " b"]
     is_line: Bool[Array, " b"]
-
-
-def _levers(points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-    """Computes the derivatives of points with respect to the heading of their scan."""
-    return jnp.stack([-points[..., 1], points[..., 0]], -1)
 
 
 @jax.jit
@@ -81,53 +83,55 @@ def _find_nearest(own: Lines, others: Lines, poses: Float[Array, "s 3"]) -> Int[
 
 def _gather_beams(own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Array, noise: Array) -> _Beams:
     """Gathers, for each beam, the beams of nearby scans that hit the same side of the same surface."""
-    turn = partial(_einsum, "sij,skj->ski", se2.rotation(poses[:, 2]))
     points = se2.transform_points(poses, others.points)
+    normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), others.normals)
     index = nearest[..., None] + jnp.arange(-_NUM_BESIDE, _NUM_BESIDE + 1)
     is_inside = (index >= 0) & (index < points.shape[1])
-    index = jnp.clip(index, 0, points.shape[1] - 1)
-    scan = jnp.arange(points.shape[0])[:, None]
-    reach = jnp.maximum(jnp.linalg.norm(others.points, axis=-1, keepdims=True), 1e-12)
-    offsets = points[scan, index] - own.points[:, None, None]
-    squared = (offsets**2).sum(-1)
-    faces_same_way = _einsum("bi,bski->bsk", own.normals, turn(others.normals)[scan, index]) > 0.8
+    index, scan = jnp.clip(index, 0, points.shape[1] - 1), jnp.arange(len(points))[:, None]
+    found_x, found_y = points[..., 0][scan, index], points[..., 1][scan, index]
+    x, y = found_x - own.points[:, :1, None], found_y - own.points[:, 1:, None]
+    squared = x**2 + y**2
+    cosine = own.normals[:, :1, None] * normals[..., 0][scan, index]
+    cosine += own.normals[:, 1:, None] * normals[..., 1][scan, index]
     # The beam itself is left out.
     is_near = (squared < (_WINDOW * noise) ** 2) & (squared > (1e-3 * noise) ** 2)
-    slant, levers = (turn(x)[scan, index] for x in (others.points / reach, _levers(others.points)))
-    mask = others.mask[scan, index] & is_inside & is_near & faces_same_way
-    return _Beams(offsets, slant, levers, mask)
+    mask = others.mask[scan, index] & is_inside & is_near & (cosine > 0.8)
+    return _Beams(x, y, found_x - poses[:, :1], found_y - poses[:, 1:2], mask)
 
 
-def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""]) -> _Lines:
+def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, ""]) -> _Fit:
     """Fits a weighted straight line to the beams around each beam, from the initial `normals`."""
-    floor = (_ROUGHNESS * noise) ** 2
-    taper = jnp.maximum(1.0 - (beams.offsets**2).sum(-1) / (_WINDOW * noise) ** 2, 0.0) ** 2
+    normal_x, normal_y = normals.T
+    reach = jnp.maximum(jnp.hypot(beams.along_x, beams.along_y), 1e-12)
+    taper = jnp.maximum(1.0 - (beams.x**2 + beams.y**2) / (_WINDOW * noise) ** 2, 0.0) ** 2
     for _ in range(2):
-        across = _einsum("bi,bski->bsk", normals, beams.offsets)
-        slant = _einsum("bi,bski->bsk", normals, beams.slant)
+        across = _wide(normal_x) * beams.x + _wide(normal_y) * beams.y
+        slant = (_wide(normal_x) * beams.along_x + _wide(normal_y) * beams.along_y) / reach
         counts = beams.mask & (jnp.abs(across) < _GATE * noise)
-        certainty = 1.0 / (noise**2 * slant**2 + floor)
-        weight = jnp.where(counts, taper * certainty, 0.0)
+        weight = jnp.where(counts, taper / (noise**2 * slant**2 + (_ROUGHNESS * noise) ** 2), 0.0)
         total = jnp.maximum(weight.sum((1, 2)), 1e-12)
-        mean = _einsum("bsk,bski->bi", weight, beams.offsets) / total[:, None]
-        centred = beams.offsets - mean[:, None, None]
-        spread = _einsum("bsk,bski,bskj->bij", weight, centred, centred) / total[:, None, None]
-        difference = 0.5 * (spread[:, 0, 0] - spread[:, 1, 1])
-        radius = jnp.hypot(difference, spread[:, 0, 1])
-        angle = 0.5 * jnp.arctan2(spread[:, 0, 1], difference)
-        fitted = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
-        fitted = jnp.where((fitted * normals).sum(-1, keepdims=True) < 0, -fitted, fitted)
-        half_sum = 0.5 * (spread[:, 0, 0] + spread[:, 1, 1])
+        mean_x, mean_y = ((weight * z).sum((1, 2)) / total for z in (beams.x, beams.y))
+        x, y = beams.x - _wide(mean_x), beams.y - _wide(mean_y)
+        xx, xy, yy = ((weight * z).sum((1, 2)) / total for z in (x * x, x * y, y * y))
+        difference, half_sum = 0.5 * (xx - yy), 0.5 * (xx + yy)
+        radius, angle = jnp.hypot(difference, xy), 0.5 * jnp.arctan2(xy, difference)
+        fitted_x, fitted_y = -jnp.sin(angle), jnp.cos(angle)
+        sign = jnp.where(fitted_x * normal_x + fitted_y * normal_y < 0, -1.0, 1.0)
         is_slender = half_sum + radius > _MIN_SLENDERNESS * (half_sum - radius)
-        normals = jnp.where(is_slender[:, None], fitted, normals)
-    stray = (weight * _einsum("bi,bski->bsk", normals, centred) ** 2).sum((1, 2))
+        normal_x = jnp.where(is_slender, sign * fitted_x, normal_x)
+        normal_y = jnp.where(is_slender, sign * fitted_y, normal_y)
+    stray = (weight * (_wide(normal_x) * x + _wide(normal_y) * y) ** 2).sum((1, 2))
     chi2 = stray / jnp.maximum(jnp.where(counts, taper, 0.0).sum((1, 2)), 1e-12)
-    along = _einsum("bi,bski->bsk", _levers(normals), centred)
-    here = -(_levers(normals) * mean).sum(-1)
+    along = _wide(normal_x) * y - _wide(normal_y) * x
+    here = normal_y * mean_x - normal_x * mean_y
     length = jnp.maximum((weight * along**2).sum((1, 2)), 1e-12)
-    shares = weight * (1.0 / total[:, None, None] + along * (here / length)[:, None, None])
+    shares = weight * (_wide(1.0 / total) + along * _wide(here / length))
     is_line = is_slender & (chi2 < _MAX_CHI2) & (counts.sum((1, 2)) > 5)
-    return _Lines(normals, shares, 1.0 / total + here**2 / length, is_line)
+    return _Fit(normal_x, normal_y, shares, 1.0 / total + here**2 / length, is_line)
+
+
+def _wide(values: Float[Array, " b"]) -> Float[Array, "b 1 1"]:
+    return values[:, None, None]
 
 
 @jax.jit
@@ -137,19 +141,23 @@ def _linearise(
     """Computes J^T W J and J^T W r of one scan; the first of `others` is the scan itself, at pose zero."""
     beams = _gather_beams(own, others, nearest, poses, noise)
     lines = _fit_lines(beams, own.normals, noise)
-    normals = lines.normals
-    residual = -_einsum("bsk,bski,bi->b", lines.shares, beams.offsets, normals)
-    squared_slant = (normals * own.points).sum(-1) ** 2 / jnp.maximum((own.points**2).sum(-1), 1e-12)
+    (x, y), (own_x, own_y) = (lines.x[:, None], lines.y[:, None]), own.points.T
+    across = _wide(lines.x) * beams.x + _wide(lines.y) * beams.y
+    residual = -(lines.shares * across).sum((1, 2))
+    slant = lines.x * own_x + lines.y * own_y
+    squared_slant = slant**2 / jnp.maximum(own_x**2 + own_y**2, 1e-12)
     variance = noise**2 * (squared_slant + _ROUGHNESS**2) + lines.variance
     robust = 1.0 / (1.0 + residual**2 / (_OUTLIER**2 * variance)) ** 2
     weight = jnp.where(own.mask & lines.is_line, robust / variance, 0.0)
-    rotation = se2.rotation(poses[:, 2])
-    shift = lines.shares.sum(2)[..., None] * _einsum("bi,sij->bsj", normals, rotation)
-    turn = _einsum("bsk,bski,bi->bs", lines.shares, beams.levers, normals)
-    own_part = jnp.concatenate([normals, (normals * _levers(own.points)).sum(-1, keepdims=True)], -1)
-    jacobian = (-jnp.concatenate([shift, turn[..., None]], -1)).at[:, 0].add(own_part)
-    information = _einsum("b,bsi,btj->stij", weight, jacobian, jacobian)
-    return information, _einsum("b,b,bsi->si", weight, residual, jacobian)
+    cos, sin, share = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2]), lines.shares.sum(2)
+    turn = (lines.shares * (_wide(lines.y) * beams.along_x - _wide(lines.x) * beams.along_y)).sum(2)
+    jacobian = -jnp.stack([share * (x * cos + y * sin), share * (y * cos - x * sin), turn], -1)
+    jacobian = jacobian.at[:, 0].add(jnp.stack([lines.x, lines.y, lines.y * own_x - lines.x * own_y], -1))
+    flat = jacobian.reshape(len(jacobian), -1)
+    information = jnp.matmul(flat.T, weight[:, None] * flat, precision="highest")
+    gradient = jnp.matmul(flat.T, weight * residual, precision="highest")
+    size = jacobian.shape[1]
+    return information.reshape(size, 3, size, 3).swapaxes(1, 2), gradient.reshape(size, 3)
 
 
 def _choose_around(poses: Floats, radius: float) -> Indices:

@@ -38,6 +38,8 @@ BEAM_DEVIATION, _STEP_DEVIATION = 0.03, (0.045, 0.15)
 _FREEDOM = 3.0
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
+# Every `_STRIDE`-th shift is scored first; the others are scored too, unless all are worse by this number of nats.
+_STRIDE, _CLEAR_GAIN = 3, 8.0
 # Number of interpolated scores for each shift, because a prior may be sharper than the spacing.
 _FINER = 8
 # Difference of scores that divides the probability of a shift by e.
@@ -256,10 +258,8 @@ def slide_steps(
     shifts = np.asarray(_SPACING * unit * np.arange(-count, count + 1), np.float64)
     places = np.repeat(np.asarray(steps, np.float64)[:, None], len(shifts), axis=1)
     places[..., :2] += shifts[:, None] * directions[:, None]
-    agreement, visible = find_evidence(scans, source, target, places)
-    # The number of visible beams must not favour short steps. Where all beams are visible, these scores equal
-    # `pair_scores`.
-    scores = agreement / (np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE))
+    costs = np.zeros(places.shape[:2]) if prior is None else prior.costs(places)
+    scores = _slide_scores(scans, (source, target), places, costs)
     shifts, scores, count = _interpolated(shifts), _interpolated(scores), _FINER * count
     nats = scores / _SCORE_SCALE
     is_open = _spread(nats, shifts)[1] > _OPEN_DEVIATION * unit
@@ -275,6 +275,33 @@ def slide_steps(
     shift = np.where(is_open, means, np.where(is_torn, shifts[best], 0.0))
     nearest = np.abs(shifts - shift[:, None]).argmin(axis=1)
     return Slides(directions, shift, deviations, is_torn, is_open, scores[row, nearest], unit)
+
+
+def _slide_scores(scans: PlanarScans, pairs: Pairs, places: Floats, costs: Floats) -> Floats:
+    """Computes scores (k, s) of pairs at shifted poses; interpolates where few of these show that no shift fits.
+
+    Args:
+        scans: n scans.
+        pairs: sources and targets.
+        places: (k, s, 3) poses; the one in the middle has no shift.
+        costs: (k, s) of the prior, nats.
+    """
+    column, middle = np.arange(places.shape[1]), places.shape[1] // 2
+    is_first, scores = (column - middle) % _STRIDE == 0, np.zeros(places.shape[:2])
+    for is_scored, rows in ((is_first, slice(None)), (~is_first, None)):
+        if rows is None:
+            nats = np.stack([scores, scores - _SCORE_SCALE * costs]) / _SCORE_SCALE
+            others = np.where(is_first & (column != middle), nats, -np.inf).max(axis=2)
+            rows = np.flatnonzero((others > nats[..., middle] - _CLEAR_GAIN).any(axis=0))
+        agreement, visible = find_evidence(scans, pairs[0][rows], pairs[1][rows], places[rows][:, is_scored])
+        # The number of visible beams must not favour short steps. Where all beams are visible, these scores equal
+        # `pair_scores`.
+        found = np.zeros((len(agreement), len(column)))
+        found[:, is_scored] = agreement / (np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE))
+        scores[rows] += found
+    for row in np.setdiff1d(np.arange(len(scores)), rows):
+        scores[row] = np.interp(column, column[is_first], scores[row, is_first])
+    return scores
 
 
 def _interpolated(values: Floats) -> Floats:
