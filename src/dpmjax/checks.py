@@ -168,20 +168,22 @@ def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
         ValueError: the shape is another one, or a valid beam of a ScanSet is not finite.
     """
     try:
-        points: Any = value.points if isinstance(value, ScanSet) else np.asarray(value, np.float32)
+        points: Any = value.points if isinstance(value, ScanSet) else value
+        points = np.asarray(points, np.float32)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers (n, b, 2), got {type(value).__name__}") from error
     if points.ndim != 3 or points.shape[-1] != 2:
         raise ValueError(f"{name}: expected shape (n, b, 2), got {points.shape}")
     if isinstance(value, ScanSet):
-        mask = jnp.asarray(value.mask, bool)
+        mask = np.asarray(value.mask, bool)
     else:
-        mask = jnp.asarray(np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0))
+        mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)
     require_shape(f"mask of {name}", mask, points.shape[:2])
-    clean = jnp.where(mask[..., None], jnp.asarray(points, jnp.float32), 0.0)
-    if not bool(jnp.isfinite(clean).all()):
+    # On the host, because each operation would compile a program for each number of scans.
+    clean = np.where(mask[..., None], points, np.float32(0.0))
+    if not np.isfinite(clean).all():
         raise ValueError(f"{name}: expected finite coordinates where the mask is True")
-    return ScanSet(points=clean, mask=mask)
+    return ScanSet(points=jax.device_put(clean), mask=jax.device_put(mask))
 
 
 def require_shape(name: str, array: AnyArray, shape: tuple[int, ...]) -> None:

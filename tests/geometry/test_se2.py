@@ -113,14 +113,9 @@ def test_wrap_angle_has_slope_one_everywhere() -> None:
     np.testing.assert_array_equal(jax.vmap(jax.grad(se2.wrap_angle))(angle), np.ones(5))
 
 
-@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-2, 1.0])
-def test_log_undoes_exp(scale: float, float64) -> None:
-    twists = scale * np.random.default_rng(6).uniform(-3, 3, (5, 3))
-    np.testing.assert_allclose(se2.log(np.asarray(se2.from_matrix(rigid.exp(twists)))), twists, **DOUBLE)
-
-
-@pytest.mark.parametrize("turn", [1e-5, 1e-2, 0.2, 0.5, 2.5])
-def test_log_keeps_its_digits_at_any_turn(turn: float) -> None:
-    twist = np.array([20, -30, turn], np.float32)
-    pose = se2.from_matrix(rigid.exp(twist))
-    np.testing.assert_allclose(se2.log(pose), twist, rtol=1e-6, atol=1e-5)
+@pytest.mark.parametrize("turn", [0.0, 1e-5, 0.5, -3.0])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_share_of_a_motion_is_that_of_its_twist(turn: float, share: float) -> None:
+    twist = np.array([20.0, -30.0, turn], np.float32)
+    whole, part = (np.asarray(se2.from_matrix(rigid.exp(np.float32(x) * twist)), np.float64) for x in (1.0, share))
+    np.testing.assert_allclose(se2.share_of(whole, share), part, rtol=1e-5, atol=1e-5)

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from unittest.mock import Mock
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration2d import GlobalConfig, nearest_tour, planar_scans, refine, register_globally
+from dpmjax.registration2d import GlobalConfig, PlanarScans, nearest_tour, planar_scans, refine, register_globally
 from dpmjax.registration2d.global_registration import find_unregistered
 from dpmjax.registration2d.map_assembly import add_up, agreeing_edges, assemble, weakest_cuts
 from dpmjax.registration2d.pair_search import (
     Candidates,
     CorrelativeConfig,
-    _spectra,
+    apart,
     search_pairs,
 )
-from dpmjax.registration2d.range_profiles import RangeProfiles, make_profiles
 from dpmjax.simulation import simulate_sequence
 from tests.registration2d.conftest import ate, scans_of
 
@@ -42,14 +39,14 @@ def truth(sequence) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def profiles(sequence) -> RangeProfiles:
-    return make_profiles(scans_of(sequence))
+def scans(sequence) -> PlanarScans:
+    return scans_of(sequence)
 
 
 @pytest.fixture(scope="module")
-def found(profiles) -> Candidates:
+def found(scans) -> Candidates:
     """All pairs, searched."""
-    return search_pairs(profiles, *np.tril_indices(len(profiles), k=-1), COARSE)
+    return search_pairs(scans, *np.tril_indices(len(scans), k=-1), COARSE)
 
 
 def test_support_counts_by_rank_and_contradictions_in_full() -> None:
@@ -63,7 +60,7 @@ def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
     # Scan 0, and scan 1 turned by each yaw: all are searched at once.
     yaws = np.array([0.0, 1.3, 3.1, -2.0])
     turned = [se2.transform_points(np.array([0.0, 0.0, -yaw]), sequence.points[1]) for yaw in yaws]
-    some = make_profiles(planar_scans(np.stack([sequence.points[0], *turned]), sequence.mask[[0, 1, 1, 1, 1]]))
+    some = planar_scans(np.stack([sequence.points[0], *turned]), sequence.mask[[0, 1, 1, 1, 1]])
     found = search_pairs(some, np.arange(1, 5), np.zeros(4, int), COARSE)
     expected = se2.relative(truth[0], truth[1] + yaws[:, None] * [0.0, 0.0, 1.0])
     error = se2.relative(expected, found.poses[:, 0])
@@ -73,33 +70,31 @@ def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
 
 
 @pytest.mark.slow
-def test_only_the_given_turns_are_searched(profiles) -> None:
+def test_only_the_given_turns_are_searched(scans) -> None:
     turns = np.zeros((1, COARSE.num_turns), bool)
     turns[0, 18] = True
-    found = search_pairs(profiles, np.array([1]), np.array([0]), COARSE, turns=turns)
+    found = search_pairs(scans, np.array([1]), np.array([0]), COARSE, turns=turns)
     headings = found.poses[0, np.isfinite(found.scores[0]), 2]
     # Refinement moves a heading by less than a turn.
     np.testing.assert_allclose(headings, np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
 
 
-def test_a_program_has_one_fourier_transform(walk_scans, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Two at once may wait for each other's threads for ever (CPU, JAX 0.11).
-    transform = Mock(wraps=jnp.fft.rfft2)
-    monkeypatch.setattr(jnp.fft, "rfft2", transform)
-    _spectra.__wrapped__(make_profiles(walk_scans), jnp.zeros(()), jnp.ones(()), COARSE)
-    assert transform.call_count == 1
+def test_selected_poses_lie_apart_the_best_first() -> None:
+    poses = np.array([[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2 * np.pi]]])
+    chosen = apart(poses, np.array([[1.0, 2.0, 3.0, -np.inf, 0.5]]), (0.5, 0.5), 4)
+    np.testing.assert_array_equal(chosen, [[2, 1, -1, -1]])
 
 
 @pytest.mark.slow
-def test_assembly_rejects_a_wrong_pair(sequence, profiles, found) -> None:
+def test_assembly_rejects_a_wrong_pair(sequence, scans, found) -> None:
     wrong = int(np.flatnonzero((found.source == 6) & (found.target == 0))[0])
     poses, scores = found.poses.copy(), found.scores.copy()
     poses[wrong, 0] = [5.0, -20.0, 2.0]
     scores[wrong, 0] = 0.9 * scores.max()
     candidates = found._replace(poses=poses, scores=scores)
-    assembled = assemble(profiles, candidates, is_ordered=False)
+    assembled = assemble(scans, candidates, is_ordered=False)
     assert ate(assembled, sequence.reference_poses) < 4.0
-    edges = agreeing_edges(assembled, candidates, profiles)
+    edges = agreeing_edges(assembled, candidates, scans)
     assert not ((edges.source == 6) & (edges.target == 0)).any()
 
 
@@ -155,10 +150,10 @@ def test_refinement_without_order_is_exact(truth) -> None:
 
 @pytest.mark.slow
 def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
-    profiles, poses = make_profiles(walk_scans), np.array(walk.reference_poses)
-    assert len(find_unregistered(profiles, poses)) == 0
+    poses = np.array(walk.reference_poses)
+    assert len(find_unregistered(walk_scans, poses)) == 0
     poses[[9, 10], :2] += 5000.0
-    assert set(find_unregistered(profiles, poses)) == {9, 10}
+    assert set(find_unregistered(walk_scans, poses)) == {9, 10}
 
 
 def test_a_tour_goes_from_each_pose_to_the_nearest_left() -> None:

@@ -12,7 +12,6 @@ from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import GlobalConfig, PlanarScans, incremental_icp, planar_scans, register_globally
 from dpmjax.registration2d.pair_search import CorrelativeConfig, search_pairs
-from dpmjax.registration2d.range_profiles import make_profiles
 from dpmjax.simulation import simulate_sequence
 from tests.registration2d.conftest import ate, scans_of
 
@@ -74,13 +73,13 @@ def test_a_robot_may_go_out_and_back_between_two_keyframes(there, monkeypatch: p
 
 @pytest.mark.slow
 def test_pairs_in_batches_are_those_of_one_search(there, monkeypatch: pytest.MonkeyPatch) -> None:
-    profiles, source, target = make_profiles(scans_of(there)), np.array([5, 1, 3, 1, 2]), np.array([4, 0, 2, 3, 1])
+    scans, source, target = scans_of(there), np.array([5, 1, 3, 1, 2]), np.array([4, 0, 2, 3, 1])
     turns = np.zeros((5, COARSE.num_turns), bool)
     turns[:, [0, 1, -1]] = True
     search = replace(COARSE, num_levels=1)
-    whole = search_pairs(profiles, source, target, search, turns=turns)
+    whole = search_pairs(scans, source, target, search, turns=turns)
     monkeypatch.setattr(importlib.import_module("dpmjax.registration2d.pair_search"), "_SEARCH_BATCH", 2)
-    batched = search_pairs(profiles, source, target, search, turns=turns)
+    batched = search_pairs(scans, source, target, search, turns=turns)
     np.testing.assert_array_equal(batched.source, source)
     np.testing.assert_array_equal(whole.target, target)
     np.testing.assert_allclose(batched.poses[:, 0], whole.poses[:, 0], atol=1e-4)

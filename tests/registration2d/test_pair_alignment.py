@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,12 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.registration2d import PlanarScans
 from dpmjax.registration2d.pair_alignment import FINE, PairPrior, linearise_pair, match_pairs
+from dpmjax.registration2d.planar_scans import Lines
 
 GATE, KERNEL = 20.0, 4.0
 
 
-def residuals(
-    source: PlanarScans, target: PlanarScans, pose: np.ndarray, nearest: np.ndarray, metric: str
-) -> np.ndarray:
+def residuals(source: Lines, target: Lines, pose: np.ndarray, nearest: np.ndarray, metric: str) -> np.ndarray:
     """Slow float64 distances of fixed pairs, (b, k)."""
     points = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
     if metric == "point":
@@ -25,20 +26,24 @@ def residuals(
 
 @pytest.mark.parametrize("metric", ["point", "plane"])
 def test_system_is_that_of_finite_differences(walk, walk_scans, metric: str) -> None:
-    source, target = (jax.tree.map(lambda x, row=row: x[row], walk_scans) for row in (1, 0))
+    source, target = (walk_scans.lines(row) for row in (1, 0))
     pose = se2.relative(walk.reference_poses[0], walk.reference_poses[1]) + np.array([1.0, -0.7, 0.02])
     with jax.default_matmul_precision("highest"):
         system = linearise_pair(
-            source, target, jnp.asarray(pose, jnp.float32), (jnp.float32(GATE), jnp.float32(KERNEL)), metric=metric
+            Lines(*map(jnp.asarray, source)),
+            Lines(*map(jnp.asarray, target)),
+            jnp.asarray(pose, jnp.float32),
+            jnp.asarray([GATE, KERNEL]),
+            metric=metric,
         )
     moved = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
     apart = np.linalg.norm(moved[:, None] - np.asarray(target.points, np.float64), axis=-1)
-    apart[:, ~np.asarray(target.is_on_line)] = np.inf
+    apart[:, ~np.asarray(target.mask)] = np.inf
     nearest = apart.argmin(-1)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turned = np.asarray(source.normals, np.float64) @ np.array([[c, s], [-s, c]])
     facing = (turned * np.asarray(target.normals)[nearest]).sum(-1) > 0.7
-    counts = np.asarray(source.is_on_line) & (apart.min(-1) < GATE) & facing
+    counts = np.asarray(source.mask) & (apart.min(-1) < GATE) & facing
     here = residuals(source, target, pose, nearest, metric)
     step = 1e-6
     jacobian = np.stack(
@@ -65,10 +70,10 @@ def corridor(shift: float) -> PlanarScans:
     """Two parallel walls, seen from `shift` along them."""
     x = np.tile(np.linspace(-50, 50, 60), 2)
     y = np.repeat([-10.0, 10.0], 60)
-    points = jnp.asarray(np.stack([x - shift, y], -1), jnp.float32)[None]
-    normals = jnp.asarray(np.stack([0 * x, -np.sign(y)], -1), jnp.float32)[None]
-    mask = jnp.ones((1, 120), bool)
-    return PlanarScans(points, mask, normals, points, mask, jnp.zeros(1), jnp.full(1, 133.0))
+    points = np.stack([x - shift, y], -1).astype(np.float32)[None]
+    normals = np.stack([0 * x, -np.sign(y)], -1).astype(np.float32)[None]
+    mask = np.ones((1, 120), bool)
+    return PlanarScans(points, mask, normals, points, mask, noise=0.0, typical_range=133.0)
 
 
 def test_prior_decides_along_a_corridor_and_the_walls_across_it() -> None:
@@ -100,7 +105,7 @@ def test_no_pair_is_no_match(walk_scans) -> None:
 
 @pytest.mark.slow
 def test_scans_without_a_beam_stay_at_their_guess(walk_scans) -> None:
-    one = walk_scans.replace(is_on_line=jnp.zeros_like(walk_scans.mask)).take([0])
+    one = replace(walk_scans, is_on_line=np.zeros_like(walk_scans.mask)).take([0])
     guess = np.array([[[3.0, -2.0, 0.4]]])
     found = match_pairs(one, one, guess, FINE)
     np.testing.assert_allclose(found.poses, guess[0], atol=1e-6)

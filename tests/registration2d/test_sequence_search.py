@@ -12,7 +12,7 @@ from dpmjax.io.carmen import read_carmen_log
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.registration2d import incremental_icp, planar_scans
 from dpmjax.registration2d.planar_scans import PlanarScans
-from dpmjax.registration2d.range_profiles import make_profiles, weak_steps
+from dpmjax.registration2d.range_profiles import weak_steps
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_search import align_arcs
 from dpmjax.registration2d.steps import MotionPrior
@@ -68,11 +68,11 @@ def test_a_repeated_scan_is_left_out_and_no_right_one_is(log) -> None:
 
 def test_right_steps_are_strong_and_torn_ones_weak(log) -> None:
     scans, truth = log
-    profiles, rows = make_profiles(scans), np.setdiff1d(np.arange(NUM_SCANS), [REPEATED, SWAPPED])
-    assert not weak_steps(profiles, truth, rows).any()
+    rows = np.setdiff1d(np.arange(NUM_SCANS), [REPEATED, SWAPPED])
+    assert not weak_steps(scans, truth, rows).any()
     torn = truth.copy()
     torn[10:, :2] += 3.0
-    assert np.flatnonzero(weak_steps(profiles, torn, rows)).tolist() == [9]
+    assert np.flatnonzero(weak_steps(scans, torn, rows)).tolist() == [9]
 
 
 def test_arcs_bend_by_half_their_turn_and_have_the_usual_lengths() -> None:
@@ -98,7 +98,7 @@ def test_a_step_with_little_overlap_is_among_the_hypotheses(place, turn) -> None
     ahead = np.arange(-80, 80) % 512
     scans = planar_scans(METRES_A_PX * points[:, ahead])
     truth = step * [METRES_A_PX, METRES_A_PX, 1.0]
-    found = align_arcs(scans, make_profiles(scans), np.array([1]), MotionPrior(1.0, 1.0))
+    found = align_arcs(scans, np.array([1]), MotionPrior(1.0, 1.0))
     off = found.poses - truth
     assert (np.hypot(off[:, 0], off[:, 1]) + np.abs(off[:, 2])).min() < 0.3
 

@@ -16,7 +16,6 @@ from dpmjax.registration2d import (
 )
 from dpmjax.registration2d.joint_alignment import restore_torn
 from dpmjax.registration2d.odometry import calibrate_odometry
-from dpmjax.registration2d.range_profiles import make_profiles
 from dpmjax.registration2d.steps import StepPrior, slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 
@@ -62,7 +61,7 @@ def steps_of(poses: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_steps_are_open_in_a_corridor_and_closed_in_rooms(scans, truth) -> None:
-    slides = slide_steps(make_profiles(scans), steps_of(truth))
+    slides = slide_steps(scans, steps_of(truth))
     assert slides.is_open[IN_CORRIDOR].all()
     assert not slides.is_open[:3].any()
     assert not slides.is_open[-3:].any()
@@ -75,7 +74,7 @@ def test_an_open_step_is_as_uncertain_as_its_odometry_and_moves_to_it(scans, tru
     deviation = 2.0
     prior = StepPrior(steps_of(truth), np.full((NUM_SCANS - 1, 3), [deviation, deviation, 0.01]))
     torn = steps_of(torn_in_the_corridor(truth, 18.0))
-    slides = slide_steps(make_profiles(scans), torn, prior)
+    slides = slide_steps(scans, torn, prior)
     assert np.flatnonzero(slides.is_torn).tolist() == [10]
     np.testing.assert_allclose(slides.moved(torn)[10, :2], steps_of(truth)[10, :2], atol=2.0)
     assert 0.3 * deviation < slides.deviations[10] < 2.0 * deviation
@@ -145,12 +144,12 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
 
 
 def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
-    profiles, radius = make_profiles(scans), RefinementConfig().radius
+    radius = RefinementConfig().radius
     prior = StepPrior.of_poses(truth, scans.typical_range)
-    assert restore_torn(profiles, steps_of(truth), truth, radius, prior) is None
+    assert restore_torn(scans, steps_of(truth), truth, radius, prior) is None
     torn = truth.copy()
     torn[3] += [25.0, -20.0, 0.3]
-    found = restore_torn(profiles, steps_of(truth), torn, radius, prior)
+    found = restore_torn(scans, steps_of(truth), torn, radius, prior)
     assert found is not None
     off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0
@@ -162,7 +161,7 @@ def test_a_lost_step_is_put_back_and_not_slid(scans, truth) -> None:
     torn[10, 2] += 0.025
     prior = StepPrior(steps, np.full((NUM_SCANS - 1, 3), [2.0, 2.0, 0.01]))
     poses = np.asarray(se2.compose(truth[0], se2.chain(torn)))
-    found = restore_torn(make_profiles(scans), steps, poses, RefinementConfig().radius, prior)
+    found = restore_torn(scans, steps, poses, RefinementConfig().radius, prior)
     np.testing.assert_allclose(steps_of(found)[10], steps[10], atol=1e-3)
 
 

@@ -20,6 +20,7 @@ from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.problem import MapFrame, Params, Problem, bind_map, choose_frame
 from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
+from dpmjax.nets.mapping import LocalizationNet
 from dpmjax.types import ScanSet
 
 # Number of nodes of the raster along each side of the map's frame.
@@ -161,8 +162,19 @@ def has_windows(fitted: Fitted) -> bool:
     Returns:
         True if a leading axis of L-Net's weights is that of the windows.
     """
-    biases = fitted.params.localization["params"]["Dense_0"]["bias"]
-    return biases.ndim > 1
+    return has_localization(fitted) and fitted.params.localization["params"]["Dense_0"]["bias"].ndim > 1
+
+
+def has_localization(fitted: Fitted) -> bool:
+    """Returns True where the fit has an L-Net; one of free poses from given poses has none.
+
+    Args:
+        fitted: result of `fit_deepmapping` or of `train_localization`.
+
+    Returns:
+        True if there are weights.
+    """
+    return bool(fitted.params.localization)
 
 
 def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps: int = 5000, key: jax.Array) -> Fitted:
@@ -189,11 +201,13 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
         raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
     measured = replace(scans, points=scans.points / fitted.unit)
-    render_key, train_key = jax.random.split(key)
+    render_key, train_key, net_key = jax.random.split(key, 3)
     rendered, places = render_scans(make_raster(fitted), measured, _NUM_RENDERED, key=render_key)
-    begin = fitted.params.localization
+    begin: Any = fitted.params.localization
     if has_windows(fitted):
         begin = jax.tree.map(lambda weights: weights[0], begin)
+    elif not has_localization(fitted):
+        begin = jax.jit(LocalizationNet(fitted.config.localization).init)(net_key, measured.points[0], measured.mask[0])
     shares = [np.full(len(some), 1.0 / len(some)) for some in (poses, places) if len(some)]
     both, labels = jax.tree.map(lambda *parts: jnp.concatenate(parts), (measured, poses), (rendered, places))
     phase = replace(fitted.config.cold_phases[0], num_steps=num_steps, num_epochs=0)

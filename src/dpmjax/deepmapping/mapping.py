@@ -107,7 +107,8 @@ def mapping_data(
             f"{unit:.4g}; dataclasses.replace(config, unit=None) takes the ranges as unit"
         )
     T_start = None if start is None else sensor.scaled_start(start, len(checked.points), unit)
-    return MappingData(replace(checked, points=checked.points / unit), T_start), unit
+    points = jax.device_put(np.asarray(checked.points) / np.float32(unit))
+    return MappingData(replace(checked, points=points), T_start), unit
 
 
 def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:

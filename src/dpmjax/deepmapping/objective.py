@@ -91,6 +91,8 @@ def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Ar
     """
     largest = max(1, min(phase.max_offset, furthest))
     count = min(phase.num_offsets, largest) - 1
+    if count == largest - 1:
+        return jnp.arange(1, largest + 1)
     others = jax.random.choice(key, jnp.arange(2, max(largest, 2) + 1), (count,), replace=False)
     return jnp.concatenate([jnp.ones(1, others.dtype), others])
 
@@ -197,16 +199,15 @@ def free_factors(world: WorldBatch, phase: PhaseConfig, *, key: jax.Array) -> Fl
     Returns:
         Factors in [0, 1).
     """
-    uniform_key, surface_key = jax.random.split(key)
     shape = (*world.mask.shape, phase.num_free)
+    # One call, because each compiles for a tenth of a second.
+    drawn = jax.random.uniform(key, (*world.mask.shape, phase.num_free + (phase.surface_distance is not None)))
+    factors = drawn[..., : phase.num_free]
     if phase.is_as_published:
-        factors = jnp.broadcast_to(jax.random.uniform(uniform_key, shape[2:]), shape)
-    else:
-        factors = jax.random.uniform(uniform_key, shape)
+        factors = jnp.broadcast_to(factors[0, 0], shape)
     if phase.surface_distance is None:
         return factors
-    mean_distance = interpolate_log(phase.surface_distance, world.progress)
-    distance = mean_distance * jax.random.uniform(surface_key, world.mask.shape, minval=0.5, maxval=1.5)
+    distance = interpolate_log(phase.surface_distance, world.progress) * (0.5 + drawn[..., -1])
     beams = jax.lax.stop_gradient(world.points - world.sensors[:, None])
     ranges = jnp.linalg.norm(jnp.where(world.mask[..., None], beams, 1.0), axis=-1)
     near = jnp.maximum(1.0 - distance / ranges, 0.3)

@@ -22,6 +22,7 @@ from dpmjax.checks import runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.localization_training import (
     MapRaster,
+    has_localization,
     has_windows,
     make_raster,
     nearest_nodes,
@@ -175,7 +176,7 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
         raise ValueError(f"max_nats: expected a positive number, got {max_nats}")
     if has_windows(fitted):
         raise ValueError("fitted: each of its L-Nets knows one window of the walk; call train_localization first")
-    if np.any(np.asarray(fitted.params.start) != 0.0):
+    if np.any(np.asarray(fitted.params.start) != 0.0) or not has_localization(fitted):
         raise ValueError(
             "fitted: its L-Net corrects given start poses, which a new scan has not; call train_localization first"
         )

@@ -101,14 +101,19 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
 
 
 def _planar_init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
-    """Makes initial parameters for planar scans (`Problem.init`); without initial poses the start is zero."""
+    """Makes initial parameters for planar scans (`Problem.init`); without initial poses the start is zero.
+
+    From given poses there is no L-Net (no weights) where no phase trains one, because it would compile for seconds.
+    """
     net_key, map_key = jax.random.split(key)
-    scans, phase = data.scans, phases_of(config, data)[0]
+    scans, (phase, *later) = data.scans, phases_of(config, data)
+    has_net = data.start is None or any(some.poses == "network" for some in (phase, *later))
     poses = start = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
     make_net = partial(LocalizationNet(config.localization).init, points=scans.points[0], mask=scans.mask[0])
-    if phase.scans_per_window is None:
+    localization: Any = {}
+    if has_net and phase.scans_per_window is None:
         localization = make_net(net_key)
-    else:
+    elif phase.scans_per_window is not None:
         rows = window_rows(len(start), phase.scans_per_window)
         localization = jax.vmap(make_net)(jax.random.split(net_key, len(rows)))
         poses = start[rows] if phase.poses == "free" else start
@@ -182,10 +187,10 @@ def _planar_loss(
 ) -> tuple[Float[Array, ""], Terms]:
     """Computes eq. 6 of DeepMapping for planar scans (`Problem.loss`): a batch of scans and beams."""
     scans, progress = data.scans, step / phase.num_steps
-    batch_key, loss_key = jax.random.split(key)
-    beam_key, row_key = jax.random.split(batch_key)
+    beam_key, row_key, free_key, offset_key = jax.random.split(key, 4)
     num_scans, num_beams = scans.mask.shape
-    some = _thinned(scans, choose_beams(num_beams, phase, jax.random.randint(beam_key, (), 0, num_beams)))
+    first = (jax.random.bits(beam_key) % num_beams).astype(jnp.int32)
+    some = _thinned(scans, choose_beams(num_beams, phase, first))
     rows, is_scan = blocks_of_step(phase, num_scans, step, key=row_key)
     if phase.poses == "network":
         poses = _localize(config, phase, params, some, rows)
@@ -194,7 +199,6 @@ def _planar_loss(
     poses, flat = poses.reshape(-1, 3), rows.reshape(-1)
     points = se2.transform_points(poses, some.points[flat])
     world = WorldBatch(points, poses[:, :2], some.mask[flat], is_scan.reshape(-1), rows.shape[1], progress)
-    free_key, offset_key = jax.random.split(loss_key)
     offsets = draw_offsets(phase, rows.shape[1] - 1, key=offset_key)
     return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.chamfer_limit), key=free_key)
 
@@ -203,7 +207,7 @@ def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array,
     """Checks initial poses x, y, heading and scales them from the unit of the points to that of the fit."""
     poses = se2.as_poses("start", start, num_scans) / [unit, unit, 1.0]
     _require_near_origin(poses[:, :2])
-    return jnp.asarray(poses, jnp.float32)
+    return jax.device_put(poses.astype(np.float32))
 
 
 def _require_near_origin(positions: NDArray[np.float64]) -> None:
@@ -228,7 +232,7 @@ def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array,
         raise ValueError(f"start: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
     T[:, :3, 3] /= unit
     _require_near_origin(T[:, :3, 3])
-    return jnp.asarray(T, jnp.float32)
+    return jax.device_put(T.astype(np.float32))
 
 
 def _unscaled(poses: ArrayLike, unit: float) -> NDArray[np.float64]:

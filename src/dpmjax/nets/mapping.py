@@ -209,10 +209,12 @@ def double_resolution(grid: Float[Array, "*size"]) -> Float[Array, "*size_out"]:
         Values at 2 r + 1 nodes along each axis.
     """
     for axis in range(grid.ndim):
-        nodes = jnp.moveaxis(grid, axis, 0)
-        pairs = jnp.stack([nodes[:-1], 0.5 * (nodes[:-1] + nodes[1:])], axis=1)
-        nodes = jnp.concatenate([pairs.reshape(-1, *nodes.shape[1:]), nodes[-1:]])
-        grid = jnp.moveaxis(nodes, 0, axis)
+        # Zeros between the nodes, and half of each node on either side of it.
+        place = [(int(k == axis), int(k == axis), int(k == axis)) for k in range(grid.ndim)]
+        spread = jax.lax.pad(grid, jnp.zeros((), grid.dtype), place)
+        middle = jax.lax.slice_in_dim(spread, 1, -1, axis=axis)
+        sides = jax.lax.slice_in_dim(spread, 0, -2, axis=axis) + jax.lax.slice_in_dim(spread, 2, None, axis=axis)
+        grid = middle + 0.5 * sides
     return grid
 
 

@@ -32,10 +32,10 @@ _NUM_OPEN_ROUNDS, _NUM_TORN_ROUNDS = 3, 5
 # A step is torn by a refinement where its score has fallen by this much, from a score that was not weak. Least weight
 # of a step, whose score may be negative.
 _LOST_SCORE, _LEAST_WEIGHT = 0.25, 0.01
-# Offsets of the neighbours in time, of ordered scans; largest difference of heading of neighbours in space, radians.
-_TEMPORAL, _MAX_TURN = (1, 2, 3), 2.0
-# Largest number of neighbours in space, each from another visit.
-_NUM_SPATIAL = 8
+# Largest difference of heading of two scans that are aligned, radians; number of nearest scans of each scan.
+_MAX_TURN, _NUM_NEAREST = 2.0, 8
+# A pair of scans more steps apart may cross a torn step.
+_FEW_STEPS = 3
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
@@ -91,9 +91,7 @@ def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: 
     return _relax(edges, adjusted, _NUM_OPEN_ROUNDS)
 
 
-def restore_torn(
-    scans: PlanarScans, steps: Floats, poses: Floats, radius: float, prior: StepPrior
-) -> Floats | None:
+def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float, prior: StepPrior) -> Floats | None:
     """Restores torn steps and distributes the difference over the pairs that constrain the map.
 
     Args:
@@ -123,7 +121,7 @@ def restore_torn(
 
 def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
     """Returns edges of the pairs that fit, without steps; their information is the scores (e,)."""
-    source, target = choose_pairs(scans, poses, radius)
+    source, target = choose_pairs(poses, radius * scans.typical_range)
     is_pair = source != target + 1
     source, target = source[is_pair], target[is_pair]
     relative = np.asarray(se2.relative(poses[target], poses[source]))
@@ -164,12 +162,12 @@ class _AlignedPairs(NamedTuple):
 
 def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
-    source, target = choose_pairs(scans, poses, radius)
+    source, target = choose_pairs(poses, radius * scans.typical_range)
     if prior is None:
         return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
     slides = slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
-    is_kept = (crossed[source] == crossed[target]) | (source - target > max(_TEMPORAL))
+    is_kept = (crossed[source] == crossed[target]) | (source - target > _FEW_STEPS)
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
     across = np.eye(3) - slide_steps(scans, relative, pairs=(source, target)).open_directions(relative)
@@ -196,29 +194,19 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
     return solve_blocks(np.stack([edges.target, edges.source], axis=1), blocks, gradients, num_poses)
 
 
-def choose_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Pairs:
-    """Returns pairs (source, target) of neighbours in time and in space; of each visit of a place the nearest scan."""
-    num_scans = len(poses)
-    temporal = _TEMPORAL if scans.is_ordered else ()
-    source = [np.arange(k, num_scans) for k in temporal]
-    target = [np.arange(num_scans - k) for k in temporal]
-    tree = scipy.spatial.cKDTree(poses[:, :2])
-    # Of each visit of a place one scan is enough; without an order every scan is a visit.
-    apart, visit = (max(temporal, default=0) + 2, 2) if scans.is_ordered else (0, 0)
-    count = min(num_scans, 6 * _NUM_SPATIAL + 2 * apart)
-    nearest = tree.query(poses[:, :2], k=count, distance_upper_bound=radius * scans.typical_range)
-    distances, rows = np.atleast_2d(nearest[0]), np.atleast_2d(nearest[1])
-    for scan in range(num_scans):
-        near = rows[scan][np.isfinite(distances[scan])]
-        near = near[(np.abs(near - scan) > apart)]
-        near = near[np.abs(se2.wrap_angle(poses[near, 2] - poses[scan, 2])) < _MAX_TURN]
-        chosen: list[int] = []
-        while len(near) and len(chosen) < _NUM_SPATIAL:
-            chosen.append(int(near[0]))
-            near = near[np.abs(near - near[0]) > visit]
-        source.append(np.full(len(chosen), scan))
-        target.append(np.array(chosen, np.int64))
-    return np.concatenate(source).astype(np.int64), np.concatenate(target).astype(np.int64)
+def choose_pairs(poses: Floats, radius: float) -> Pairs:
+    """Returns pairs (source, target) of each scan and its nearest scans.
+
+    Args:
+        poses: (n, 3).
+        radius: largest distance of a pair, unit of the poses.
+    """
+    tree, count = scipy.spatial.cKDTree(poses[:, :2]), min(len(poses), 6 * _NUM_NEAREST)
+    distances, rows = (np.atleast_2d(x) for x in tree.query(poses[:, :2], k=count, distance_upper_bound=radius))
+    turns = np.abs(se2.wrap_angle(poses[np.minimum(rows, len(poses) - 1), 2] - poses[:, None, 2]))
+    is_near = np.isfinite(distances) & (rows != np.arange(len(poses))[:, None]) & (turns < _MAX_TURN)
+    source, column = np.nonzero(is_near & (np.cumsum(is_near, axis=1) <= _NUM_NEAREST))
+    return source.astype(np.int64), rows[source, column].astype(np.int64)
 
 
 def _linearise(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: Floats) -> tuple[Edges, Floats]:

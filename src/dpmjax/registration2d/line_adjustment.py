@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
@@ -140,7 +140,7 @@ def _linearise(
 ) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
     """Computes J^T W J and J^T W r of one scan; the first of `others` is the scan itself, at pose zero."""
     beams = _gather_beams(own, others, nearest, poses, noise)
-    lines = _fit_lines(beams, own.normals, noise)
+    lines = _fit_lines(beams, jnp.asarray(own.normals), noise)
     (x, y), (own_x, own_y) = (lines.x[:, None], lines.y[:, None]), own.points.T
     across = _wide(lines.x) * beams.x + _wide(lines.y) * beams.y
     residual = -(lines.shares * across).sum((1, 2))

@@ -269,7 +269,8 @@ def match_pairs(
     found = _align_guesses(lines, guesses, prior, scales, metric)
     best = found.weight.argmax(axis=1)
     poses, information, _, weight = (x[row[:, 0], best] for x in found)
-    return PairMatches(poses, weight / np.maximum(np.minimum(*(x.mask.sum(1) for x in lines)), 1), information)
+    num_beams = np.maximum(np.minimum(lines[0].mask.sum(1), lines[1].mask.sum(1)), 1)
+    return PairMatches(poses, np.asarray(weight / num_beams, np.float64), information)
 
 
 def _align_guesses(

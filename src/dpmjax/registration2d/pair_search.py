@@ -211,9 +211,7 @@ def search_pairs(
     return Candidates(joined.source[back], joined.target[back], joined.poses[back], joined.scores[back])
 
 
-def _search_batch(
-    scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None
-) -> Candidates:
+def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None) -> Candidates:
     """Finds candidates of one batch of pairs."""
     unit, (source, target) = scans.typical_range, pairs
     cell, size = config.cell * unit, config.num_cells

@@ -286,19 +286,19 @@ def _slide_scores(scans: PlanarScans, pairs: Pairs, places: Floats, costs: Float
         places: (k, s, 3) poses; the one in the middle has no shift.
         costs: (k, s) of the prior, nats.
     """
-    column, middle = np.arange(places.shape[1]), places.shape[1] // 2
+    column, middle, rows = np.arange(places.shape[1]), places.shape[1] // 2, np.arange(len(places))
     is_first, scores = (column - middle) % _STRIDE == 0, np.zeros(places.shape[:2])
-    for is_scored, rows in ((is_first, slice(None)), (~is_first, None)):
-        if rows is None:
-            nats = np.stack([scores, scores - _SCORE_SCALE * costs]) / _SCORE_SCALE
-            others = np.where(is_first & (column != middle), nats, -np.inf).max(axis=2)
-            rows = np.flatnonzero((others > nats[..., middle] - _CLEAR_GAIN).any(axis=0))
+    for is_scored in (is_first, ~is_first):
         agreement, visible = find_evidence(scans, pairs[0][rows], pairs[1][rows], places[rows][:, is_scored])
         # The number of visible beams must not favour short steps. Where all beams are visible, these scores equal
         # `pair_scores`.
-        found = np.zeros((len(agreement), len(column)))
-        found[:, is_scored] = agreement / (np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE))
-        scores[rows] += found
+        scores[np.ix_(rows, np.flatnonzero(is_scored))] = agreement / (
+            np.maximum(visible, LEAST_VISIBLE) * (1.0 + LEAST_VISIBLE)
+        )
+        if is_scored is is_first:
+            nats = np.stack([scores, scores - _SCORE_SCALE * costs]) / _SCORE_SCALE
+            others = np.where(is_first & (column != middle), nats, -np.inf).max(axis=2)
+            rows = np.flatnonzero((others > nats[..., middle] - _CLEAR_GAIN).any(axis=0))
     for row in np.setdiff1d(np.arange(len(scores)), rows):
         scores[row] = np.interp(column, column[is_first], scores[row, is_first])
     return scores
