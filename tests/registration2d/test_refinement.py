@@ -89,7 +89,7 @@ def test_bad_poses_are_named(walk_scans, poses, message) -> None:
 def test_pairs_are_the_nearest_scans_that_look_alike() -> None:
     out = np.stack([10.0 * np.arange(30), np.zeros(30), np.zeros(30)], axis=1)
     back = out[::-1] + np.array([0.0, 1.0, np.pi])
-    source, target = choose_pairs(np.concatenate([out, back]), 40.0)
+    source, target = choose_pairs(np.concatenate([out, back]), 41.0)
     # The way back sees other walls.
     assert ((source < 30) == (target < 30)).all()
     assert np.bincount(source).tolist() == 2 * [*range(4, 8), *(22 * [8]), *range(7, 3, -1)]

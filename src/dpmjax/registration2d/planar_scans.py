@@ -39,8 +39,8 @@ _BEND = 5e-4
 _NOISE_SAMPLES = 65536
 # Numbers of beams of the runs that compete.
 _WIDTHS = (3, 4, 8, 16, 32)
-# Numbers of bearings of the views.
-_NUM_BEARINGS, _NUM_FINE_BEARINGS = 512, 4096
+# Number of bearings of fine views.
+_NUM_FINE_BEARINGS = 4096
 # Scans that lines are fitted to at a time, few enough for the cache.
 _BLOCK = 256
 
@@ -93,6 +93,7 @@ class PlanarScans:
         noise: standard deviation of the range noise of all scans together, in the unit of the points.
         typical_range: range that nine in ten beams on a line stay below, median over the scans: the unit of settings.
         is_ordered: True where neighbours in the array are neighbours in time.
+        num_bearings: of the views.
     """
 
     points: Float[np.ndarray, "n b 2"]
@@ -103,6 +104,7 @@ class PlanarScans:
     noise: float
     typical_range: float
     is_ordered: bool = True
+    num_bearings: int = 512
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -110,12 +112,12 @@ class PlanarScans:
     @cached_property
     def views(self) -> Views:
         """Ranges of the scans by the bearing, made once."""
-        return make_views(self, _NUM_BEARINGS)
+        return make_views(self, self.num_bearings)
 
     @cached_property
-    def fine_views(self) -> Views:
-        """Views for the comparison of noise-free scans to a thousandth of the typical range, made once."""
-        return make_views(self, _NUM_FINE_BEARINGS)
+    def fine(self) -> PlanarScans:
+        """The same scans with views for comparisons to a thousandth of the typical range, made once."""
+        return replace(self, num_bearings=_NUM_FINE_BEARINGS)
 
     @property
     def num_on_line(self) -> Indices:

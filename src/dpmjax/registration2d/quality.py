@@ -202,7 +202,7 @@ def view_misfit(scans: PlanarScans, poses: Floats) -> float:
     tolerance = max(scans.noise, _LEAST_TOLERANCE * scans.typical_range)
     source, target = near_pairs(poses, scans.typical_range)
     tolerances, relative = scans.tolerances._replace(match=tolerance), se2.relative(poses[target], poses[source])
-    views = compare_pairs(scans, source, target, relative, tolerances=tolerances, views=scans.fine_views)
+    views = compare_pairs(scans.fine, source, target, relative, tolerances=tolerances)
     return 1.0 - float(np.sum(views.matched) / max(float(np.sum(views.visible)), 1.0))
 
 

@@ -91,7 +91,7 @@ def _look(
 
 def compare_pairs(
     scans: PlanarScans, source: Indices, target: Indices, poses: Floats,
-    *, stride: int = 2, tolerances: Tolerances | None = None, views: Views | None = None,
+    *, stride: int = 2, tolerances: Tolerances | None = None,
 ) -> ViewComparison:  # fmt: skip
     """Compares p pairs of scans at given relative poses.
 
@@ -102,12 +102,11 @@ def compare_pairs(
         poses: (p, 3) T_target_source, or (p, h, 3), several of each pair.
         stride: every `stride`-th beam is compared.
         tolerances: None: those of the scans.
-        views: None: those of the scans.
 
     Returns:
         ViewComparison with float64 arrays (p,) or (p, h) on the host.
     """
-    views, tolerances = views or scans.views, tolerances or scans.tolerances
+    views, tolerances = scans.views, tolerances or scans.tolerances
     several = poses if poses.ndim == 3 else poses[:, None]
     result = np.zeros((3, *several.shape[:2]))
     num_poses = several.shape[1]
