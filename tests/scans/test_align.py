@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se3
-from dpmjax.scans.align import LEVELS, AlignedMotion, AlignmentLevel, Prior, align, align_on_host, nearest_planes
+from dpmjax.scans.align import LEVELS, AlignedMotion, AlignmentLevel, Prior, align, align_on_host
+from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.surfaces import Surface, scan_surface, surface_of_elements
 from dpmjax.types import SurfaceElements
 from tests.scans.surface_scenes import motion, seen_from, street

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpmjax.scans.align import Pairs
+from dpmjax.scans.pairs import Pairs
 from dpmjax.scans.weak_directions import (
     CUBE_M,
     SCATTER_FACTOR,

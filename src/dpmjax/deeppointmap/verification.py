@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scans.align import nearest_planes
 from dpmjax.scans.lidar import Scan
+from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.surfaces import SurfaceConfig, view_points
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
 from dpmjax.types import Poses, Verification

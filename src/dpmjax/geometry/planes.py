@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -47,13 +45,14 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
     Returns:
         Normals and flatness.
     """
+    # Sums of products, because a contraction of JAX has a lower precision on some devices.
     xp, tiny = rigid.namespace_of(xyz[0]), np.finfo(xyz[0].dtype).tiny
-    counts = is_near.sum(axis=1)
+    counts = is_near.sum(axis=1).astype(xyz[0].dtype)
     centred = []
     for column in xyz:
         kept = xp.where(is_near, column, 0.0)
         centred.append((kept - (kept.sum(axis=1) / counts)[:, None]) * is_near)
-    xx, xy, xz, yy, yz, zz = (_dots(centred[i], centred[j]) / counts for i in range(3) for j in range(i, 3))
+    xx, xy, xz, yy, yz, zz = ((centred[i] * centred[j]).sum(axis=1) / counts for i in range(3) for j in range(i, 3))
     mean = (xx + yy + zz) / 3
     off_diagonal = xy**2 + xz**2 + yz**2
     radius = xp.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off_diagonal) / 6)
@@ -64,11 +63,6 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
     middle = 3 * mean - largest - smallest
     flatness = xp.clip((middle - smallest) / xp.maximum(largest, tiny), 0, 1)
     return PlaneFits(_kernels(a, b, c, d, e, f, 2 * xp.cos(angle + 2 * np.pi / 3)), flatness)
-
-
-def _dots(first: Float[AnyArray, "n k"], second: Float[AnyArray, "n k"]) -> Any:
-    # JAX would make a contraction of it, at lower precision on some devices.
-    return jnp.sum(first * second, axis=1) if isinstance(first, jax.Array) else np.einsum("nk,nk->n", first, second)
 
 
 def _kernels(*matrix_and_value: Float[AnyArray, " n"]) -> Any:

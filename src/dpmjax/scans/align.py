@@ -10,6 +10,7 @@ step (Chen and Medioni 1992) with a Geman-McClure kernel. They differ in the sea
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,8 +24,9 @@ from dpmjax.checks import require_count, require_positive
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import along_curve, k_nearest
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
+from dpmjax.scans.pairs import Pairs, Planes, find_planes, in_columns, move_elements, pair_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
-from dpmjax.types import AnyArray, Poses, SurfaceElements
+from dpmjax.types import AnyArray, SurfaceElements
 
 # A level ends after a step that turns less, radians, and is shorter, metres.
 CONVERGED_RAD, CONVERGED_M = 1e-4, 2e-3
@@ -32,6 +34,10 @@ CONVERGED_RAD, CONVERGED_M = 1e-4, 2e-3
 # Pairs are searched again once the points have moved farther, in the mean: a larger distance keeps wrong pairs, a
 # smaller one searches in vain.
 SEARCHED_AGAIN_M = 0.02
+
+# Largest ratio of two steps by which the next is lengthened: a larger one overshoots where pairs change. Metres that
+# count as much as a radian of a step.
+MAX_RATIO, LEVER_M = 0.67, 10.0
 
 # Least width of the kernel, and its width as a share of the radius.
 MIN_KERNEL_M, KERNEL_SHARE = 0.05, 1 / 6
@@ -41,9 +47,6 @@ PAIR_COSINE = 0.3
 
 # Fewer pairs do not constrain a motion.
 MIN_PAIRS = 20
-
-# Largest distance of a point from a plane that it meets, and least cosine between the normals of both.
-PLANE_DISTANCE_M, MIN_COSINE = 0.15, 0.7
 
 
 @dataclass(frozen=True)
@@ -85,36 +88,6 @@ LEVELS = (
 )
 
 
-class Pairs(NamedTuple):
-    """Elements of the source under motions, and the planes of the target nearest to them; arrays of one kind.
-
-    Attributes:
-        is_paired: (..., n) True if an element of the target is within the radius; where it is False, all further fields
-            but `points` are undefined.
-        points: (..., n, d) elements in the frame of the target.
-        residuals: (..., n) signed distances to the planes.
-        normals: (..., n, d) normals of the planes.
-        cosines: (..., n) absolute cosine between the normals of both; 1 for an element without a normal.
-        flatness: (..., n) of the target's neighbourhood.
-    """
-
-    is_paired: Any
-    points: Any
-    residuals: Any
-    normals: Any
-    cosines: Any
-    flatness: Any
-
-    @property
-    def meets(self) -> Any:
-        """True for an element that meets a plane: it is near, and the normals of both surfaces agree."""
-        return self.is_paired & (np.abs(self.residuals) < PLANE_DISTANCE_M) & (self.cosines > MIN_COSINE)
-
-    def take(self, chosen: Any) -> Pairs:
-        """Returns chosen rows of all fields."""
-        return Pairs(*(values[chosen] for values in self))
-
-
 class Prior(NamedTuple):
     """Expected motion, which holds the directions that no plane holds.
 
@@ -145,45 +118,16 @@ class AlignedMotion(NamedTuple):
     information: Any
 
 
-class _Planes(NamedTuple):
-    # The nearest element of the target of each point: where it is, its normal and flatness, and its distance.
-    positions: Any
-    normals: Any
-    flatness: Any
-    distances: Any
+class _Solved(NamedTuple):
+    # The Gauss-Newton step, 0 where there are too few pairs; then as in `AlignedMotion`.
+    step: PlaneStep
+    rmse: Any
+    num_pairs: Any
+    information: Any
 
 
-def _moved(source: tuple[Any, Any], T_target_source: Any) -> tuple[Any, Any]:
-    """Moves points and normals (n, d); coordinates lie behind one another in memory: NumPy is several times faster."""
-    xp, dim = rigid.namespace_of(T_target_source), T_target_source.shape[-1] - 1
-    turn = T_target_source[..., :dim, :dim]
-    points, normals = (xp.swapaxes(rigid.matmul(turn, values.T), -1, -2) for values in source)
-    return points + T_target_source[..., None, :dim, dim], normals
-
-
-def _pair(moved: tuple[Any, Any], planes: _Planes, radius: Any) -> Pairs:
-    """Pairs moved points and normals with the nearest planes."""
-    xp, (points, own) = rigid.namespace_of(moved[0]), moved
-    normals, is_bare = planes.normals, (own == 0).all(axis=-1)
-    residuals = ((points - planes.positions) * normals).sum(axis=-1)
-    cosines = xp.where(is_bare, 1.0, xp.abs((own * normals).sum(axis=-1)))
-    return Pairs(planes.distances < radius, points, residuals, normals, cosines, planes.flatness)
-
-
-def step(
-    pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None = None
-) -> tuple[AlignedMotion, PlaneStep]:
-    """Takes one Gauss-Newton step.
-
-    Args:
-        pairs: pairs under the motions.
-        T_target_source: motions (..., d+1, d+1) before the step.
-        kernel: width of the Geman-McClure kernel.
-        prior: expected motion.
-
-    Returns:
-        The motions after the step, with the numbers of the pairs before it, and the step.
-    """
+def _solve(pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None) -> _Solved:
+    """Computes one Gauss-Newton step from motions (..., d+1, d+1)."""
     xp = rigid.namespace_of(T_target_source)
     weights = pairs.is_paired * pairs.flatness * xp.maximum(pairs.cosines - PAIR_COSINE, 0)
     num_pairs = (weights > 0).sum(axis=-1)
@@ -191,13 +135,12 @@ def step(
     if xp is jnp:
         weights = lax.stop_gradient(weights)
     about = None if prior is None else (T_target_source, *prior)
-    found, information = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights, about)
+    step, information = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights, about)
     is_enough = num_pairs >= MIN_PAIRS
-    found = PlaneStep(xp.where(is_enough[..., None], found.tangent, 0), found.centre)
+    step = PlaneStep(xp.where(is_enough[..., None], step.tangent, 0), step.centre)
     total = xp.maximum(weights.sum(axis=-1), np.finfo(weights.dtype).tiny)
     rmse = rigid.safe_sqrt((weights * pairs.residuals**2).sum(axis=-1) / total)
-    T = rigid.matmul(motion_about(found), T_target_source)
-    return AlignedMotion(T, xp.where(is_enough, rmse, np.inf), num_pairs, information), found
+    return _Solved(step, xp.where(is_enough, rmse, np.inf), num_pairs, information)
 
 
 def schedule_of(levels: tuple[AlignmentLevel, ...]) -> Float[np.ndarray, "k 2"]:
@@ -235,12 +178,13 @@ def align(
     T, schedule = jnp.asarray(T_target_source, source.positions.dtype), jnp.asarray(schedule, source.positions.dtype)
 
     def step_from(source: SurfaceElements, target: SurfaceElements, T: Any, scale: Any) -> AlignedMotion:
-        moved = _moved((source.positions, source.normals), T)
+        moved = move_elements((source.positions, source.normals), T)
         near = k_nearest(*lax.stop_gradient((moved[0], target.positions)), 1, target.mask)
         is_there, row = near.mask[:, 0] & source.mask, near.indices[:, 0]
         distances = jnp.where(is_there, jnp.sqrt(jnp.where(is_there, near.squared_distances[:, 0], 1)), jnp.inf)
-        planes = _Planes(target.positions[row], target.normals[row], target.planarity[row], distances)
-        return step(_pair(moved, planes, scale[0]), T, scale[1], prior)[0]
+        planes = Planes(target.positions[row], target.normals[row], target.planarity[row], distances)
+        solved = _solve(pair_planes(moved, planes, scale[0]), T, scale[1], prior)
+        return AlignedMotion(rigid.matmul(motion_about(solved.step), T), *solved[1:])
 
     still = lax.stop_gradient((source, target))
     T = lax.stop_gradient(T)
@@ -277,48 +221,27 @@ def align_on_host(
     T, size = np.array(T_target_source, np.float64), len(T_target_source)
     num_free = 3 * (T.shape[-1] - 2)
     found = AlignedMotion(T, np.full(size, np.inf), np.zeros(size, int), np.zeros((size, num_free, num_free)))
-    target = _in_columns(target)
+    target = in_columns(target)
     has_pairs = np.full(size, len(target.points) > 0 and len(source.samples) >= MIN_PAIRS)
     for level in levels:
-        own = _first_elements(source, level.num_points)
-        rows, at, planes = np.flatnonzero(has_pairs), None, None
+        own, active = _first_elements(source, level.num_points), _Active(np.flatnonzero(has_pairs))
         for _ in range(level.num_iterations):
+            rows = active.rows
             if len(rows) == 0:
                 break
-            moved = _moved(own, T[rows])
-            at, planes = _nearest_again(target, moved[0], at, planes)
-            after, taken = step(_pair(moved, planes, level.radius_m), T[rows], level.kernel_width_m, prior)
-            for values, new in zip(found, after, strict=True):
+            moved = move_elements(own, T[rows])
+            at, planes = _nearest_again(target, moved[0], active)
+            solved = _solve(pair_planes(moved, planes, level.radius_m), T[rows], level.kernel_width_m, prior)
+            longer, factor = _lengthened(solved.step, active)
+            T[rows] = rigid.matmul(motion_about(longer), T[rows])
+            for values, new in zip(found[1:], solved[1:], strict=True):
                 values[rows] = new
-            has_pairs[rows] = np.isfinite(after.rmse)
-            is_active = has_pairs[rows] & ~_is_converged(taken)
-            if not is_active.all():
-                rows, at, planes = rows[is_active], at[is_active], _Planes(*(values[is_active] for values in planes))
+            has_pairs[rows] = np.isfinite(solved.rmse)
+            goes_on = has_pairs[rows] & ~_is_converged(solved.step)
+            active = _Active(rows, at, planes, solved.step.tangent, factor)
+            if not goes_on.all():
+                active = jax.tree.map(operator.itemgetter(goes_on), active)
     return found
-
-
-def nearest_planes(source: Surface, target: Surface, T_target_source: Poses, radius_m: float, num_points: int) -> Pairs:
-    """Pairs the first samples of the source with the planes of the target nearest to them, under several motions.
-
-    Args:
-        source: surface of a scan.
-        target: the second surface.
-        T_target_source: motions of the source.
-        radius_m: largest distance of a point from the point of the target that it is paired with.
-        num_points: number of points that are paired.
-
-    Returns:
-        A pair for each sample under each motion, in the order of the samples.
-    """
-    rows = source.samples[:num_points]
-    own = source.points.take(rows, axis=0), source.normals.take(rows, axis=0)
-    moved = _moved(own, np.asarray(T_target_source))
-    return _pair(moved, _nearest(_in_columns(target), moved[0]), radius_m)
-
-
-def _in_columns(target: Surface) -> Surface:
-    """Returns the surface with coordinates behind one another in memory, of which few are taken faster."""
-    return target._replace(points=np.asfortranarray(target.points), normals=np.asfortranarray(target.normals))
 
 
 def _first_elements(source: Surface, num_points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -328,33 +251,40 @@ def _first_elements(source: Surface, num_points: int) -> tuple[np.ndarray, np.nd
     return source.points.take(rows, axis=0), source.normals.take(rows, axis=0)
 
 
-def _nearest(target: Surface, points: np.ndarray) -> _Planes:
-    """Finds the nearest element of each point (..., d); at an infinite distance where there is none."""
-    shape, dim = points.shape[:-1], points.shape[-1]
-    if len(target.points) == 0:
-        return _Planes(np.zeros_like(points), np.zeros_like(points), np.zeros(shape), np.full(shape, np.inf))
-    rows, distances = (values[:, 0] for values in target.tree.nearest(points.reshape(-1, dim), 1))
-    positions, normals = (
-        np.moveaxis(np.stack([column.take(rows) for column in values.T]).reshape(dim, *shape), 0, -1)
-        for values in (target.points, target.normals)
-    )
-    return _Planes(positions, normals, target.flatness.take(rows).reshape(shape), distances.reshape(shape))
+class _Active(NamedTuple):
+    # Starts that are not converged: their rows, the points where their planes were searched, these, and the last step.
+    rows: Any
+    at: Any = None
+    planes: Planes | None = None
+    tangent: Any = None
+    factor: Any = None
 
 
-def _nearest_again(
-    target: Surface, points: np.ndarray, at: np.ndarray | None, planes: _Planes | None
-) -> tuple[np.ndarray, _Planes]:
-    """Finds the nearest elements of points (s, n, d), or keeps those of starts that have hardly moved since `at`."""
-    if at is None or planes is None:
-        return points, _nearest(target, points)
+def _nearest_again(target: Surface, points: np.ndarray, active: _Active) -> tuple[np.ndarray, Planes]:
+    """Finds the nearest elements of points (s, n, d), or keeps those of starts that have hardly moved since."""
+    at, planes = active.at, active.planes
+    if planes is None:
+        return points, find_planes(target, points)
     has_moved = np.abs(points - at).mean(axis=(1, 2)) > SEARCHED_AGAIN_M
     if has_moved.all():
-        return points, _nearest(target, points)
+        return points, find_planes(target, points)
     if has_moved.any():
         at[has_moved] = points[has_moved]
-        for values, new in zip(planes, _nearest(target, points[has_moved]), strict=True):
+        for values, new in zip(planes, find_planes(target, points[has_moved]), strict=True):
             values[has_moved] = new
     return at, planes
+
+
+def _lengthened(step: PlaneStep, active: _Active) -> tuple[PlaneStep, np.ndarray]:
+    """Extrapolates steps that shorten slowly, by their ratio (Aitken): each step changes only some pairs."""
+    tangent, dim = step.tangent, step.centre.shape[-1]
+    if active.tangent is None:
+        return step, np.ones(len(tangent))
+    squares = np.repeat([1.0, LEVER_M**2], [dim, tangent.shape[-1] - dim])
+    before = active.tangent * squares
+    shortening = (tangent * before).sum(axis=-1) / np.maximum((active.tangent * before).sum(axis=-1), 1e-12)
+    factor = 1 / (1 - np.clip(1 - (1 - shortening) / active.factor, 0, MAX_RATIO))
+    return PlaneStep(factor[:, None] * tangent, step.centre), factor
 
 
 def _is_converged(taken: PlaneStep) -> np.ndarray:

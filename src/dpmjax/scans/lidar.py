@@ -71,10 +71,11 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
     """
     if len(points) < MIN_NUM_POINTS:
         return None
-    tree, is_inlier = filter_points(points, None, config)
-    inliers = np.flatnonzero(is_inlier)
-    thinned = tree.points.take(inliers, axis=0)
-    surface = surface_at(tree, inliers[_spread_rows(thinned)], NEIGHBOURHOODS)
+    tree, rows = filter_points(points, None, config)
+    thinned = tree.points.take(rows, axis=0)
+    is_inlier = np.zeros(len(tree.points), bool)
+    is_inlier[rows] = True
+    surface = surface_at(tree, rows[_spread_rows(thinned)], NEIGHBOURHOODS, is_counted=is_inlier)
     if np.count_nonzero(surface.flatness) < MIN_NUM_POINTS:
         return None
     surface, weak_axis = surface_in_corridor(surface)

@@ -19,23 +19,11 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_host_points, as_mask, as_points, require_count, require_fields, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import voxel_sample
+from dpmjax.scans.outliers import OUTLIER_SIGMAS, OUTLIER_SLACK, evenly_spaced, find_inliers
 from dpmjax.types import AnyArray, PointCloud
-
-# A point is an outlier if its mean distance to its neighbours exceeds the mean over all points by more than this number
-# of standard deviations.
-OUTLIER_SIGMAS = 3.0
-
-# Number of points whose neighbours are searched first, to estimate the limit: all points of a smaller scan. With fewer,
-# more points must be searched again.
-NUM_SPACED = 1024
-# Cells of half the limit; where more would be needed, the neighbours of all points are searched.
-MAX_CELLS = 1 << 22
 
 MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
-# Relative tolerance: rounding must not drop points that are all equally far from their neighbours.
-OUTLIER_SLACK = 1 + 1e-5
-
 # A table of 2 MB; a fortieth of the voxels of a large scan share a slot. The factor spreads them (Knuth).
 HASH_FACTOR, TABLE_BITS = np.uint64(0x9E3779B97F4A7C15), 18
 
@@ -168,8 +156,8 @@ def preprocess_scan_on_host(
     Raises:
         ValueError: if the shapes do not match.
     """
-    tree, is_inlier = filter_points(points, mask, config, num_threads=num_threads)
-    return as_cloud(tree.points[is_inlier], config)
+    tree, rows = filter_points(points, mask, config, num_threads=num_threads)
+    return as_cloud(tree.points.take(rows, axis=0), config)
 
 
 def filter_points(
@@ -178,7 +166,7 @@ def filter_points(
     config: PreprocessConfig,
     *,
     num_threads: int = 2,
-) -> tuple[HostTree, Bool[np.ndarray, " k"]]:
+) -> tuple[HostTree, Int[np.ndarray, " k"]]:
     """Applies the filters of `preprocess_scan` on the host, and keeps the tree that found the outliers.
 
     Args:
@@ -188,7 +176,8 @@ def filter_points(
         num_threads: threads of the neighbour search, at least 1.
 
     Returns:
-        A tree of the points that range and voxel leave, in their order, and False for the outliers among them.
+        A tree of the points that range and voxel leave, in their order, and the rows of those that are no outliers, of
+        which the farthest is exchanged with the first.
 
     Raises:
         ValueError: if the shapes do not match.
@@ -200,14 +189,18 @@ def filter_points(
     _warn_if_out_of_range(points, mask, int(is_kept.sum()), config)
     kept = points.take(np.flatnonzero(is_kept), axis=0)  # four times faster than by the mask
     kept = kept[first_of_each_voxel(kept, config.voxel_size_m)]
-    tree = HostTree(kept[_evenly_spaced(len(kept), config.capacity)], num_threads=num_threads)
-    if config.num_outlier_neighbours == 0 or len(tree.points) < 2:
-        return tree, np.ones(len(tree.points), bool)
-    return tree, _is_inlier_on_host(tree, config.num_outlier_neighbours)
+    tree = HostTree(kept[evenly_spaced(len(kept), config.capacity)], num_threads=num_threads)
+    rows = np.arange(len(tree.points))
+    if config.num_outlier_neighbours > 0 and len(rows) > 1:
+        rows = np.flatnonzero(find_inliers(tree, config.num_outlier_neighbours))
+    if len(rows):
+        farthest = int(np.argmax(np.square(tree.points.take(rows, axis=0)).sum(axis=1)))
+        rows[[0, farthest]] = rows[[farthest, 0]]
+    return tree, rows
 
 
 def as_cloud(points: Float[np.ndarray, "k 3"], config: PreprocessConfig) -> PointCloud:
-    """Pads filtered points to the capacity, and exchanges the first with the farthest as `farthest_first` does.
+    """Pads filtered points to the capacity.
 
     Args:
         points: metres, in the frame of the lidar; at most `config.capacity`.
@@ -218,9 +211,6 @@ def as_cloud(points: Float[np.ndarray, "k 3"], config: PreprocessConfig) -> Poin
     """
     result = np.zeros((config.capacity, 3), np.float32)
     result[: len(points)] = points
-    if len(points) > 0:
-        farthest = int(np.argmax(np.sum(np.asarray(points, np.float64) ** 2, axis=1)))
-        result[[0, farthest]] = result[[farthest, 0]]
     return PointCloud(result, np.arange(config.capacity) < len(points))
 
 
@@ -273,46 +263,3 @@ def _numbered_voxels(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int
     x, y, z = (np.floor(column / np.float32(voxel_size)).astype(np.int64) for column in points.T)
     x, y, z = x - x.min(), y - y.min(), z - z.min()
     return (x * (y.max() + 1) + y) * (z.max() + 1) + z  # below 2^63, because MAX_VOXELS bounds each factor
-
-
-def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
-    slots = np.arange(min(num_kept, capacity))
-    return slots * num_kept // capacity if num_kept > capacity else slots
-
-
-def _is_inlier_on_host(tree: HostTree, num_neighbours: int) -> Bool[np.ndarray, " k"]:
-    points, rows = tree.points, _evenly_spaced(len(tree.points), NUM_SPACED)
-    # One more neighbour, because each point is its own nearest one.
-    num_nearest = min(num_neighbours + 1, len(points))
-
-    def measure(rows: Int[np.ndarray, " r"]) -> None:
-        spread[rows] = tree.nearest(points.take(rows, axis=0), num_nearest)[1][:, 1:].mean(axis=1)
-
-    spread, weights = np.zeros(len(points)), np.zeros(len(points))
-    measure(rows)
-    weights[rows] = 1
-    if len(rows) < len(points):
-        is_lonely = _is_lonely(points, (spread[rows].mean() + OUTLIER_SIGMAS * spread[rows].std()) / 2, num_neighbours)
-        measure(np.flatnonzero(is_lonely & (weights == 0)))
-        # The points that are not lonely are counted as often as there are such: no spread of theirs is large.
-        weights = np.where(is_lonely, 1, weights * (~is_lonely).sum() / max(weights[~is_lonely].sum(), 1))
-    mean = np.average(spread, weights=weights)
-    limit = mean + OUTLIER_SIGMAS * np.sqrt(np.average((spread - mean) ** 2, weights=weights))
-    return spread <= limit * OUTLIER_SLACK
-
-
-def _is_lonely(points: Float[np.ndarray, "n 3"], cell_m: float, num_neighbours: int) -> Bool[np.ndarray, " n"]:
-    """Returns True for points with at most so many others in the 27 cells around; all, where there are many cells."""
-    size_m, cell_m = np.ptp(points, axis=0), max(cell_m, 1e-9)
-    if (size_m / cell_m + 3).prod() > MAX_CELLS:
-        return np.ones(len(points), bool)
-    shape = (size_m / cell_m).astype(int) + 3
-    x, y, z = (((column - column.min()) * (1 / cell_m)).astype(np.int64) + 1 for column in points.T)
-    rows = (x * shape[1] + y) * shape[2] + z
-    counts = np.bincount(rows, minlength=shape.prod()).astype(np.int32).reshape(shape)
-    for axis in range(3):  # the border is empty
-        before, counts = np.moveaxis(counts, axis, 0), counts.copy()
-        along = np.moveaxis(counts, axis, 0)
-        along[1:] += before[:-1]
-        along[:-1] += before[1:]
-    return counts.reshape(-1)[rows] <= num_neighbours

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
-from dpmjax.scans.align import PLANE_DISTANCE_M, Pairs, nearest_planes
+from dpmjax.scans.pairs import PLANE_DISTANCE_M, Pairs, nearest_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, firm_surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
@@ -252,12 +252,7 @@ def wall_axis(surface: Surface) -> WallAxis:
     Returns:
         The axis; the information is 0 where there is no wall.
     """
-    T = T_level_lidar(surface)
-    normals = surface.normals @ T[:3, :3].T
-    is_wall = (surface.flatness > MIN_FLATNESS) & (np.abs(normals[:, 2]) < STEEP_COSINE)
-    points, normals = (surface.points[is_wall] @ T[:3, :3].T)[:, :2], normals[is_wall, :2]
-    rows = first_of_each_voxel(surface.points[is_wall], VOXEL_M)
-    points, normals = points[rows], normals[rows]
+    T, points, normals = _walls(surface, MIN_FLATNESS)
     information, axes = np.linalg.eigh(normals.T @ normals)
     along, across = axes[:, 0], np.array([-axes[1, 0], axes[0, 0]])
     is_parallel = np.abs(normals @ across) > PARALLEL_COSINE
@@ -266,6 +261,16 @@ def wall_axis(surface: Surface) -> WallAxis:
     profile = gaussian_filter1d(np.minimum(counts, MAX_COUNT), 1.0, mode="constant")
     extent_m = float(np.percentile(np.linalg.norm(points, axis=1), EXTENT_PERCENT)) if len(points) else 0.0
     return WallAxis(T, float(np.arctan2(along[1], along[0])), np.maximum(information, 0), profile, extent_m)
+
+
+def _walls(surface: Surface, min_flatness: float) -> tuple[Pose, Float[np.ndarray, "w 2"], Float[np.ndarray, "w 2"]]:
+    """Returns T_level_lidar, and horizontal points and normals of walls, one of each voxel."""
+    T = T_level_lidar(surface, min_flatness)
+    normals = surface.normals @ T[:3, :3].T
+    is_wall = (surface.flatness > min_flatness) & (np.abs(normals[:, 2]) < STEEP_COSINE)
+    rows = np.flatnonzero(is_wall)
+    rows = rows[first_of_each_voxel(surface.points[rows], VOXEL_M)]
+    return T, (surface.points[rows] @ T[:3, :3].T)[:, :2], normals[rows, :2]
 
 
 def weak_share(source: WallAxis, target: WallAxis) -> float:
@@ -293,9 +298,11 @@ def surface_in_corridor(surface: Surface) -> tuple[Surface, Float[np.ndarray, "3
     Returns:
         The surface, and the axis of the corridor as a unit vector; elsewhere the given surface, and None.
     """
-    firm = firm_surface(surface, FIRM_FLATNESS)
-    axis = wall_axis(firm)
-    return (firm, axis.axis) if weak_share(axis, axis) < CORRIDOR_SHARE else (surface, None)
+    T, _, normals = _walls(surface, FIRM_FLATNESS)
+    information, axes = np.linalg.eigh(normals.T @ normals)
+    if not len(normals) or information[0] >= CORRIDOR_SHARE * information.sum():
+        return surface, None
+    return firm_surface(surface, FIRM_FLATNESS), np.append(axes[:, 0], 0.0) @ T[:3, :3]
 
 
 def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Poses:

@@ -25,8 +25,9 @@ from dpmjax.deeppointmap.overlap_prediction import overlap_pairs, require_overla
 from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_scan, descriptors_of, expand_elements, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.align import align_on_host, nearest_planes
+from dpmjax.scans.align import align_on_host
 from dpmjax.scans.lidar import Scan
+from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.weak_directions import diagonal_information, plane_information
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.interfaces import Match, Proposal, SlamMethods

@@ -10,9 +10,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model_config import ModelConfig
+from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.align import AlignmentLevel, Pairs, align_on_host, nearest_planes
+from dpmjax.scans.align import AlignmentLevel, align_on_host
 from dpmjax.scans.lidar import Scan, lidar_scan
+from dpmjax.scans.pairs import Pairs, nearest_planes
 from dpmjax.scans.surfaces import Surface, view_points
 from dpmjax.scans.weak_directions import (
     plane_information,
@@ -22,7 +24,7 @@ from dpmjax.scans.weak_directions import (
 from dpmjax.sequences import homogeneous
 from dpmjax.slam.interfaces import Alignment
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import Pose, Poses
+from dpmjax.types import Information, Pose, Poses
 
 # Turns about the x and y axes among the further starts.
 TILTS_DEG = (-8.0, 8.0)
@@ -114,10 +116,10 @@ class SurfaceGeometry:
         Returns:
             The pose under which most elements meet planes and fewest lie in free space.
         """
-        surface = scan.surface
-        coarse = list(align_on_host(surface, local_map.surface, T_map_scan, self._wide).T_target_source)
-        coarse.sort(key=lambda T: -_matched_share(surface, self._planes(local_map, surface, T, NUM_SAMPLES // 3)))
-        return max(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])), key=lambda found: found.score)
+        coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, self._wide).T_target_source
+        matched = _matched_shares(scan.surface, self._planes(local_map, scan, coarse, NUM_SAMPLES // 3))
+        best = np.argsort(-matched, kind="stable")[:NUM_FINE]
+        return max(self._aligned(local_map, scan, coarse[best]), key=lambda found: found.score)
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
@@ -144,39 +146,45 @@ class SurfaceGeometry:
         return homogeneous(rotations, translations)
 
     def _aligned(self, local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
-        found = align_on_host(scan.surface, local_map.surface, orthonormal(starts), self._narrow)
-        return [self._scored(local_map, scan, T) for T in found.T_target_source]
+        T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), self._narrow).T_target_source
+        planes = self._planes(local_map, scan, T, NUM_SAMPLES)
+        matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
+        scores = matched - CONTRADICTION_WEIGHT * contradicted
+        columns = (column.tolist() for column in (matched, contradicted, scores))
+        information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
+        return list(map(Alignment, T, *columns, information))
 
-    def _scored(self, local_map: LocalMap, scan: Scan, T: Pose) -> Alignment:
-        surface = scan.surface
-        planes = self._planes(local_map, surface, T, NUM_SAMPLES)
-        matched, contradicted = _matched_share(surface, planes), _contradicted_share(local_map, scan, T)
-        pairs = planes.take(planes.is_paired)
-        if scan.weak_axis is not None:
-            is_firm = planes.meets & (surface.flatness[surface.samples[: planes.meets.shape[1]]] > 0)
-            pairs = without_noise_along(pairs, T[:3, :3] @ scan.weak_axis, is_firm[planes.is_paired])
-        information = with_least_covariance(plane_information(pairs, T), FLOOR_M, FLOOR_RAD)
-        return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
-
-    def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> Pairs:
-        return nearest_planes(surface, local_map.surface, T_map_scan[None], self._plane_radius_m, num_samples)
+    def _planes(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
+        return nearest_planes(scan.surface, local_map.surface, T_map_scan, self._plane_radius_m, num_samples)
 
 
-def _matched_share(surface: Surface, planes: Pairs) -> float:
+def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
+    """Returns the information of a pose by the planes that elements meet; along a corridor, firm ones alone count."""
+    pairs = planes.take(planes.is_paired)
+    if scan.weak_axis is not None:
+        is_firm = pairs.meets & (scan.surface.flatness[scan.surface.samples[: len(planes.meets)]] > 0)[planes.is_paired]
+        pairs = without_noise_along(pairs, T_map_scan[:3, :3] @ scan.weak_axis, is_firm)
+    return with_least_covariance(plane_information(pairs, T_map_scan), FLOOR_M, FLOOR_RAD)
+
+
+def _matched_shares(surface: Surface, planes: Pairs) -> Float[np.ndarray, " s"]:
     """Returns the mean share of elements that meet planes, over the main directions of their normals.
 
     Ground meets ground under any motion: without the mean it would outweigh the walls.
     """
-    meets = planes.meets[0]
-    direction = np.argmax(np.abs(surface.normals[surface.samples[: len(meets)]]), axis=1)
-    counts = np.bincount(direction, minlength=3)
-    shares = np.bincount(direction, weights=meets, minlength=3) / np.maximum(counts, 1)
+    meets = planes.meets
+    is_along = np.eye(3)[np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)]
+    counts = is_along.sum(axis=0)
     # A direction of few elements counts less, because its share is uncertain.
-    return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
+    weights = np.minimum(counts, counts.max() / 3) + 1e-9
+    return np.asarray(meets @ is_along / np.maximum(counts, 1) @ (weights / weights.sum()))
 
 
-def _contradicted_share(local_map: LocalMap, scan: Scan, T_map_scan: Pose) -> float:
+def _contradicted_shares(local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Float[np.ndarray, " s"]:
     """Returns the share of visible elements of the map that lie in the free space of the scan."""
-    points = local_map.surface.points[local_map.surface.samples[:MAX_VIEWED]]
-    is_visible, is_contradicted = view_points(scan.image, (points - T_map_scan[:3, 3]) @ T_map_scan[:3, :3])
-    return float(is_contradicted.sum()) / max(int(is_visible.sum()), 1)
+    surface = local_map.surface
+    points = surface.points.take(surface.samples[:MAX_VIEWED], axis=0).astype(np.float32)
+    T_scan_map = rigid.inverse(T_map_scan).astype(np.float32)
+    moved = np.matmul(T_scan_map[:, :3, :3], points.T) + T_scan_map[:, :3, 3:]
+    is_visible, is_contradicted = view_points(scan.image, moved.swapaxes(1, 2))
+    return np.asarray(is_contradicted.sum(axis=1) / np.maximum(is_visible.sum(axis=1), 1))
