@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dpmjax import Model, slam
+from dpmjax import Model, scans, slam
 
 NUM_ELEMENTS = (64, 128, 256, 512, 1024)
 WHOLE, NETWORK, PAPER = "whole", "network proposes every pose", "paper"
@@ -52,9 +52,9 @@ def with_fewer_elements(model: Model, num_elements: int) -> slam.SlamMethods:
     Fewer elements of the same surface are farther apart, by the root of the ratio: radii of odometry grow with it.
     """
     factor = max(math.sqrt(model.config.pyramid.stages[0].num_points / num_elements), 1.0)
-    whole = slam.make_methods(model, _with_wider_radii(slam.SlamConfig(), factor))
+    whole = slam.make_methods(model)
 
-    def encode(scan: slam.ThinnedScan) -> Any:
+    def encode(scan: scans.Scan) -> Any:
         """Returns a keyframe with its first elements, in the order of farthest points, and their features."""
         compact = whole.matcher.encode(scan)
         unit_m, *arrays = compact.elements
@@ -64,31 +64,21 @@ def with_fewer_elements(model: Model, num_elements: int) -> slam.SlamMethods:
         }
         return compact._replace(elements=elements, **described)
 
-    def thin(points: np.ndarray) -> slam.ThinnedScan | None:
+    def thin(points: np.ndarray) -> scans.Scan | None:
         """Returns a scan with its first elements only."""
         scan = whole.geometry.thin(points)
         if scan is None:
             return None
-        surface = scan.measured.surface
+        surface = scan.surface
         # Normals are those of all points, as in a keyframe.
         first = {name: getattr(surface, name)[:num_elements] for name in ("points", "normals", "flatness")}
         samples, tree = surface.samples[surface.samples < num_elements], type(surface.tree)(first["points"])
         few = surface._replace(**first, samples=samples, tree=tree)
-        return scan._replace(measured=scan.measured._replace(surface=few))
+        return scan._replace(surface=few)
 
-    matcher, geometry = _Replaced(whole.matcher, encode=encode), _Replaced(whole.geometry, thin=thin)
+    matcher = _Replaced(whole.matcher, encode=encode)
+    geometry = _Replaced(slam.SurfaceGeometry(model.config, spacing=factor), thin=thin)
     return whole._replace(matcher=matcher, geometry=geometry)
-
-
-def _with_wider_radii(config: slam.SlamConfig, factor: float) -> slam.SlamConfig:
-    def wider(alignment: Any) -> Any:
-        levels = (replace(level, radius_m=factor * level.radius_m) for level in alignment.levels)
-        return replace(alignment, levels=tuple(levels))
-
-    odometry = config.odometry
-    radius_m = factor * odometry.plane_radius_m
-    odometry = replace(odometry, narrow=wider(odometry.narrow), wide=wider(odometry.wide), plane_radius_m=radius_m)
-    return replace(config, odometry=odometry)
 
 
 class _Replaced:

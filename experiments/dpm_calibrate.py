@@ -310,13 +310,12 @@ def measure_motions(
         poses.append(drive.T_world_lidar[row] @ T_lidar_turned)
     prepared = [dpm.prepare_scan(model, scan) for scan in clouds]
     found = dpm.match_clouds(model, *(scan.descriptors for scan in prepared), config=model.config.matching)
-    measured = [scan.measured for scan in prepared]
-    surfaces, config = [scan.surface for scan in measured], model.config.verification
+    surfaces, config = [scan.surface for scan in prepared], model.config.verification
     T = np.concatenate([dpm.distinct_motions(found), scans.correlate_views(*surfaces, config.views)])
     for alignment in (dpm.COARSE, dpm.FINE):
-        T = scans.align_surfaces(*surfaces, T, alignment)
+        T = scans.align_on_host(*surfaces, T, alignment).T_target_source
     T_true = np.broadcast_to(rigid.inverse(poses[1]) @ poses[0], T.shape)
-    return dpm.evidence_shares(*measured, T, config), metrics.registration_recall(T, T_true).is_right
+    return dpm.evidence_shares(*prepared, T, config), metrics.registration_recall(T, T_true).is_right
 
 
 def share_right(scene: Mapping[str, np.ndarray], weights: np.ndarray | None) -> float:

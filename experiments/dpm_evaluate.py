@@ -29,6 +29,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from dpmjax import cli, encode, load_model, register
 from dpmjax import deeppointmap as dpm
 from dpmjax.metrics import mcnemar_p_value
+from dpmjax.scans import measure_scan
 
 EXPERIMENT = "dpm_evaluate"
 # Overlap is cheap: more pairs, of each kind.
@@ -121,7 +122,7 @@ def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def search_alone(source: np.ndarray, target: np.ndarray, config: dpm.VerificationConfig) -> np.ndarray:
     """Returns `T_target_source` by the search of `register` among the views from above, without a network."""
-    measured = dpm.measure_scan(source, config), dpm.measure_scan(target, config)
+    measured = measure_scan(source, config.surface), measure_scan(target, config.surface)
     chosen = dpm.choose_motion(*measured, np.eye(4)[None], config)
     return dpm.refine_motion(*measured, chosen, config).T_target_source
 

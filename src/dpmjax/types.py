@@ -81,8 +81,8 @@ class SurfaceElements:
         mask: True for valid elements; invalid ones may hold anything.
     """
 
-    positions: Float[AnyArray, "n 3"]
-    normals: Float[AnyArray, "n 3"]
+    positions: Float[AnyArray, "n d"]
+    normals: Float[AnyArray, "n d"]
     planarity: Float[AnyArray, " n"]
     mask: Bool[AnyArray, " n"]
 

@@ -24,7 +24,8 @@ from dpmjax.deeppointmap.confidence import (
     weak_features,
 )
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, verify_elements
-from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, measure_scan, measured_elements
+from dpmjax.deeppointmap.verification import VerificationConfig
+from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
 from dpmjax.scans.weak_directions import facing_samples, sliding_motions, wall_axis, weak_share, weakest_direction
 from dpmjax.types import Registration, SurfaceElements, Verification
 from tests.scans.surface_scenes import corridor, motion, seen_from, street
@@ -36,19 +37,19 @@ T_TRUE = np.linalg.inv(POSES[1]) @ POSES[0]
 RANGE_M = 20.0
 
 
-def scans_of(pillars_m: tuple[float, ...]) -> list[MeasuredScan]:
+def scans_of(pillars_m: tuple[float, ...]) -> list[Scan]:
     """Scans of both poses, of other points of the same surfaces."""
     points = [seen_from(corridor(seed, pillars_m), T) for seed, T in enumerate(POSES)]
-    return [measure_scan(some[np.linalg.norm(some, axis=1) < RANGE_M], CONFIG) for some in points]
+    return [measure_scan(some[np.linalg.norm(some, axis=1) < RANGE_M]) for some in points]
 
 
 @pytest.fixture(scope="module")
-def with_pillars() -> list[MeasuredScan]:
+def with_pillars() -> list[Scan]:
     return scans_of(PILLARS_M)
 
 
 @pytest.fixture(scope="module")
-def bare() -> list[MeasuredScan]:
+def bare() -> list[Scan]:
     return scans_of(())
 
 
@@ -81,7 +82,7 @@ def test_a_bare_corridor_is_never_sure_of_the_shift(bare, with_pillars) -> None:
     assert confidence(choose_motion(*with_pillars, T_TRUE[None], CONFIG)) > 0.9
 
 
-def elements_of(scan: MeasuredScan) -> MeasuredScan:
+def elements_of(scan: Scan) -> Scan:
     """Every 4th point as a surface element, which is what descriptor clouds keep of a scan."""
     surface = scan.surface
     points, normals, planarity = (array[::4] for array in (surface.points, surface.normals, surface.flatness))
@@ -109,7 +110,7 @@ def test_elements_tell_the_motion_from_shifts_but_are_never_sure(with_pillars) -
 
 def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None:
     points = [seen_from(street(seed), T) for seed, T in enumerate((motion(10, (1, 0, 0)), motion(30, (-2, 1, 0))))]
-    elements = [elements_of(measure_scan(some, CONFIG)) for some in points]
+    elements = [elements_of(measure_scan(some)) for some in points]
     T_true = np.linalg.inv(motion(30, (-2, 1, 0))) @ motion(10, (1, 0, 0))
     right, turned = (verify_elements(*elements, T, CONFIG) for T in (T_true, T_true @ motion(90, (0, 0, 0))))
     assert right.num_slid == turned.num_slid == 0
@@ -157,7 +158,7 @@ def test_walls_of_all_directions_leave_the_choice_as_it_was() -> None:
         for seed, angle in enumerate(range(0, 360, 50))
     ]
     points = np.concatenate([ground, *walls])
-    scans = [measure_scan(seen_from(points, T), CONFIG) for T in POSES]
+    scans = [measure_scan(seen_from(points, T)) for T in POSES]
     hypotheses = np.stack([along_the_corridor(9.0), along_the_corridor(0.5)])
     found = choose_motion(*scans, hypotheses, CONFIG)
     without = choose_motion(*scans, hypotheses, replace(CONFIG, max_weak_share=0))
@@ -187,7 +188,7 @@ def test_an_end_wall_counts_as_one_position(with_pillars) -> None:
 
 
 def test_scans_without_walls_have_no_weak_axis() -> None:
-    empty = wall_axis(measure_scan(np.zeros((0, 3)), CONFIG).surface)
+    empty = wall_axis(measure_scan(np.zeros((0, 3))).surface)
     assert weak_share(empty, empty) == 0.5
     assert empty.extent_m == 0
 

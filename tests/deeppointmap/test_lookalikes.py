@@ -10,7 +10,8 @@ import pytest
 import dpmjax
 from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
-from dpmjax.deeppointmap.verification import VerificationConfig, measure_scan
+from dpmjax.deeppointmap.verification import VerificationConfig
+from dpmjax.scans.lidar import measure_scan
 from tests.scans.surface_scenes import motion, rectangle, seen_from, street
 
 CONFIG = VerificationConfig()
@@ -33,7 +34,7 @@ def room(rng: np.random.Generator, *, has_niche: bool = False) -> np.ndarray:
 
 def scans_of(*, has_niche: bool):
     points = [seen_from(room(np.random.default_rng(seed), has_niche=has_niche), T) for seed, T in enumerate(POSES)]
-    return [measure_scan(some, CONFIG) for some in points]
+    return [measure_scan(some) for some in points]
 
 
 @pytest.mark.parametrize("T", [T_TRUE, T_HALF_TURN])
@@ -58,7 +59,7 @@ def test_nothing_competes_where_the_search_is_off_or_no_motion_is_clear() -> Non
     assert choose_motion(*scans_of(has_niche=False), T_TRUE[None], settings).verification.lookalike_gap == np.inf
     far = motion(0, (500.0, 0.0, 0.0))
     views = replace(CONFIG, views=replace(CONFIG.views, num_motions=0))
-    streets = [measure_scan(street(seed), CONFIG) for seed in (0, 1)]
+    streets = [measure_scan(street(seed)) for seed in (0, 1)]
     assert choose_motion(*streets, far[None], views).verification.lookalike_gap == np.inf
 
 

@@ -11,9 +11,10 @@ from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.model import model_fingerprint
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.prepared_scans import compact_scan, expand_scan, round_directions, round_features
-from dpmjax.deeppointmap.verification import VerificationConfig, measure_scan
+from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import pyramid_elements
+from dpmjax.scans.lidar import measure_scan
 from dpmjax.scans.surfaces import surface_of_elements
 from dpmjax.types import DescriptorCloud
 from tests.scans.surface_scenes import motion, seen_from, street
@@ -48,9 +49,9 @@ def scans() -> list[np.ndarray]:
 
 @pytest.mark.slow
 def test_compact_scans_find_the_same_motion(scans) -> None:
-    images = [measure_scan(scan, CONFIG).image for scan in scans]
+    images = [measure_scan(scan).image for scan in scans]
     compact = [compact_scan(cloud_of(scan), image) for scan, image in zip(scans, images, strict=True)]
-    found = [expand_scan(one).measured for one in compact]
+    found = [expand_scan(one) for one in compact]
     hypotheses = np.stack([motion(200, (3, 0, 0)), T_TRUE @ motion(3, (1.0, -0.8, 0.1))])
     chosen = choose_motion(*found, hypotheses, CONFIG)
     T = refine_motion(*found, chosen, CONFIG).T_target_source
@@ -60,7 +61,7 @@ def test_compact_scans_find_the_same_motion(scans) -> None:
 
 
 def test_a_compact_scan_is_the_cloud_within_rounding(scans) -> None:
-    cloud, image = cloud_of(scans[0]), measure_scan(scans[0], CONFIG).image
+    cloud, image = cloud_of(scans[0]), measure_scan(scans[0]).image
     compact = compact_scan(cloud, image)
     found = compact.cloud
     np.testing.assert_array_equal(found.mask, cloud.mask)
@@ -70,7 +71,7 @@ def test_a_compact_scan_is_the_cloud_within_rounding(scans) -> None:
     cosines = np.sum(found.directions * cloud.directions, axis=1)
     assert cosines.min() > np.cos(np.radians(0.5 * 180 / 127 + 0.01))
     # The scan that registration reads is made of the same elements.
-    surface, expected = expand_scan(compact).measured.surface, surface_of_elements(found.elements)
+    surface, expected = expand_scan(compact).surface, surface_of_elements(found.elements)
     for name in ("points", "normals", "flatness", "samples"):
         np.testing.assert_array_equal(getattr(surface, name), getattr(expected, name))
 

@@ -11,9 +11,9 @@ from dpmjax.deeppointmap.verification import (
     EVIDENCE,
     VerificationConfig,
     evidence_shares,
-    measure_scan,
     verify_motions,
 )
+from dpmjax.scans.lidar import measure_scan
 from dpmjax.scans.surfaces import Surface, surface_of_elements
 from dpmjax.types import SurfaceElements, Verification
 from tests.scans.surface_scenes import motion, seen_from, street
@@ -29,7 +29,7 @@ def verify_motion(source, target, T: np.ndarray, config: VerificationConfig) -> 
 
 @pytest.fixture(scope="module")
 def scans():
-    return tuple(measure_scan(seen_from(street(seed), T), CONFIG) for seed, T in enumerate((T_WORLD_A, T_WORLD_B)))
+    return tuple(measure_scan(seen_from(street(seed), T)) for seed, T in enumerate((T_WORLD_A, T_WORLD_B)))
 
 
 def translation_error(T: np.ndarray) -> float:
@@ -49,7 +49,7 @@ def test_two_scans_on_each_other_gain_nothing_by_their_ground() -> None:
     # 16 m apart, each sees 20 m: half of the truth lies where only one of them sees, and all ground meets anywhere.
     poses = motion(0, (-8, 0, 0)), motion(0, (8, 0, 0))
     points = [seen_from(street(seed, 40_000), T) for seed, T in enumerate(poses)]
-    scans = [measure_scan(some[np.linalg.norm(some, axis=1) < 20], CONFIG) for some in points]
+    scans = [measure_scan(some[np.linalg.norm(some, axis=1) < 20]) for some in points]
     motions = np.stack([np.linalg.inv(poses[1]) @ poses[0], np.eye(4), motion(180, (0, 0, 0))])
     right, *wrong = verify_motions(*scans, motions, CONFIG)
     assert right.matched_share < max(one.matched_share for one in wrong)
@@ -118,7 +118,7 @@ def test_near_equal_hypotheses_do_not_compete(scans) -> None:
 
 
 def test_empty_scans_leave_the_hypothesis(scans) -> None:
-    empty = measure_scan(np.zeros((0, 3)), CONFIG)
+    empty = measure_scan(np.zeros((0, 3)))
     for pair in ((empty, scans[0]), (scans[0], empty), (empty, empty)):
         found = choose_motion(*pair, T_TRUE[None], CONFIG)
         np.testing.assert_allclose(found.T_target_source, T_TRUE)

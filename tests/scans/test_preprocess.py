@@ -8,10 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from dpmjax.geometry.neighbours import HostTree
 from dpmjax.scans import PreprocessConfig, preprocess_scan, preprocess_scan_on_host
-from dpmjax.scans.preprocess import OUTLIER_SIGMAS, TABLE_BITS, first_of_each_voxel
+from dpmjax.scans.outliers import NUM_SPACED, OUTLIER_SIGMAS, find_inliers
+from dpmjax.scans.preprocess import TABLE_BITS, first_of_each_voxel
 from dpmjax.types import PointCloud
+from tests.scans.surface_scenes import street
 
 CONFIG = PreprocessConfig(max_range_m=30.0, num_outlier_neighbours=5, capacity=512)
 BUILDERS = pytest.mark.parametrize("preprocess", [preprocess_scan, preprocess_scan_on_host])
@@ -72,6 +76,20 @@ def test_both_forms_agree(case: str) -> None:
     device = jax.device_get(preprocess_scan(points, mask, CONFIG))
     jax.tree.map(np.testing.assert_array_equal, device, host)
     assert host.mask.sum() == {"one": 1, "none": 0, "too near": 0}.get(case, host.mask.sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_of_a_large_scan_are_those_of_all_neighbours(seed: int) -> None:
+    """Neighbours of few points are searched: only points near the limit may be judged otherwise."""
+    lonely = np.random.default_rng(seed).uniform(-60, 60, (60, 3))
+    points = np.concatenate([street(seed, 8000), lonely])
+    assert len(points) > 4 * NUM_SPACED
+    spread = cKDTree(points).query(points, 11)[0][:, 1:].mean(axis=1)
+    limit = spread.mean() + OUTLIER_SIGMAS * spread.std()
+    is_inlier = find_inliers(HostTree(points), 10)
+    assert 20 < (~is_inlier).sum() < 200
+    is_clear = np.abs(spread / limit - 1) > 0.03
+    np.testing.assert_array_equal(is_inlier[is_clear], (spread <= limit)[is_clear])
 
 
 # The bounding box of the second cloud has nearly 2^63 voxels.

@@ -4,18 +4,11 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import estimate_normals
-from dpmjax.scans.surface_alignment import (
-    AlignmentConfig,
-    AlignmentLevel,
-    align_surfaces,
-    nearest_planes,
-)
+from dpmjax.geometry.neighbours import HostTree
+from dpmjax.scans.align import LEVELS, AlignmentLevel, align_on_host
+from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, SurfaceConfig, firm_surface, scan_surface, surface_at
-from tests.scans.surface_scenes import motion, seen_from, street
-
-ALIGNMENT = AlignmentConfig(
-    levels=(AlignmentLevel(3.0, 1500, 6), AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10))
-)
+from tests.scans.surface_scenes import motion, street
 
 
 def test_normals_are_those_of_the_device() -> None:
@@ -52,42 +45,7 @@ def test_surface_of_hardly_any_point_is_flat_nowhere(num_points: int) -> None:
     assert len(surface.points) == num_points
     assert len(surface.samples) == 0
     start = motion(10, (1, 0, 0))
-    np.testing.assert_array_equal(align_surfaces(surface, surface, start[None], ALIGNMENT)[0], start)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_two_samplings_of_a_street_are_aligned(seed: int) -> None:
-    """The oracle is the motion with which the scans were made."""
-    rng = np.random.default_rng(seed)
-    T_world_a, T_world_b = motion(5, (1, -2, 0.1), 1), motion(rng.uniform(-180, 180), (-4, 3, 0), -1)
-    a, b = seen_from(street(seed), T_world_a), seen_from(street(10 + seed), T_world_b)
-    T_b_a = np.linalg.inv(T_world_b) @ T_world_a
-    guess = T_b_a @ motion(rng.uniform(-4, 4), tuple(rng.uniform(-1, 1, 3)), 0.5)
-    (found,) = align_surfaces(scan_surface(a), scan_surface(b), guess[None], ALIGNMENT)
-    difference = np.linalg.inv(T_b_a) @ found
-    assert np.linalg.norm(difference[:3, 3]) < 0.02
-    assert np.degrees(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))) < 0.1
-
-
-def test_what_no_plane_holds_stays() -> None:
-    """On a plain, only height and tilt are fixed."""
-    rng = np.random.default_rng(0)
-    plain = [np.column_stack([rng.uniform(-20, 20, (3000, 2)), np.full(3000, -2.0)]) for _ in range(2)]
-    start = motion(3, (0.5, -0.4, 0.3))
-    (found,) = align_surfaces(*map(scan_surface, plain), start[None], ALIGNMENT)
-    assert abs(found[2, 3]) < 0.01
-    np.testing.assert_allclose(found[:2, 3], start[:2, 3], atol=0.05)
-
-
-def test_starts_that_are_aligned_together_end_as_alone() -> None:
-    a, b = scan_surface(street(6)), scan_surface(street(7))
-    nowhere = motion(0, (500.0, 0, 0))
-    starts = np.array([motion(2, (0.5, 0.3, 0)), nowhere, np.eye(4), motion(-60, (0, 2, 0))])
-    together = align_surfaces(a, b, starts, ALIGNMENT)
-    for start, found in zip(starts, together, strict=True):
-        np.testing.assert_allclose(found, align_surfaces(a, b, start[None], ALIGNMENT)[0], atol=1e-9)
-    np.testing.assert_array_equal(together[1], nowhere)
-    np.testing.assert_allclose(together[0], together[2], atol=0.01)
+    np.testing.assert_array_equal(align_on_host(surface, surface, start[None], LEVELS).T_target_source[0], start)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +54,6 @@ def test_starts_that_are_aligned_together_end_as_alone() -> None:
         (lambda: SurfaceConfig(voxel_size_m=0.0), "voxel_size_m"),
         (lambda: SurfaceConfig(min_range_m=90.0), "min_range_m"),
         (lambda: AlignmentLevel(0.0, 10, 1), "radius_m"),
-        (lambda: AlignmentConfig(levels=()), "levels"),
     ],
 )
 def test_settings_out_of_range_are_named(make, name: str) -> None:
@@ -117,17 +74,17 @@ def test_a_surface_at_some_points_has_the_normals_of_all() -> None:
     points = street_under_foliage()
     whole = scan_surface(points)
     rows = np.random.default_rng(1).permutation(len(whole.points))[:700]
-    some = surface_at(whole.points, rows)
+    some = surface_at(HostTree(whole.points), rows)
     is_flat = whole.flatness[rows] > MIN_FLATNESS
     np.testing.assert_array_equal(some.points, whole.points[rows])
     np.testing.assert_allclose(some.flatness[is_flat], whole.flatness[rows][is_flat], atol=1e-12)
-    np.testing.assert_allclose(np.abs((some.normals * whole.normals[rows]).sum(axis=1)[is_flat]), 1)
+    np.testing.assert_allclose(np.abs((some.normals * whole.normals[rows]).sum(axis=1)[is_flat]), 1, atol=1e-6)
 
 
 def test_points_of_no_surface_are_the_last_samples_and_are_paired_with_any_plane() -> None:
     points = street_under_foliage()
     whole = scan_surface(points)
-    some = surface_at(whole.points, np.arange(len(whole.points)))
+    some = surface_at(HostTree(whole.points), np.arange(len(whole.points)))
     num_flat = int((some.flatness > 0).sum())
     assert 100 < len(some.points) - num_flat < 400
     assert sorted(some.samples) == list(range(len(some.points)))

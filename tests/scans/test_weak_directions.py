@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpmjax.scans.surface_alignment import PlanePairs
+from dpmjax.scans.pairs import Pairs
 from dpmjax.scans.weak_directions import (
     CUBE_M,
     SCATTER_FACTOR,
@@ -15,6 +15,11 @@ from dpmjax.scans.weak_directions import (
 )
 
 IDENTITY = np.eye(4)
+
+
+def pairs_of(points: np.ndarray, residuals: np.ndarray, normals: np.ndarray) -> Pairs:
+    ones = np.ones(len(points))
+    return Pairs(ones > 0, points, residuals, normals, ones, ones)
 
 
 def walls(rng: np.random.Generator, num: int = 1500) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +40,7 @@ def test_sigma_covers_alignments_whose_cubes_disagree() -> None:
     for _ in range(300):
         residuals = rng.normal(0, 0.05, cubes.max() + 1)[cubes] + rng.normal(0, 0.01, len(points))
         step = np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
-        pairs = PlanePairs(points, residuals - jacobian @ step, normals)
+        pairs = pairs_of(points, residuals - jacobian @ step, normals)
         before.append(np.linalg.inv(plane_information(pairs, IDENTITY))[0, 0])
         variances.append(sigma_along(scattered_information(pairs, IDENTITY), np.array([1.0, 0, 0])) ** 2 - before[-1])
         errors.append(step[0])
@@ -50,7 +55,7 @@ def test_one_cube_alone_is_as_uncertain_as_its_planes() -> None:
     normals = np.tile([1.0, 0, 0], (200, 1))
     jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1)
     noise = rng.uniform(-0.02, 0.02, 200)
-    pairs = PlanePairs(points, noise - jacobian @ np.linalg.lstsq(jacobian, noise, rcond=None)[0], normals)
+    pairs = pairs_of(points, noise - jacobian @ np.linalg.lstsq(jacobian, noise, rcond=None)[0], normals)
     by_planes, scattered = plane_information(pairs, IDENTITY), scattered_information(pairs, IDENTITY)
     sigmas = [sigma_along(information, np.array([1.0, 0, 0])) for information in (scattered, by_planes)]
     np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-4)
@@ -61,7 +66,7 @@ def test_few_pairs_have_no_more_information_than_they_have() -> None:
     rng = np.random.default_rng(2)
     for num in (30, 150):
         points, normals = rng.normal(0, 10.0, (num, 3)), np.eye(3)[np.arange(num) % 3]
-        pairs = PlanePairs(points, np.full(num, 0.05) * rng.choice([-1, 1], num), normals)
+        pairs = pairs_of(points, np.full(num, 0.05) * rng.choice([-1, 1], num), normals)
         jacobian = np.concatenate([normals, np.cross(points, normals)], axis=1) / 0.05
         np.testing.assert_allclose(
             plane_information(pairs, IDENTITY), jacobian.T @ jacobian + UNKNOWN, rtol=1e-6, atol=1
@@ -69,6 +74,6 @@ def test_few_pairs_have_no_more_information_than_they_have() -> None:
 
 
 def test_few_planes_constrain_nothing() -> None:
-    pairs = PlanePairs(np.ones((5, 3)), np.zeros(5), np.eye(3)[[0, 1, 2, 0, 1]])
+    pairs = pairs_of(np.ones((5, 3)), np.zeros(5), np.eye(3)[[0, 1, 2, 0, 1]])
     np.testing.assert_allclose(plane_information(pairs, IDENTITY), UNKNOWN)
     np.testing.assert_allclose(scattered_information(pairs, IDENTITY), UNKNOWN)

@@ -10,7 +10,8 @@ import dpmjax
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.prepared_scans import expand_elements
 from dpmjax.deeppointmap.scan_registration import match_clouds
-from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry, ThinnedScan
+from dpmjax.scans import Scan
+from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry
 from dpmjax.slam.model_methods import union_of
 from tests.deeppointmap import toy
 from tests.slam.test_odometry import motion, planes, seen_from
@@ -19,7 +20,7 @@ POSES = [motion(1.5 * number, 0.1, 10.0 * number) for number in range(3)]
 
 
 @pytest.fixture(scope="module")
-def scans() -> list[ThinnedScan]:
+def scans() -> list[Scan]:
     geometry, rng = SurfaceGeometry(toy.SLAM_MODEL), np.random.default_rng(0)
     return [geometry.thin(seen_from(planes(rng), T)) for T in POSES]
 
@@ -32,7 +33,7 @@ def matcher() -> NetworkMatcher:
 def test_a_keyframe_holds_the_elements_that_odometry_aligns(matcher, scans) -> None:
     for scan in scans:
         compact = matcher.encode(scan)
-        elements, surface = expand_elements(compact.elements), scan.measured.surface
+        elements, surface = expand_elements(compact.elements), scan.surface
         apart_m, rows = surface.tree.nearest(elements.positions[elements.mask], 1)[::-1]
         is_both = apart_m[:, 0] < compact.elements.unit_m
         assert is_both.mean() > 0.1

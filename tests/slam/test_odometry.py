@@ -11,11 +11,13 @@ from dpmjax import model_preset
 from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_elements, compact_image
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
+from dpmjax.scans import Scan
+from dpmjax.scans.lidar import MAX_ELEMENTS, SPREAD_M
 from dpmjax.scans.weak_directions import sigma_along
-from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry, ThinnedScan
+from dpmjax.slam import Alignment, KeyframeMap, LocalMap, OdometryConfig, SurfaceGeometry
 from dpmjax.slam.keyframe_map import Keyframe, add_keyframe
 from dpmjax.slam.local_map import local_map_of
-from dpmjax.slam.surface_geometry import CONTRADICTION_WEIGHT, MAX_ELEMENTS, SPREAD_M
+from dpmjax.slam.surface_geometry import CONTRADICTION_WEIGHT
 from dpmjax.types import SurfaceElements
 
 
@@ -43,15 +45,15 @@ def seen_from(points: np.ndarray, T_world_scan: np.ndarray) -> np.ndarray:
     return (points - T_world_scan[:3, 3]) @ T_world_scan[:3, :3]
 
 
-def compacted(scan: ThinnedScan) -> CompactScan:
+def compacted(scan: Scan) -> CompactScan:
     """The scan as a map keeps it, without descriptors."""
     none = np.zeros((0, 1), np.int8), np.zeros(0, np.float32), np.zeros(0, np.int8)
-    surface = scan.measured.surface
+    surface = scan.surface
     elements = SurfaceElements(surface.points, surface.normals, surface.flatness, np.ones(len(surface.points), bool))
-    return CompactScan(compact_elements(elements), *none, compact_image(scan.measured.image))
+    return CompactScan(compact_elements(elements), *none, compact_image(scan.image))
 
 
-def map_of_one(scan: ThinnedScan) -> LocalMap:
+def map_of_one(scan: Scan) -> LocalMap:
     """The local map after the first keyframe."""
     keyframe = Keyframe(0, np.eye(4), 0.0, 0, scan.extent_m, compacted(scan))
     return local_map_of(add_keyframe(KeyframeMap(), keyframe, np.eye(4), np.ones(1), None), (), OdometryConfig())
@@ -158,7 +160,7 @@ def test_ground_does_not_outvote_walls(geometry) -> None:
     local_map = map_of_one(geometry.thin(ground))
     alone = geometry.align(local_map, geometry.thin(ground), np.eye(4))
     scan = geometry.thin(np.concatenate([ground, walls, sides]))
-    surface = scan.measured.surface
+    surface = scan.surface
     ground_share = np.mean(np.abs(surface.normals[surface.samples, 2]) > 0.9)
     assert alone.matched_share > 0.95
     assert geometry.align(local_map, scan, np.eye(4)).matched_share < ground_share - 0.1
@@ -188,7 +190,7 @@ def test_empty_scans_are_none(geometry) -> None:
 def test_a_thinned_scan_is_of_points_of_the_scan(geometry) -> None:
     points = planes(np.random.default_rng(0))
     scan = geometry.thin(points)
-    surface = scan.measured.surface
+    surface = scan.surface
     assert cKDTree(points).query(surface.points)[0].max() < 1e-4
     assert len(surface.points) == MAX_ELEMENTS
     # The first elements stand for all of the scan: no point is far from them.

@@ -11,6 +11,7 @@ import pytest
 from dpmjax import encode
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
+from dpmjax.scans import Scan
 from dpmjax.slam import (
     Alignment,
     LocalMap,
@@ -18,7 +19,6 @@ from dpmjax.slam import (
     SlamConfig,
     SlamMethods,
     SlamResult,
-    ThinnedScan,
     finish_slam,
     init_slam,
     localize,
@@ -159,7 +159,7 @@ class DoorwayGeometry(TruthGeometry):
 
     door: int = 0
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+    def search(self, local_map: LocalMap, scan: Scan, T_map_scan: np.ndarray) -> Alignment:
         number, last = number_of_scan(scan), round(float(local_map.keyframes[0].positions[0, 0]))
         T_map_before = rigid.inverse(self.T_world_scan[last]) @ self.T_world_scan[number - 1]
         element = T_map_before[:3, :3] @ [number - 1, 0, 0] + T_map_before[:3, 3]
@@ -187,13 +187,13 @@ class CorridorGeometry(TruthGeometry):
 
     corridor: range = range(0)
 
-    def thin(self, points: np.ndarray) -> ThinnedScan | None:
+    def thin(self, points: np.ndarray) -> Scan | None:
         scan = super().thin(points)
         assert scan is not None
         is_in_corridor = number_of_scan(scan) in self.corridor
         return scan._replace(weak_axis=np.array([1.0, 0.0, 0.0])) if is_in_corridor else scan
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+    def search(self, local_map: LocalMap, scan: Scan, T_map_scan: np.ndarray) -> Alignment:
         found = super().search(local_map, scan, T_map_scan)
         if scan.weak_axis is None:
             return found

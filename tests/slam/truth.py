@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.prepared_scans import CompactElements, CompactImage, CompactScan, expand_elements
-from dpmjax.deeppointmap.verification import MeasuredScan
 from dpmjax.geometry import rigid
+from dpmjax.scans.lidar import Scan
 from dpmjax.scans.surfaces import surface_of_elements
-from dpmjax.slam import Alignment, LocalMap, Match, Proposal, Submap, ThinnedScan
+from dpmjax.slam import Alignment, LocalMap, Match, Proposal, Submap
 
 EMPTY = np.zeros((0, 3))
 NO_IMAGE = CompactImage(90, 0, *(np.zeros((0, 180), np.uint8),) * 2)
@@ -69,8 +69,8 @@ def laps(num_laps: int, side_m: float = 100.0, step_m: float = 1.0) -> np.ndarra
     return np.array(poses)
 
 
-def number_of_scan(scan: ThinnedScan) -> int:
-    return round(float(scan.measured.surface.points[0, 0]))
+def number_of_scan(scan: Scan) -> int:
+    return round(float(scan.surface.points[0, 0]))
 
 
 @dataclass(frozen=True)
@@ -83,16 +83,16 @@ class TruthGeometry:
     seed: int = 0
     failures: frozenset[int] = frozenset()
 
-    def thin(self, points: np.ndarray) -> ThinnedScan | None:
+    def thin(self, points: np.ndarray) -> Scan | None:
         if not len(points):
             return None
         elements = expand_elements(compact_of(int(points[0, 0])).elements)
-        return ThinnedScan(None, MeasuredScan(surface_of_elements(elements), None), 10.0)
+        return Scan(surface_of_elements(elements), None, extent_m=10.0)
 
-    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+    def align(self, local_map: LocalMap, scan: Scan, T_map_scan: np.ndarray) -> Alignment:
         return self.search(local_map, scan, T_map_scan[None])
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: np.ndarray) -> Alignment:
+    def search(self, local_map: LocalMap, scan: Scan, T_map_scan: np.ndarray) -> Alignment:
         # Relative to the last keyframe: odometry drifts.
         T_map_last, positions, *_ = local_map.keyframes[0]
         last, number = round(float(positions[0, 0])), number_of_scan(scan)
@@ -123,7 +123,7 @@ class TruthMatcher:
     least_probability: float = 0.6
     fingerprint: str = "truth"
 
-    def encode(self, scan: ThinnedScan) -> CompactScan:
+    def encode(self, scan: Scan) -> CompactScan:
         return compact_of(number_of_scan(scan))
 
     def propose(self, source: CompactScan, target: CompactScan, num_motions: int) -> Proposal:

@@ -57,7 +57,6 @@ from .overlap_prediction import head_probability as head_probability
 from .overlap_prediction import overlap as overlap
 from .overlap_prediction import overlap_pairs as overlap_pairs
 from .overlap_prediction import require_overlap as require_overlap
-from .prepared_scans import PreparedScan as PreparedScan
 from .prepared_scans import prepare_scan as prepare_scan
 from .scan_evaluation import NO_OVERLAP_M as NO_OVERLAP_M
 from .scan_evaluation import OverlapEvaluation as OverlapEvaluation
@@ -118,7 +117,5 @@ from .training.step import finish as finish
 from .training.step import init_training as init_training
 from .training.step import make_step as make_step
 from .verification import EvidenceWeights as EvidenceWeights
-from .verification import MeasuredScan as MeasuredScan
 from .verification import VerificationConfig as VerificationConfig
 from .verification import evidence_shares as evidence_shares
-from .verification import measure_scan as measure_scan

@@ -15,22 +15,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dpmjax.deeppointmap.verification import MeasuredScan, VerificationConfig, compare_scans, verify_motions
+from dpmjax.deeppointmap.verification import VerificationConfig, compare_scans, verify_motions
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
-from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel, align_surfaces
+from dpmjax.scans.align import AlignmentLevel, align_on_host
+from dpmjax.scans.lidar import Scan
 from dpmjax.scans.view_correlation import ViewCorrelationConfig, correlate_views
 from dpmjax.scans.weak_directions import WallAxis, facing_samples, sliding_motions, wall_axis, weak_share
 from dpmjax.types import Pose, Poses, Verification
 
 # Alignment of each hypothesis.
-COARSE = AlignmentConfig(levels=(AlignmentLevel(3.0, 600, 5),))
+COARSE = (AlignmentLevel(3.0, 600, 5),)
 
 # Alignment of the best `NUM_FINE` hypotheses.
-FINE = AlignmentConfig(levels=(AlignmentLevel(1.0, 1500, 5),))
+FINE = (AlignmentLevel(1.0, 1500, 5),)
 
 # Alignment of the chosen hypothesis by `refine_motion`; it starts where `FINE` ended.
-REFINEMENT = AlignmentConfig(levels=(AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10)))
+REFINEMENT = (AlignmentLevel(1.0, 4000, 8), AlignmentLevel(0.4, 8000, 10))
 
 NUM_FINE = 3
 
@@ -47,9 +48,7 @@ NUM_SLID_FINE = 32
 ELEMENT_RADIUS_M = 2.0
 
 # Alignment of elements, and number of sliding motions that are aligned by it.
-OF_ELEMENTS = AlignmentConfig(
-    levels=(AlignmentLevel(3.0, 1024, 5, kernel_m=0.5), AlignmentLevel(2.0, 1024, 4, kernel_m=0.2))
-)
+OF_ELEMENTS = (AlignmentLevel(3.0, 1024, 5, kernel_m=0.5), AlignmentLevel(2.0, 1024, 4, kernel_m=0.2))
 NUM_SLID_ELEMENTS = 16
 
 # Number of elements of each scan that face the axis and are compared.
@@ -89,9 +88,7 @@ class VerifiedMotion(NamedTuple):
     verification: Verification
 
 
-def choose_motion(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
-) -> VerifiedMotion:
+def choose_motion(source: Scan, target: Scan, T_target_source: Poses, config: VerificationConfig) -> VerifiedMotion:
     """Chooses the hypothesis under which two scans agree best.
 
     The walls of a corridor constrain one horizontal direction only. There, motions along its axis are tried too, with
@@ -122,7 +119,7 @@ def choose_motion(
     if is_weak := weak_share(*axes) < config.max_weak_share:
         starts = sliding_motions(*axes, SLIDING_STEP_M)
         num_slid = len(starts)
-        slid = align_surfaces(source.surface, target.surface, starts, COARSE)
+        slid = align_on_host(source.surface, target.surface, starts, COARSE).T_target_source
         order = np.argsort(-pair.facing_elements(axes, slid), kind="stable")
         finalists += pair.aligned([_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE)
     motions = [*lookalikes, *finalists, *remaining]
@@ -154,8 +151,8 @@ class _Candidate(NamedTuple):
 
 class _Pair(NamedTuple):
     # The two scans whose motion is chosen.
-    source: MeasuredScan
-    target: MeasuredScan
+    source: Scan
+    target: Scan
     config: VerificationConfig
 
     def candidates(self, T_target_source: Poses) -> Iterator[list[_Candidate]]:
@@ -182,13 +179,13 @@ class _Pair(NamedTuple):
         return sorted(others, key=_badness)
 
     def aligned(
-        self, candidates: Sequence[_Candidate | VerifiedMotion], alignment: AlignmentConfig
+        self, candidates: Sequence[_Candidate | VerifiedMotion], levels: tuple[AlignmentLevel, ...]
     ) -> list[VerifiedMotion]:
         """Aligns the surfaces of both scans from each candidate, and verifies the motions."""
         if not candidates:
             return []
         starts = np.stack([candidate.T_target_source for candidate in candidates])
-        T = align_surfaces(self.source.surface, self.target.surface, starts, alignment)
+        T = align_on_host(self.source.surface, self.target.surface, starts, levels).T_target_source
         verified = verify_motions(self.source, self.target, T, self.config)
         return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
 
@@ -204,9 +201,7 @@ class _Pair(NamedTuple):
         return np.mean(counts, axis=0)
 
 
-def refine_motion(
-    source: MeasuredScan, target: MeasuredScan, motion: VerifiedMotion, config: VerificationConfig
-) -> VerifiedMotion:
+def refine_motion(source: Scan, target: Scan, motion: VerifiedMotion, config: VerificationConfig) -> VerifiedMotion:
     """Aligns the surfaces of two scans point to plane, as finely as the scans allow.
 
     Args:
@@ -218,15 +213,13 @@ def refine_motion(
     Returns:
         The refined motion and its verification.
     """
-    T = align_surfaces(source.surface, target.surface, motion.T_target_source[None], REFINEMENT)
+    T = align_on_host(source.surface, target.surface, motion.T_target_source[None], REFINEMENT).T_target_source
     found = verify_motions(source, target, T, config)[0]
     kept = {name: getattr(motion.verification, name) for name in OF_THE_SEARCH}
     return VerifiedMotion(motion.row, T[0], found._replace(**kept))
 
 
-def verify_elements(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Pose, config: VerificationConfig
-) -> Verification:
+def verify_elements(source: Scan, target: Scan, T_target_source: Pose, config: VerificationConfig) -> Verification:
     """Compares the surface elements of two scans under a motion that is kept.
 
     In corridors motions along the axis are tried as by `choose_motion`. Elements are too few to choose among these, but
@@ -247,11 +240,13 @@ def verify_elements(
     if weak_share(*axes) >= config.max_weak_share:
         return found
     starts = sliding_motions(*axes, SLIDING_STEP_M)
+    num_slid = len(starts)
     order = np.argsort(-pair.facing_elements(axes, starts), kind="stable")
-    slid = align_surfaces(source.surface, target.surface, starts[order[:NUM_SLID_ELEMENTS]], OF_ELEMENTS)
+    starts = starts[order[:NUM_SLID_ELEMENTS]]
+    slid = align_on_host(source.surface, target.surface, starts, OF_ELEMENTS).T_target_source
     own, *facing = pair.facing_elements(axes, np.concatenate([T, slid]))
     best = np.array(facing)[_is_apart(slid, T_target_source)].max(initial=0.0)
-    return found._replace(num_slid=len(starts), facing_gap=float(own - best))
+    return found._replace(num_slid=num_slid, facing_gap=float(own - best))
 
 
 def _is_apart(T: Poses, T_other: Pose) -> Bool[np.ndarray, " s"]:

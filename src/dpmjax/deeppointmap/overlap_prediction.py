@@ -23,10 +23,11 @@ from dpmjax.deeppointmap.confidence import OverlapEvidence
 from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
-from dpmjax.deeppointmap.prepared_scans import PreparedScan, ScanOrCloud, descriptors_of
+from dpmjax.deeppointmap.prepared_scans import ScanOrCloud, descriptors_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
+from dpmjax.scans.lidar import Scan
 from dpmjax.types import DescriptorCloud, RawScan
 
 # Scans that are nearer to each other overlap.
@@ -72,7 +73,7 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     require_overlap(model)
     _require_one_scale(source, target)
     clouds = [
-        descriptors_of(scan if isinstance(scan, DescriptorCloud | PreparedScan) else encode(model, scan))
+        descriptors_of(scan if isinstance(scan, DescriptorCloud | Scan) else encode(model, scan))
         for scan in (source, target)
     ]
     return overlap_probability(model, *(cloud.described for cloud in clouds))
@@ -216,7 +217,7 @@ def _probability(logit: Float[Array, ""], a: DescriptorCloud, b: DescriptorCloud
 def _require_one_scale(source: ScanOrCloud, target: ScanOrCloud) -> None:
     """Refuses scans of two scales; that of a descriptor cloud is unknown, that of a raw scan is 1."""
     scans = [scan for scan in (source, target) if not isinstance(scan, DescriptorCloud)]
-    scales = {scan.scale if isinstance(scan, PreparedScan) else 1.0 for scan in scans}
+    scales = {scan.scale if isinstance(scan, Scan) else 1.0 for scan in scans}
     if len(scales) > 1:
         raise ValueError(f"target: expected the scale of the source, got scales {min(scales):g} and {max(scales):g}")
 
@@ -229,7 +230,7 @@ def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud],
     clouds: dict[int, DescriptorCloud] = {}
     raw: dict[int, RawScan] = {}
     for scan in (*sources, *targets):
-        if isinstance(scan, DescriptorCloud | PreparedScan):
+        if isinstance(scan, DescriptorCloud | Scan):
             clouds[id(scan)] = descriptors_of(scan).described
         else:
             raw[id(scan)] = scan

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int8, Int16, UInt8
 
 from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan, valid_points
 from dpmjax.deeppointmap.model import Model, encode_pyramid
-from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, measure_scan
+from dpmjax.deeppointmap.verification import NUM_THREADS
+from dpmjax.scans.lidar import Scan, measure_scan
 from dpmjax.scans.surfaces import RangeImage, surface_of_elements
 from dpmjax.types import DescriptorCloud, RawScan, SurfaceElements
 
@@ -22,30 +23,19 @@ MAX_CODE = np.iinfo(np.uint8).max
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 150.0
 
 
-class PreparedScan(NamedTuple):
-    """A scan that is ready for any number of registrations.
-
-    Attributes:
-        descriptors: descriptors of the scan; positions in metres times `scale`.
-        measured: surface and free space of the scan, metres.
-        scale: factor by which the points were enlarged for the encoder.
-    """
-
-    descriptors: DescriptorCloud
-    measured: MeasuredScan
-    scale: float = 1.0
-
-
 # A raw scan, a prepared scan, or descriptors of a scan or of a map.
-ScanOrCloud = DescriptorCloud | PreparedScan | RawScan
+ScanOrCloud = DescriptorCloud | Scan | RawScan
 
 
-def descriptors_of(scan: DescriptorCloud | PreparedScan) -> DescriptorCloud:
-    """Returns the descriptors of a prepared scan, or the cloud itself."""
-    return scan.descriptors if isinstance(scan, PreparedScan) else scan
+def descriptors_of(scan: DescriptorCloud | Scan) -> DescriptorCloud:
+    """Returns the descriptors of a prepared scan, or the cloud itself; a `ValueError` refuses a scan without any."""
+    cloud = scan.descriptors if isinstance(scan, Scan) else scan
+    if cloud is None:
+        raise ValueError("scan: expected descriptors, got a scan that is not encoded; call prepare_scan")
+    return cloud
 
 
-def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> PreparedScan:
+def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Scan:
     """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
 
     Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
@@ -61,7 +51,7 @@ def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Prepar
     return prepare_scans(model, [points], scale=scale)[0]
 
 
-def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[PreparedScan]:
+def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[Scan]:
     """Prepares scans in their order; threads measure their surfaces while JAX encodes.
 
     Raises a `ValueError` if the points of a scan are no real numbers (n, 3).
@@ -79,9 +69,12 @@ def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0)
         clouds, measured = [], []
         for points in scans:
             pyramid = pyramid_of_scan(points, model.config, scale=scale)
-            measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification))
+            measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification.surface))
             clouds.append(encode_pyramid(model, pyramid))
-        return [PreparedScan(cloud, future.result(), scale) for cloud, future in zip(clouds, measured, strict=True)]
+        return [
+            future.result()._replace(descriptors=cloud, scale=scale)
+            for cloud, future in zip(clouds, measured, strict=True)
+        ]
 
 
 def is_verified_pair(pair: tuple[ScanOrCloud, ScanOrCloud]) -> bool:
@@ -91,7 +84,7 @@ def is_verified_pair(pair: tuple[ScanOrCloud, ScanOrCloud]) -> bool:
 
 def prepare_each(
     model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
-) -> dict[tuple[int, bool], DescriptorCloud | PreparedScan]:
+) -> dict[tuple[int, bool], DescriptorCloud | Scan]:
     """Prepares each scan object of pairs once for each use: surfaces are measured where both sides are scans.
 
     Args:
@@ -104,12 +97,12 @@ def prepare_each(
         Prepared scans, or descriptors, by the id of each object and `is_verified_pair` of its pair.
     """
     raw: dict[tuple[int, bool], RawScan] = {}
-    ready: dict[tuple[int, bool], DescriptorCloud | PreparedScan] = {}
+    ready: dict[tuple[int, bool], DescriptorCloud | Scan] = {}
     for pair in pairs:
         is_verified = is_verified_pair(pair)
         for scan in pair:
             use = id(scan), is_verified
-            if isinstance(scan, DescriptorCloud | PreparedScan):
+            if isinstance(scan, DescriptorCloud | Scan):
                 ready[use] = scan
             elif is_verified:
                 raw[use] = scan
@@ -304,7 +297,7 @@ def round_directions(directions: Float[np.ndarray, "m 2"]) -> Int8[np.ndarray, "
     return np.rint(np.arctan2(directions[:, 1], directions[:, 0]) * (MAX_COMPONENT / np.pi)).astype(np.int8)
 
 
-def expand_scan(compact: CompactScan) -> PreparedScan:
+def expand_scan(compact: CompactScan) -> Scan:
     """Restores a scan for registrations, in a millisecond.
 
     Args:
@@ -314,4 +307,4 @@ def expand_scan(compact: CompactScan) -> PreparedScan:
         Descriptors, surface and free space.
     """
     cloud = compact.cloud
-    return PreparedScan(cloud, MeasuredScan(surface_of_elements(cloud.elements), expand_image(compact.image)))
+    return Scan(surface_of_elements(cloud.elements), expand_image(compact.image), cloud)

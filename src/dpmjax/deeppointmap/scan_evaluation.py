@@ -23,9 +23,9 @@ from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, overlap_pairs
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds
-from dpmjax.deeppointmap.verification import measure_scan
 from dpmjax.metrics.drives import path_lengths
 from dpmjax.metrics.statistics import area_under_curve, brier_score
+from dpmjax.scans.lidar import measure_scan
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import DescriptorCloud, Pose
 
@@ -73,7 +73,7 @@ def register_in_stages(model: Model, pair: ScanPair) -> StagedRegistration:
     settings, begun = model.config.verification, time.perf_counter()
     scans = pair.source, pair.target
     clouds = [encode(model, points) for points in scans]
-    source, target = (measure_scan(points, settings) for points in scans)
+    source, target = (measure_scan(points, settings.surface) for points in scans)
     hypotheses = match_clouds(model, *clouds, config=model.config.matching)
     motions = distinct_motions(hypotheses)
     verified = choose_motion(source, target, motions, settings)

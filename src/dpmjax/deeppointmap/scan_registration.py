@@ -19,15 +19,15 @@ from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, verify_elements
 from dpmjax.deeppointmap.prepared_scans import (
-    PreparedScan,
     ScanOrCloud,
     descriptors_of,
     is_verified_pair,
     prepare_each,
 )
-from dpmjax.deeppointmap.verification import NUM_THREADS, MeasuredScan, VerificationConfig, measured_elements
+from dpmjax.deeppointmap.verification import NUM_THREADS, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
-from dpmjax.scans.element_alignment import align_elements_on_host
+from dpmjax.scans.align import LEVELS, align_on_host
+from dpmjax.scans.lidar import Scan, measured_elements
 from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
 from dpmjax.types import DescriptorCloud, Pose, Poses, Registration, Verification
 
@@ -129,9 +129,8 @@ def register_each(
             hypotheses = _in_metres(in_cloud_units, pair_scale)
             if min(int(np.sum(cloud.described.mask)) for cloud in clouds) < MIN_DESCRIPTORS:
                 motion = pool.submit(_unregistered, source, target)
-            elif isinstance(source, PreparedScan) and isinstance(target, PreparedScan):
-                scans = source.measured, target.measured
-                motion = pool.submit(_verified, *scans, hypotheses, verification, refine=refine)
+            elif isinstance(source, Scan) and isinstance(target, Scan):
+                motion = pool.submit(_verified, source, target, hypotheses, verification, refine=refine)
             elif refine and all(cloud.normals is not None for cloud in clouds):
                 motion = pool.submit(_refined, *clouds, in_cloud_units, pair_scale, model)
             else:
@@ -233,11 +232,9 @@ class _RegisteredMotion(NamedTuple):
     num_elements: int = 0
 
 
-def _shared_scale(
-    source: DescriptorCloud | PreparedScan, target: DescriptorCloud | PreparedScan, scale: float
-) -> float:
+def _shared_scale(source: DescriptorCloud | Scan, target: DescriptorCloud | Scan, scale: float) -> float:
     """Returns the scale that both sides of a pair have; raises a `ValueError` if they differ."""
-    scales = [scan.scale if isinstance(scan, PreparedScan) else scale for scan in (source, target)]
+    scales = [scan.scale if isinstance(scan, Scan) else scale for scan in (source, target)]
     if scales[0] != scales[1]:
         raise ValueError(f"target: expected scale {scales[0]:g} as the source, got {scales[1]:g}")
     return scales[0]
@@ -250,7 +247,7 @@ def _in_metres(hypotheses: Registration, scale: float) -> Registration:
     return replace(hypotheses, T_target_source=jnp.asarray(T), rmse=hypotheses.rmse / np.float32(scale))
 
 
-def _unregistered(*scans: DescriptorCloud | PreparedScan) -> _RegisteredMotion:
+def _unregistered(*scans: DescriptorCloud | Scan) -> _RegisteredMotion:
     """Returns the identity, with all fields that a registration of two scans has."""
     if any(isinstance(scan, DescriptorCloud) for scan in scans):
         return _RegisteredMotion(None, np.eye(4))
@@ -258,7 +255,7 @@ def _unregistered(*scans: DescriptorCloud | PreparedScan) -> _RegisteredMotion:
 
 
 def _verified(
-    source: MeasuredScan, target: MeasuredScan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
+    source: Scan, target: Scan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
 ) -> _RegisteredMotion:
     """Chooses the motion of two scans by their surfaces and free space, and refines it on request."""
     chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
@@ -277,11 +274,11 @@ def _refined(
     T_target_source, agreement = np.array(hypotheses.T_target_source[0], np.float64), None
     num_elements = min(int(np.sum(cloud.mask)) for cloud in (source, target))
     if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
-        aligned = align_elements_on_host(source.elements, target.elements, T_target_source)
-        T_target_source = np.array(aligned.T_target_source)
+        scans = measured_elements(source.elements), measured_elements(target.elements)
+        surfaces = scans[0].surface, scans[1].surface
+        T_target_source = align_on_host(*surfaces, T_target_source[None], LEVELS).T_target_source[0]
         # A map of several scans was not seen from one place: it has no free space of its own.
         if max(len(cloud.features) for cloud in (source, target)) <= model.config.num_descriptors:
-            scans = measured_elements(source.elements), measured_elements(target.elements)
             agreement = verify_elements(*scans, T_target_source, model.config.verification)
     T_target_source[:3, 3] /= scale
     return _RegisteredMotion(0, T_target_source, elements=agreement, num_elements=num_elements)

@@ -15,18 +15,11 @@ from jaxtyping import Bool, Float
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
-from dpmjax.scans.surface_alignment import nearest_planes
-from dpmjax.scans.surfaces import (
-    RangeImage,
-    Surface,
-    SurfaceConfig,
-    range_image,
-    scan_surface,
-    surface_of_elements,
-    view_points,
-)
+from dpmjax.scans.lidar import Scan
+from dpmjax.scans.pairs import nearest_planes
+from dpmjax.scans.surfaces import SurfaceConfig, view_points
 from dpmjax.scans.view_correlation import ViewCorrelationConfig
-from dpmjax.types import Poses, SurfaceElements, Verification
+from dpmjax.types import Poses, Verification
 
 # A target with a smaller share of the source's number of points has been thinned (`saved_maps`). Too few of its points
 # are near those of the source, so its own points are compared with the planes of the source.
@@ -97,47 +90,8 @@ class VerificationConfig:
         require_fields(self, "max_weak_share", "num_lookalikes", low=0)
 
 
-class MeasuredScan(NamedTuple):
-    """Surface and free space of a scan, which verification compares.
-
-    Attributes:
-        surface: points, normals and a tree, in the frame of the lidar.
-        image: range image, the free space.
-    """
-
-    surface: Surface
-    image: RangeImage
-
-
-def measure_scan(points: Float[np.ndarray, "n 3"], config: VerificationConfig) -> MeasuredScan:
-    """Prepares a scan for verification.
-
-    Args:
-        points: metres, in the frame of the lidar; points that are not finite are dropped.
-        config: resolution.
-
-    Returns:
-        Surface and free space.
-    """
-    surface = scan_surface(points, config.surface)
-    return MeasuredScan(surface, range_image(surface.points))
-
-
-def measured_elements(elements: SurfaceElements) -> MeasuredScan:
-    """Prepares the surface elements of a scan for verification, without the scan.
-
-    Args:
-        elements: metres, in the frame of the lidar.
-
-    Returns:
-        Surface and free space, as far as the elements show it.
-    """
-    surface = surface_of_elements(elements)
-    return MeasuredScan(surface, range_image(surface.points))
-
-
 def verify_motions(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
+    source: Scan, target: Scan, T_target_source: Poses, config: VerificationConfig
 ) -> list[Verification]:
     """Compares two scans under several motions.
 
@@ -180,9 +134,7 @@ class ComparedScan(NamedTuple):
     is_level: Bool[np.ndarray, " n"]
 
 
-def compare_scans(
-    scan: MeasuredScan, other: MeasuredScan, T_other_scan: Poses, config: VerificationConfig
-) -> ComparedScan:
+def compare_scans(scan: Scan, other: Scan, T_other_scan: Poses, config: VerificationConfig) -> ComparedScan:
     """Compares the samples of one scan with a second scan.
 
     Args:
@@ -200,7 +152,7 @@ def compare_scans(
 
 
 def evidence_shares(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
+    source: Scan, target: Scan, T_target_source: Poses, config: VerificationConfig
 ) -> Float[np.ndarray, "s 6"]:
     """Computes the shares that `EvidenceWeights` weighs.
 
@@ -220,7 +172,7 @@ def evidence_shares(
 
 
 def _both_sides(
-    source: MeasuredScan, target: MeasuredScan, T_target_source: Poses, config: VerificationConfig
+    source: Scan, target: Scan, T_target_source: Poses, config: VerificationConfig
 ) -> tuple[ComparedScan, ComparedScan]:
     return (
         compare_scans(source, target, T_target_source, config),

@@ -172,30 +172,33 @@ else:
 
 
 class HostTree:
-    """Points in a k-d tree.
+    """Points in the plane or in space in a k-d tree, which is built at the first search.
 
     Attributes:
-        points: the points, float64.
+        points: (n, d) float64.
         num_threads: threads of building and searching.
     """
 
-    def __init__(self, points: Float[np.ndarray, "n 3"], *, num_threads: int = 2) -> None:
+    def __init__(self, points: Float[np.ndarray, "n d"], *, num_threads: int = 2) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
         self.num_threads = num_threads
-        # Where a tree is larger than a cache, points near in space lie together, and are searched one after another:
-        # neighbours are found in less time.
-        self._order = _along_curve(self.points) if len(points) >= ORDERED_FROM else None
-        ordered = self.points if self._order is None else self.points.take(self._order, axis=0)
-        self._tree = small_gicp.KdTree(ordered, num_threads=num_threads) if len(points) > 0 else None
+
+    @functools.cached_property
+    def _built(self) -> tuple[Any, Int[np.ndarray, " n"] | None]:
+        # Where a tree is larger than a cache, points near in space lie together: neighbours are found in less time.
+        points = _in_space(self.points)
+        order = along_curve(points) if len(points) >= ORDERED_FROM else None
+        ordered = points if order is None else points.take(order, axis=0)
+        return small_gicp.KdTree(ordered, num_threads=self.num_threads), order
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The tree itself cannot be pickled or copied; it is built again.
         return functools.partial(HostTree, num_threads=self.num_threads), (self.points,)
 
     def nearest(
-        self, queries: Float[np.ndarray, "m 3"], k: int
+        self, queries: Float[np.ndarray, "m d"], k: int
     ) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
-        """Finds the nearest points of each query.
+        """Finds the nearest points of each query; queries near in space, one after another, are searched faster.
 
         Args:
             queries: finite.
@@ -204,21 +207,21 @@ class HostTree:
         Returns:
             Rows of the points and their distances, nearest first; equally near points come in any order.
         """
-        if self._tree is None or k == 0 or len(queries) == 0:
+        if len(self.points) == 0 or k == 0 or len(queries) == 0:
             return np.zeros((len(queries), k), np.int64), np.zeros((len(queries), k))
-        queries, num_threads = np.ascontiguousarray(queries, np.float64), self.num_threads
-        if self._order is None:
-            found, squared = self._tree.batch_knn_search(queries, k, num_threads=num_threads)
-            return found.view(np.int64), np.sqrt(squared)
-        order = _along_curve(queries)
-        found, squared = self._tree.batch_knn_search(queries.take(order, axis=0), k, num_threads=num_threads)
-        rows, distances = np.empty(found.shape, np.int64), np.empty(squared.shape)
-        rows[order], distances[order] = self._order.take(found.view(np.int64)), np.sqrt(squared)
-        return rows, distances
+        tree, order = self._built
+        queries = _in_space(np.ascontiguousarray(queries, np.float64))
+        found, squared = tree.batch_knn_search(queries, k, num_threads=self.num_threads)
+        rows = found.view(np.int64)
+        return rows if order is None else order.take(rows), np.sqrt(squared)
 
 
-def _along_curve(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Returns the rows of points along a Z-order curve over 256 x 256 cells of the horizontal plane."""
+def _in_space(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 3"]:
+    return points if points.shape[1] == 3 else np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+
+
+def along_curve(points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
+    """Returns the rows of points along a Z-order curve over 256 x 256 cells of the first two axes."""
     x, y = (column - column.min(initial=np.inf) for column in points.T[:2])
     scale = 255 / max(x.max(initial=0), y.max(initial=0), 1e-9)
     of_x, of_y = (SPREAD_BITS[(column * scale).astype(np.uint8)] for column in (x, y))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -47,13 +45,14 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
     Returns:
         Normals and flatness.
     """
+    # Sums of products, because a contraction of JAX has a lower precision on some devices.
     xp, tiny = rigid.namespace_of(xyz[0]), np.finfo(xyz[0].dtype).tiny
-    counts = is_near.sum(axis=1)
+    counts = is_near.sum(axis=1).astype(xyz[0].dtype)
     centred = []
     for column in xyz:
         kept = xp.where(is_near, column, 0.0)
         centred.append((kept - (kept.sum(axis=1) / counts)[:, None]) * is_near)
-    xx, xy, xz, yy, yz, zz = (_dots(centred[i], centred[j]) / counts for i in range(3) for j in range(i, 3))
+    xx, xy, xz, yy, yz, zz = ((centred[i] * centred[j]).sum(axis=1) / counts for i in range(3) for j in range(i, 3))
     mean = (xx + yy + zz) / 3
     off_diagonal = xy**2 + xz**2 + yz**2
     radius = xp.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off_diagonal) / 6)
@@ -64,11 +63,6 @@ def fit_planes(xyz: Columns, is_near: Bool[AnyArray, "n k"]) -> PlaneFits:
     middle = 3 * mean - largest - smallest
     flatness = xp.clip((middle - smallest) / xp.maximum(largest, tiny), 0, 1)
     return PlaneFits(_kernels(a, b, c, d, e, f, 2 * xp.cos(angle + 2 * np.pi / 3)), flatness)
-
-
-def _dots(first: Float[AnyArray, "n k"], second: Float[AnyArray, "n k"]) -> Any:
-    # JAX would make a contraction of it, at lower precision on some devices.
-    return jnp.sum(first * second, axis=1) if isinstance(first, jax.Array) else np.einsum("nk,nk->n", first, second)
 
 
 def _kernels(*matrix_and_value: Float[AnyArray, " n"]) -> Any:
@@ -94,18 +88,18 @@ def _kernels(*matrix_and_value: Float[AnyArray, " n"]) -> Any:
 
 
 class PlaneStep(NamedTuple):
-    """A small motion about a centre; arrays of the kind and dtype of the points.
+    """A small motion about a centre; arrays of the kind and dtype of the points, k is 3 in the plane and 6 in space.
 
     Attributes:
-        tangent: (..., 6) translation, then rotation vector.
-        centre: (..., 3) centre of the rotation.
+        tangent: (..., k) translation, then rotation.
+        centre: (..., d) centre of the rotation.
     """
 
     tangent: Any
     centre: Any
 
 
-def geman_mcclure(residuals: Float[AnyArray, "*p"], width: float) -> Any:
+def geman_mcclure(residuals: Float[AnyArray, "*p"], width: Any) -> Any:
     """Computes the weights of the Geman-McClure kernel, in (0, 1].
 
     Args:
@@ -119,12 +113,13 @@ def geman_mcclure(residuals: Float[AnyArray, "*p"], width: float) -> Any:
 
 
 def step_to_planes(
-    points: Float[AnyArray, "*b n 3"],
-    normals: Float[AnyArray, "*b n 3"],
+    points: Float[AnyArray, "*b n d"],
+    normals: Float[AnyArray, "*b n d"],
     residuals: Float[AnyArray, "*b n"],
     weights: Float[AnyArray, "*b n"],
-) -> PlaneStep:
-    """Solves the weighted normal equations of point-to-plane alignment (Chen and Medioni 1992).
+    prior: tuple[Any, Any, Any] | None = None,
+) -> tuple[PlaneStep, Any]:
+    """Solves the weighted normal equations of point-to-plane alignment (Chen and Medioni 1992), d = 2 or 3.
 
     The step is that of `T <- motion_about(step) T`. A direction that no plane constrains does not move.
 
@@ -133,25 +128,46 @@ def step_to_planes(
         normals: normals of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
         weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
+        prior: present motion T (..., d+1, d+1), expected motion, and information (k, k) about the latter; None for
+            none.
 
     Returns:
-        The step; 0 where no pair counts.
+        The step, 0 where no pair counts; and the information (..., k, k) of the pairs about its centre.
     """
     xp = rigid.namespace_of(points)
     counted = (weights > 0).astype(points.dtype)
     count = xp.maximum(counted.sum(axis=-1), 1)[..., None]
     centre = rigid.matmul(counted[..., None, :], points)[..., 0, :] / count
-    levers = points - centre[..., None, :]
-    (lx, ly, lz), (nx, ny, nz) = (xp.moveaxis(vectors, -1, 0) for vectors in (levers, normals))
-    jacobian = xp.stack([nx, ny, nz, ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx], axis=-2)
+    jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), _torques(points - centre[..., None, :], normals)], axis=-2)
     weighted = weights[..., None, :] * jacobian
-    system = rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2))
+    information = rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2))
+    gradient, system = rigid.matmul(weighted, residuals[..., None]), information
     diagonal = xp.diagonal(system, axis1=-2, axis2=-1)
     floor = max(1e-9, float(np.finfo(points.dtype).eps)) * diagonal.sum(axis=-1, keepdims=True)
     damping = 1e-6 * diagonal + floor + np.finfo(points.dtype).tiny
-    gradient = rigid.matmul(weighted, residuals[..., None])
-    tangent = -xp.linalg.solve(system + damping[..., None] * np.eye(6, dtype=points.dtype), gradient)[..., 0]
-    return PlaneStep(tangent, centre)
+    if prior is not None:
+        T, T_prior, of_prior = prior
+        system = system + of_prior
+        gradient = gradient + rigid.matmul(of_prior, _offset_about(T, T_prior, centre)[..., None])
+    tangent = -xp.linalg.solve(system + damping[..., None] * np.eye(system.shape[-1], dtype=points.dtype), gradient)
+    return PlaneStep(tangent[..., 0], centre), information
+
+
+def _torques(levers: Any, forces: Any) -> Any:
+    """Returns cross products (..., 1, n) in the plane, (..., 3, n) in space, of vectors (..., n, d)."""
+    xp, dim = rigid.namespace_of(levers, forces), levers.shape[-1]
+    axes = [(0, 1)] if dim == 2 else [(1, 2), (2, 0), (0, 1)]
+    return xp.stack([levers[..., i] * forces[..., j] - levers[..., j] * forces[..., i] for i, j in axes], axis=-2)
+
+
+def _offset_about(T: Any, T_prior: Any, centre: Any) -> Any:
+    """Returns the small motion (..., k) from a prior to `T`, to first order: shift of the centre, then the turn."""
+    xp, dim = rigid.namespace_of(T), T.shape[-1] - 1
+    T_here_prior = rigid.matmul(T, rigid.inverse(T_prior))
+    turn = T_here_prior[..., :dim, :dim]
+    shift = rigid.matmul(turn, centre[..., None])[..., 0] + T_here_prior[..., :dim, dim] - centre
+    rows, columns = ([1], [0]) if dim == 2 else ([2, 0, 1], [1, 2, 0])
+    return xp.concatenate([shift, (turn[..., rows, columns] - turn[..., columns, rows]) / 2], axis=-1)
 
 
 def motion_about(step: PlaneStep) -> Any:
@@ -161,17 +177,18 @@ def motion_about(step: PlaneStep) -> Any:
         step: result of `step_to_planes`.
 
     Returns:
-        (..., 4, 4) homogeneous matrices of the kind of the step; the derivative is right at the zero step too.
+        (..., d+1, d+1) homogeneous matrices of the kind of the step; the derivative is right at the zero step too.
     """
     tangent, centre = step
-    xp = rigid.namespace_of(tangent)
-    squared = (tangent[..., 3:] ** 2).sum(axis=-1)
+    xp, dim = rigid.namespace_of(tangent), centre.shape[-1]
+    squared = (tangent[..., dim:] ** 2).sum(axis=-1)
     is_turned = squared > 0
     angle = xp.where(is_turned, xp.sqrt(xp.where(is_turned, squared, 1)), 0)[..., None, None]
-    cross = (tangent[..., 3:, None, None] * GENERATORS.astype(tangent.dtype)).sum(axis=-3)
+    generators = GENERATORS.astype(tangent.dtype) if dim == 3 else GENERATORS[2:, :2, :2].astype(tangent.dtype)
+    cross = (tangent[..., dim:, None, None] * generators).sum(axis=-3)
     # Rodrigues; sinc(t) is sin(pi t) / (pi t), and half the square of sinc(t / 2) is (1 - cos) / angle^2.
     turn = xp.sinc(angle / np.pi) * cross + xp.sinc(angle / (2 * np.pi)) ** 2 / 2 * rigid.matmul(cross, cross)
-    translation = tangent[..., :3] - rigid.matmul(turn, centre[..., None])[..., 0]
-    top = xp.concatenate([turn + np.eye(3, dtype=tangent.dtype), translation[..., None]], axis=-1)
-    last = xp.broadcast_to(np.array([0, 0, 0, 1], tangent.dtype), (*tangent.shape[:-1], 1, 4))
+    translation = tangent[..., :dim] - rigid.matmul(turn, centre[..., None])[..., 0]
+    top = xp.concatenate([turn + np.eye(dim, dtype=tangent.dtype), translation[..., None]], axis=-1)
+    last = xp.broadcast_to(np.eye(dim + 1, dtype=tangent.dtype)[dim:], (*tangent.shape[:-1], 1, dim + 1))
     return xp.concatenate([top, last], axis=-2)

@@ -19,21 +19,13 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_host_points, as_mask, as_points, require_count, require_fields, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import voxel_sample
+from dpmjax.scans.outliers import OUTLIER_SIGMAS, OUTLIER_SLACK, evenly_spaced, find_inliers
 from dpmjax.types import AnyArray, PointCloud
-
-# A point is an outlier if its mean distance to its neighbours exceeds the mean over all points by more than this number
-# of standard deviations.
-OUTLIER_SIGMAS = 3.0
 
 MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
-# Relative tolerance: rounding must not drop points that are all equally far from their neighbours.
-OUTLIER_SLACK = 1 + 1e-5
-
 # A table of 2 MB; a fortieth of the voxels of a large scan share a slot. The factor spreads them (Knuth).
 HASH_FACTOR, TABLE_BITS = np.uint64(0x9E3779B97F4A7C15), 18
-
-SORTED_BY_M = 2.0
 
 MIN_COUNT_TO_WARN, MIN_SHARE_IN_RANGE = 20, 0.01
 
@@ -148,7 +140,7 @@ def preprocess_scan_on_host(
     *,
     num_threads: int = 2,
 ) -> PointCloud:
-    """Returns what `preprocess_scan` returns, as NumPy arrays, up to rounding at the outlier threshold.
+    """Returns what `preprocess_scan` returns, as NumPy arrays, up to a percent of the limit of outliers.
 
     Warns where hardly any point is in range: the points are then probably not in metres.
 
@@ -164,6 +156,32 @@ def preprocess_scan_on_host(
     Raises:
         ValueError: if the shapes do not match.
     """
+    tree, rows = filter_points(points, mask, config, num_threads=num_threads)
+    return as_cloud(tree.points.take(rows, axis=0), config)
+
+
+def filter_points(
+    points: Float[np.ndarray, "n 3"],
+    mask: Bool[np.ndarray, " n"] | None,
+    config: PreprocessConfig,
+    *,
+    num_threads: int = 2,
+) -> tuple[HostTree, Int[np.ndarray, " k"]]:
+    """Applies the filters of `preprocess_scan` on the host, and keeps the tree that found the outliers.
+
+    Args:
+        points: see `preprocess_scan_on_host`.
+        mask: see `preprocess_scan_on_host`.
+        config: settings of the filters.
+        num_threads: threads of the neighbour search, at least 1.
+
+    Returns:
+        A tree of the points that range and voxel leave, in their order, and the rows of those that are no outliers, of
+        which the farthest is exchanged with the first.
+
+    Raises:
+        ValueError: if the shapes do not match.
+    """
     points = as_host_points("points", points).astype(np.float32, copy=False)
     mask = as_mask("mask", mask, points.shape[:1], np)
     require_count("num_threads", num_threads)
@@ -171,15 +189,29 @@ def preprocess_scan_on_host(
     _warn_if_out_of_range(points, mask, int(is_kept.sum()), config)
     kept = points.take(np.flatnonzero(is_kept), axis=0)  # four times faster than by the mask
     kept = kept[first_of_each_voxel(kept, config.voxel_size_m)]
-    kept = kept[_evenly_spaced(len(kept), config.capacity)]
-    if config.num_outlier_neighbours > 0 and len(kept) > 1:
-        kept = kept[_is_inlier_on_host(kept, config, num_threads)]
+    tree = HostTree(kept[evenly_spaced(len(kept), config.capacity)], num_threads=num_threads)
+    rows = np.arange(len(tree.points))
+    if config.num_outlier_neighbours > 0 and len(rows) > 1:
+        rows = np.flatnonzero(find_inliers(tree, config.num_outlier_neighbours))
+    if len(rows):
+        farthest = int(np.argmax(np.square(tree.points.take(rows, axis=0)).sum(axis=1)))
+        rows[[0, farthest]] = rows[[farthest, 0]]
+    return tree, rows
+
+
+def as_cloud(points: Float[np.ndarray, "k 3"], config: PreprocessConfig) -> PointCloud:
+    """Pads filtered points to the capacity.
+
+    Args:
+        points: metres, in the frame of the lidar; at most `config.capacity`.
+        config: capacity.
+
+    Returns:
+        The cloud, arrays of NumPy, float32.
+    """
     result = np.zeros((config.capacity, 3), np.float32)
-    result[: len(kept)] = kept
-    if len(kept) > 0:
-        farthest = int(np.argmax(np.sum(kept.astype(np.float64) ** 2, axis=1)))
-        result[[0, farthest]] = result[[farthest, 0]]
-    return PointCloud(result, np.arange(config.capacity) < len(kept))
+    result[: len(points)] = points
+    return PointCloud(result, np.arange(config.capacity) < len(points))
 
 
 def _is_within(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Bool[np.ndarray, " n"]:
@@ -231,22 +263,3 @@ def _numbered_voxels(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int
     x, y, z = (np.floor(column / np.float32(voxel_size)).astype(np.int64) for column in points.T)
     x, y, z = x - x.min(), y - y.min(), z - z.min()
     return (x * (y.max() + 1) + y) * (z.max() + 1) + z  # below 2^63, because MAX_VOXELS bounds each factor
-
-
-def _evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
-    slots = np.arange(min(num_kept, capacity))
-    return slots * num_kept // capacity if num_kept > capacity else slots
-
-
-def _is_inlier_on_host(
-    points: Float[np.ndarray, "n 3"], config: PreprocessConfig, num_threads: int
-) -> Bool[np.ndarray, " n"]:
-    # One more neighbour, because each point is its own nearest one.
-    num_nearest = min(config.num_outlier_neighbours + 1, len(points))
-    # Points near in space lie together in memory, so that neighbours are found in two thirds of the time.
-    order = np.argsort(_numbered_voxels(points, SORTED_BY_M))
-    points = points[order]
-    distances = HostTree(points, num_threads=num_threads).nearest(points, num_nearest)[1]
-    spread = np.empty(len(points))
-    spread[order] = distances[:, 1:].mean(axis=1)
-    return spread <= (spread.mean() + OUTLIER_SIGMAS * spread.std()) * OUTLIER_SLACK

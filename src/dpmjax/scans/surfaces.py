@@ -75,8 +75,8 @@ class Surface(NamedTuple):
         tree: a tree of the points.
     """
 
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n d"]
+    normals: Float[np.ndarray, "n d"]
     flatness: Float[np.ndarray, " n"]
     samples: Int[np.ndarray, " s"]
     tree: HostTree
@@ -107,22 +107,27 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
 
 
 def surface_at(
-    points: Float[np.ndarray, "n 3"], rows: Int[np.ndarray, " e"], config: SurfaceConfig = SurfaceConfig()
+    tree: HostTree,
+    rows: Int[np.ndarray, " e"],
+    config: SurfaceConfig = SurfaceConfig(),
+    *,
+    is_counted: Bool[np.ndarray, " n"] | None = None,
 ) -> Surface:
     """Estimates the surface of a thinned scan at some of its points, from the neighbours among all of them.
 
     Points that are no part of a surface are the last samples and have no normal: an alignment moves them onto planes.
 
     Args:
-        points: metres, in the frame of the lidar.
+        tree: the points, metres, in the frame of the lidar.
         rows: rows of the chosen points.
         config: neighbourhoods; range and density are those of the points.
+        is_counted: False for points that belong to no neighbourhood, as outliers; None for none.
 
     Returns:
-        The surface; its points are `points[rows]`.
+        The surface; its points are those of the rows.
     """
-    chosen = points[rows].astype(np.float64)
-    normals, flatness = _normals(chosen, HostTree(points), config)
+    chosen = tree.points.take(rows, axis=0)
+    normals, flatness = _normals(chosen, tree, config, is_counted)
     return firm_surface(Surface(chosen, normals, flatness, np.arange(len(chosen)), HostTree(chosen)), MIN_FLATNESS)
 
 
@@ -159,26 +164,34 @@ def surface_of_elements(elements: SurfaceElements) -> Surface:
 
 
 def _normals(
-    points: Float[np.ndarray, "n 3"], tree: HostTree, config: SurfaceConfig
+    points: Float[np.ndarray, "n 3"],
+    tree: HostTree,
+    config: SurfaceConfig,
+    is_counted: Bool[np.ndarray, " m"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Fits planes to the neighbours of points among those of a tree."""
     num_neighbours = min(config.num_neighbours, len(tree.points))
     if num_neighbours < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    farthest_m = tree.nearest(points[:: max(1, len(points) // NUM_PROBED)], num_neighbours)[1][:, -1]
-    radius_m = max(config.neighbour_radius_m, config.sparse_radius_share * float(np.median(farthest_m)))
     rows, distances = tree.nearest(points, num_neighbours)
-    is_near = distances < radius_m
-    x, y, z = (column[rows] - own[:, None] for column, own in zip(tree.points.T, points.T, strict=True))
+    farthest_m = np.median(distances[:: max(1, len(points) // NUM_PROBED), -1]) if len(points) else 0.0
+    is_near = distances < max(config.neighbour_radius_m, config.sparse_radius_share * farthest_m)
+    if is_counted is not None:
+        is_near &= is_counted.take(rows)
+    columns, own = (np.ascontiguousarray(values.T, np.float32) for values in (tree.points, points))
+    # Neighbour by neighbour in memory: sums over them are several times faster.
+    rows, is_near = rows.T, np.asfortranarray(is_near)
+    x, y, z = ((column.take(rows) - middle).T for column, middle in zip(columns, own, strict=True))
     fit = fit_planes((x, y, z), is_near)
-    return fit.normals, np.where(is_near.sum(axis=1) >= MIN_NEIGHBOURS, fit.flatness, 0)
+    flatness = np.where(is_near.sum(axis=1) >= MIN_NEIGHBOURS, fit.flatness, 0)
+    return fit.normals.astype(np.float64), flatness.astype(np.float64)
 
 
-def _samples(normals: Float[np.ndarray, "n 3"], flatness: Float[np.ndarray, " n"]) -> Int[np.ndarray, " s"]:
+def _samples(normals: Float[np.ndarray, "n d"], flatness: Float[np.ndarray, " n"]) -> Int[np.ndarray, " s"]:
     rows = np.random.default_rng(0).permutation(np.flatnonzero(flatness > MIN_FLATNESS))
     direction = np.argmax(np.abs(normals[rows]), axis=1)
     rank = np.zeros(len(rows), np.int64)
-    for axis in range(3):
+    for axis in range(normals.shape[1]):
         is_along = direction == axis
         rank[is_along] = np.arange(is_along.sum())
     return rows[np.argsort(rank, kind="stable")]
@@ -196,18 +209,6 @@ class RangeImage(NamedTuple):
     farthest_m: Float[np.ndarray, "r c"]
 
 
-class View(NamedTuple):
-    """Visibility of the points of another scan in a range image.
-
-    Attributes:
-        is_visible: True where the lidar measured something in this direction, and the point is not far behind it.
-        is_contradicted: True where the point lies clearly in front of all that was measured in this direction.
-    """
-
-    is_visible: Bool[np.ndarray, "*n"]
-    is_contradicted: Bool[np.ndarray, "*n"]
-
-
 def range_image(points: Float[np.ndarray, "n 3"]) -> RangeImage:
     """Makes the range image of a scan, with a margin of one pixel about each measurement.
 
@@ -219,6 +220,7 @@ def range_image(points: Float[np.ndarray, "n 3"]) -> RangeImage:
     """
     nearest, farthest = np.full((NUM_ROWS, NUM_COLUMNS), np.inf), np.zeros((NUM_ROWS, NUM_COLUMNS))
     pixels, ranges = _project(points)
+    ranges = ranges.astype(np.float64)  # of another type, the next two lines take ten times as long
     np.minimum.at(nearest.reshape(-1), pixels, ranges)
     np.maximum.at(farthest.reshape(-1), pixels, ranges)
     nearest = minimum_filter1d(minimum_filter1d(nearest, 3, axis=0, mode="nearest"), 3, axis=1, mode="wrap")
@@ -226,7 +228,9 @@ def range_image(points: Float[np.ndarray, "n 3"]) -> RangeImage:
     return RangeImage(nearest, farthest)
 
 
-def view_points(image: RangeImage, points: Float[np.ndarray, "*n 3"]) -> View:
+def view_points(
+    image: RangeImage, points: Float[np.ndarray, "*n 3"]
+) -> tuple[Bool[np.ndarray, "*n"], Bool[np.ndarray, "*n"]]:
     """Compares points with the ranges that the lidar of an image has measured in their directions.
 
     Args:
@@ -234,13 +238,14 @@ def view_points(image: RangeImage, points: Float[np.ndarray, "*n 3"]) -> View:
         points: metres, in the frame of that lidar.
 
     Returns:
-        Masks of the points that are visible, and of those that contradict the image.
+        True for points that are visible: something was measured in their direction, and they are not far behind it.
+        True for points that contradict the image: they lie clearly in front of all that was measured there.
     """
     pixels, ranges = _project(points)
     nearest, farthest = image.nearest_m.ravel()[pixels], image.farthest_m.ravel()[pixels]
     margin = np.maximum(MARGIN_M, MARGIN_SHARE * ranges)
     is_measured = np.isfinite(nearest)
-    return View(is_measured & (ranges <= farthest + margin), is_measured & (ranges < nearest - margin))
+    return is_measured & (ranges <= farthest + margin), is_measured & (ranges < nearest - margin)
 
 
 def _project(points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray]:

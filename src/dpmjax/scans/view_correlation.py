@@ -123,17 +123,18 @@ def _extent_share(source: Surface, target: Surface) -> float:
     return float(np.clip(max(extents) / FULL_EXTENT_M, MIN_EXTENT_SHARE, 1))
 
 
-def T_level_lidar(surface: Surface) -> Pose:
+def T_level_lidar(surface: Surface, min_flatness: float = MIN_FLATNESS) -> Pose:
     """Finds the turn that makes the ground of a scan level, and the shift that puts it at height 0.
 
     Args:
         surface: surface of the scan.
+        min_flatness: least flatness of an element of the ground.
 
     Returns:
         The motion; the identity where there is too little ground.
     """
     T, up = np.eye(4), np.array([0.0, 0.0, 1.0])
-    is_flat = surface.flatness > MIN_FLATNESS
+    is_flat = surface.flatness > min_flatness
     points, normals = surface.points[is_flat], surface.normals[is_flat]
     normals = normals * np.where(normals[:, 2:] < 0, -1, 1)
     is_ground = np.zeros(len(points), bool)

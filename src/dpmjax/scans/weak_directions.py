@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from dpmjax.geometry import rigid
+from dpmjax.scans.pairs import PLANE_DISTANCE_M, Pairs, nearest_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import PLANE_DISTANCE_M, PlanePairs, nearest_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, firm_surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.types import Information, Pose, Poses
@@ -99,7 +99,7 @@ class _PlaneSystem(NamedTuple):
     residuals: Float[np.ndarray, " m"]
 
 
-def _plane_system(pairs: PlanePairs, T_target_source: Pose) -> _PlaneSystem:
+def _plane_system(pairs: Pairs, T_target_source: Pose) -> _PlaneSystem:
     """Returns the system of the pairs that meet, of none below `MIN_PLANES`; arguments as in `plane_information`."""
     is_used = np.abs(pairs.residuals) < PLANE_DISTANCE_M
     is_used &= is_used.sum() >= MIN_PLANES
@@ -111,7 +111,7 @@ def _plane_system(pairs: PlanePairs, T_target_source: Pose) -> _PlaneSystem:
     return _PlaneSystem(points, jacobian / sigma_m, residuals / sigma_m)
 
 
-def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
+def plane_information(pairs: Pairs, T_target_source: Pose) -> Information:
     """Computes the normal equations of point-to-plane residuals.
 
     Args:
@@ -126,7 +126,7 @@ def plane_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
     return np.asarray(independent_share * jacobian.T @ jacobian + UNKNOWN)
 
 
-def scattered_information(pairs: PlanePairs, T_target_source: Pose) -> Information:
+def scattered_information(pairs: Pairs, T_target_source: Pose) -> Information:
     """Computes the inverse covariance of an alignment where parts of space disagree on the motion, as foliage does.
 
     The covariance of Liang and Zeger (1986) is that of the gradients of cubes of space. It is zero where one cube alone
@@ -163,7 +163,8 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
         The direction and the standard deviation along it.
     """
     # All elements count: the first samples face all directions equally, but few elements of a corridor face its axis.
-    pairs = nearest_planes(source, target, T_target_source[None], radius_m, len(source.samples)).pairs
+    pairs = nearest_planes(source, target, T_target_source[None], radius_m, len(source.samples))
+    pairs = pairs.take(pairs.is_paired)
     R = T_target_source[:3, :3]
     covariance = R @ np.linalg.inv(plane_information(pairs, T_target_source))[:3, :3] @ R.T
     horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]
@@ -172,9 +173,7 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
     return WeakDirection(direction, sigma_along(scattered_information(held, T_target_source), R.T @ direction))
 
 
-def without_noise_along(
-    pairs: PlanePairs, direction: Float[np.ndarray, "3"], is_firm: Bool[np.ndarray, " p"]
-) -> PlanePairs:
+def without_noise_along(pairs: Pairs, direction: Float[np.ndarray, "3"], is_firm: Bool[np.ndarray, " p"]) -> Pairs:
     """Removes from normals the component along a direction that they do not face: it is noise.
 
     Args:
@@ -253,12 +252,7 @@ def wall_axis(surface: Surface) -> WallAxis:
     Returns:
         The axis; the information is 0 where there is no wall.
     """
-    T = T_level_lidar(surface)
-    normals = surface.normals @ T[:3, :3].T
-    is_wall = (surface.flatness > MIN_FLATNESS) & (np.abs(normals[:, 2]) < STEEP_COSINE)
-    points, normals = (surface.points[is_wall] @ T[:3, :3].T)[:, :2], normals[is_wall, :2]
-    rows = first_of_each_voxel(surface.points[is_wall], VOXEL_M)
-    points, normals = points[rows], normals[rows]
+    T, points, normals = _walls(surface, MIN_FLATNESS)
     information, axes = np.linalg.eigh(normals.T @ normals)
     along, across = axes[:, 0], np.array([-axes[1, 0], axes[0, 0]])
     is_parallel = np.abs(normals @ across) > PARALLEL_COSINE
@@ -267,6 +261,16 @@ def wall_axis(surface: Surface) -> WallAxis:
     profile = gaussian_filter1d(np.minimum(counts, MAX_COUNT), 1.0, mode="constant")
     extent_m = float(np.percentile(np.linalg.norm(points, axis=1), EXTENT_PERCENT)) if len(points) else 0.0
     return WallAxis(T, float(np.arctan2(along[1], along[0])), np.maximum(information, 0), profile, extent_m)
+
+
+def _walls(surface: Surface, min_flatness: float) -> tuple[Pose, Float[np.ndarray, "w 2"], Float[np.ndarray, "w 2"]]:
+    """Returns T_level_lidar, and horizontal points and normals of walls, one of each voxel."""
+    T = T_level_lidar(surface, min_flatness)
+    normals = surface.normals @ T[:3, :3].T
+    is_wall = (surface.flatness > min_flatness) & (np.abs(normals[:, 2]) < STEEP_COSINE)
+    rows = np.flatnonzero(is_wall)
+    rows = rows[first_of_each_voxel(surface.points[rows], VOXEL_M)]
+    return T, (surface.points[rows] @ T[:3, :3].T)[:, :2], normals[rows, :2]
 
 
 def weak_share(source: WallAxis, target: WallAxis) -> float:
@@ -294,9 +298,11 @@ def surface_in_corridor(surface: Surface) -> tuple[Surface, Float[np.ndarray, "3
     Returns:
         The surface, and the axis of the corridor as a unit vector; elsewhere the given surface, and None.
     """
-    firm = firm_surface(surface, FIRM_FLATNESS)
-    axis = wall_axis(firm)
-    return (firm, axis.axis) if weak_share(axis, axis) < CORRIDOR_SHARE else (surface, None)
+    T, _, normals = _walls(surface, FIRM_FLATNESS)
+    information, axes = np.linalg.eigh(normals.T @ normals)
+    if not len(normals) or information[0] >= CORRIDOR_SHARE * information.sum():
+        return surface, None
+    return firm_surface(surface, FIRM_FLATNESS), np.append(axes[:, 0], 0.0) @ T[:3, :3]
 
 
 def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Poses:

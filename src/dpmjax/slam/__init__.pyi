@@ -20,7 +20,6 @@ from .interfaces import Matcher as Matcher
 from .interfaces import PreparedInput as PreparedInput
 from .interfaces import Proposal as Proposal
 from .interfaces import SlamMethods as SlamMethods
-from .interfaces import ThinnedScan as ThinnedScan
 from .interfaces import TimedScan as TimedScan
 from .keyframe_map import KeyframeMap as KeyframeMap
 from .keyframe_map import Submap as Submap

@@ -10,13 +10,9 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from dpmjax.checks import require_fields, require_one_of, require_positive_fields
-from dpmjax.scans.surface_alignment import AlignmentConfig, AlignmentLevel
 
 Proposer = Literal["prediction", "network"]
 SlamMethod = Literal["surfaces", "descriptors"]
-
-NARROW = AlignmentConfig(levels=(AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1)))
-WIDE = AlignmentConfig(levels=(AlignmentLevel(3.0, 300, 10),))
 
 
 @dataclass(frozen=True)
@@ -28,20 +24,13 @@ class OdometryConfig:
             those of the decoder are tried. With "network" the decoder registers each scan to the nearest keyframe
             (DeepPointMap section 4).
         num_keyframes: number of the nearest keyframes in the local map.
-        narrow: alignment from a first guess that is nearly right.
-        wide: alignment from other starts.
-        plane_radius_m: largest distance between an element and the element of the map whose plane it meets.
     """
 
     proposer: Proposer = "prediction"
     num_keyframes: int = 12
-    narrow: AlignmentConfig = NARROW
-    wide: AlignmentConfig = WIDE
-    plane_radius_m: float = 1.5
 
     def __post_init__(self) -> None:
         require_one_of("proposer", self.proposer, get_args(Proposer))
-        require_positive_fields(self, "plane_radius_m")
         require_fields(self, "num_keyframes", low=1)
 
 

@@ -14,8 +14,9 @@ from jaxtyping import Float
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
+from dpmjax.scans.lidar import Scan
 from dpmjax.scans.weak_directions import diagonal_information, sigma_along
-from dpmjax.slam.interfaces import Alignment, Match, PreparedInput, Proposal, SlamMethods, ThinnedScan
+from dpmjax.slam.interfaces import Alignment, Match, PreparedInput, Proposal, SlamMethods
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
 from dpmjax.types import Information, Pose
@@ -191,7 +192,7 @@ def place_scan(
     if report.status == "restarted" or _is_keyframe(methods, report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after = _advanced(state, report)
-    placed = placed_scan(thinned.measured.surface, report.T_keyframe_scan)
+    placed = placed_scan(thinned.surface, report.T_keyframe_scan)
     if report.status == "predicted":
         after = after._replace(lost=(*state.lost, placed))
     else:
@@ -224,7 +225,7 @@ class _Search(NamedTuple):
     methods: SlamMethods
     state: FrontEndState
     local_map: LocalMap
-    scan: ThinnedScan
+    scan: Scan
     compact: CompactScan | None
 
     def located(self, report: ScanReport) -> _Located:
@@ -322,7 +323,7 @@ def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
     return are_near(tried.tracked.T_map_scan, best.T_map_scan, PLACE_M, CONFIRMED_RAD)
 
 
-def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: ThinnedScan) -> bool:
+def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: Scan) -> bool:
     config, T = methods.config.front_end, report.T_keyframe_scan
     spacing_m = np.clip(config.keyframe_share * scan.extent_m, config.min_keyframe_m, config.max_keyframe_m)
     is_away = bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > KEYFRAME_RAD
@@ -330,7 +331,7 @@ def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: ThinnedScan) ->
 
 
 def _make_keyframe(
-    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: ThinnedScan, located: _Located
+    methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: Scan, located: _Located
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
     report, row = located.report, len(slam_map)
     T, is_guess = report.T_keyframe_scan, row > 0 and report.status in ("first", "restarted")
@@ -341,7 +342,7 @@ def _make_keyframe(
     # In the frame of the new keyframe; the scans of another segment have no place in it, but the lost ones begin it.
     T_new_old, before = rigid.inverse(T), state.lost if is_guess else state.recent
     moved = tuple(one._replace(T_map_scan=T_new_old @ one.T_map_scan) for one in before)
-    placed = placed_scan(scan.measured.surface, np.eye(4))
+    placed = placed_scan(scan.surface, np.eye(4))
     recent = with_scan(moved, placed, scan.extent_m)
     after = _advanced(state, report)._replace(recent=recent, local_map=None, T_keyframe_last=np.eye(4))
     return after, slam_map, report._replace(keyframe=row, T_keyframe_scan=np.eye(4), is_keyframe=True)

@@ -13,27 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from dpmjax.deeppointmap.prepared_scans import CompactScan
-from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.scans.lidar import Scan
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.keyframe_map import MapOrigin, Submap
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import AnyArray, Information, PointCloud, Pose, Poses, Verification
-
-
-class ThinnedScan(NamedTuple):
-    """A thinned scan, the common input of encoder and odometry.
-
-    Attributes:
-        cloud: thinned points, metres, in the frame of the lidar; input of the encoder.
-        measured: surface and free space of the thinned points.
-        extent_m: median range of the thinned points.
-        weak_axis: unit vector along a corridor, which few walls face, in the frame of the lidar; None elsewhere.
-    """
-
-    cloud: PointCloud
-    measured: MeasuredScan
-    extent_m: float
-    weak_axis: Float[np.ndarray, "3"] | None = None
+from dpmjax.types import AnyArray, Information, Pose, Poses, Verification
 
 
 class Alignment(NamedTuple):
@@ -57,7 +41,7 @@ class Alignment(NamedTuple):
 class Geometry(Protocol):
     """Thins scans and aligns them with the local map. `thin` runs in a thread of its own, one scan ahead."""
 
-    def thin(self, points: Float[np.ndarray, "n 3"]) -> ThinnedScan | None:
+    def thin(self, points: Float[np.ndarray, "n 3"]) -> Scan | None:
         """Prepares a scan.
 
         Args:
@@ -67,7 +51,7 @@ class Geometry(Protocol):
             The thinned scan; None for a scan without enough flat points.
         """
 
-    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
+    def align(self, local_map: LocalMap, scan: Scan, T_map_scan: Pose) -> Alignment:
         """Aligns a scan from a first guess that is nearly right.
 
         Args:
@@ -79,7 +63,7 @@ class Geometry(Protocol):
             The alignment.
         """
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Poses) -> Alignment:
+    def search(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Alignment:
         """Aligns a scan from several first guesses, coarse to fine.
 
         Args:
@@ -147,7 +131,7 @@ class Matcher(Protocol):
     def fingerprint(self) -> str:
         """Returns a text that is equal for equal matchers."""
 
-    def encode(self, scan: ThinnedScan) -> CompactScan:
+    def encode(self, scan: Scan) -> CompactScan:
         """Prepares a scan for any number of registrations.
 
         Where each scan is encoded it runs one scan ahead, in the thread of `Geometry.thin`.
@@ -261,6 +245,6 @@ class PreparedInput(NamedTuple):
     """
 
     num_points: int
-    thinned: ThinnedScan | None
+    thinned: Scan | None
     T_turn: Pose | None = None
     compact: CompactScan | None = None

@@ -134,5 +134,6 @@ def joined_surface(placed: Sequence[PlacedElements]) -> Surface:
     for T, positions, normals, planarity in placed:
         R = T[:3, :3].T
         parts.append((positions @ R + T[:3, 3], normals @ R, planarity))
-    points, normals, planarity = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    # In columns: an alignment takes a few of them at each step.
+    points, normals, planarity = (np.asfortranarray(np.concatenate(arrays)) for arrays in zip(*parts, strict=True))
     return Surface(points, normals, planarity, np.random.default_rng(0).permutation(len(points)), HostTree(points))

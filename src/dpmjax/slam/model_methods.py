@@ -22,13 +22,15 @@ from dpmjax.deeppointmap.matching import MatchConfig, merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.motion_choice import ELEMENT_RADIUS_M, REFINEMENT
 from dpmjax.deeppointmap.overlap_prediction import overlap_pairs, require_overlap
-from dpmjax.deeppointmap.prepared_scans import CompactScan, PreparedScan, compact_scan, expand_elements, expand_scan
+from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_scan, descriptors_of, expand_elements, expand_scan
 from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.surface_alignment import align_surfaces, nearest_planes
+from dpmjax.scans.align import align_on_host
+from dpmjax.scans.lidar import Scan
+from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.weak_directions import diagonal_information, plane_information
 from dpmjax.slam.config import SlamConfig
-from dpmjax.slam.interfaces import Match, Proposal, SlamMethods, ThinnedScan
+from dpmjax.slam.interfaces import Match, Proposal, SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap
 from dpmjax.slam.local_map import joined_surface, placed_keyframes
 from dpmjax.slam.surface_geometry import SurfaceGeometry
@@ -62,7 +64,7 @@ class NetworkMatcher:
         self._overlap_model = without_regression(self._model) if by_head else self._model
         self.fingerprint = model_fingerprint(model)
 
-    def encode(self, scan: ThinnedScan) -> CompactScan:
+    def encode(self, scan: Scan) -> CompactScan:
         """Encodes a scan in the compact form of a map; see `Matcher`.
 
         Args:
@@ -72,9 +74,11 @@ class NetworkMatcher:
             The compact scan.
         """
         config = self._model.config
+        if scan.cloud is None:
+            raise ValueError("scan: expected the thinned points of lidar_scan, got none")
         pyramid = pyramid_of_cloud(scan.cloud, config)
         cloud = encode_pyramid(self._model, pyramid, num_elements=config.pyramid.stages[0].num_points)
-        return compact_scan(jax.device_get(cloud), scan.measured.image)
+        return compact_scan(jax.device_get(cloud), scan.image)
 
     def vector(self, scan: CompactScan) -> Float[np.ndarray, " c"]:
         """Pools the descriptors; see `Matcher`.
@@ -152,9 +156,9 @@ class NetworkMatcher:
     def _match(self, source: Submap, target: Submap, found: Registration) -> Match:
         config = self._model.config.verification
         scan, union = joined_surface(placed_keyframes(source)[:1]), joined_surface(placed_keyframes(target))
-        T = align_surfaces(scan, union, np.asarray(found.T_target_source)[None], REFINEMENT)
-        pairs = nearest_planes(scan, union, T, config.plane_radius_m, config.num_samples).pairs
-        information = plane_information(pairs, T[0])
+        T = align_on_host(scan, union, np.asarray(found.T_target_source)[None], REFINEMENT).T_target_source
+        pairs = nearest_planes(scan, union, T, config.plane_radius_m, config.num_samples)
+        information = plane_information(pairs.take(pairs.is_paired), T[0])
         return Match(T[0], float(found.confidence), float(found.rmse), found.verification, information)
 
 
@@ -173,10 +177,11 @@ def without_regression(model: Model) -> Model:
     return model
 
 
-def _merged(submap: Submap) -> PreparedScan:
+def _merged(submap: Submap) -> Scan:
     """Merges descriptors, without copies of one place, for the verification by the central scan."""
     first = expand_scan(submap.scans[0])
-    return PreparedScan(thin_merged(union_of(submap), len(first.descriptors.described.mask)), first.measured)
+    merged = thin_merged(union_of(submap), len(descriptors_of(first).described.mask))
+    return first._replace(descriptors=merged)
 
 
 def union_of(submap: Submap) -> DescriptorCloud:
@@ -241,7 +246,7 @@ def make_methods(model: Model, config: SlamConfig | None = None, *, weights: str
     require_type("model", model, Model, "load_model")
     require_type("config", config, SlamConfig, "SlamConfig or slam_preset")
     matcher = NetworkMatcher(model, by_head=config.method == "descriptors")
-    return SlamMethods(matcher, SurfaceGeometry(model.config, config.odometry), config, weights)
+    return SlamMethods(matcher, SurfaceGeometry(model.config), config, weights)
 
 
 def methods_for(model: Model | SlamMethods, slam_map: KeyframeMap) -> SlamMethods:

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deeppointmap.encoding import thin_scan
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.verification import MeasuredScan
+from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surface_alignment import NearestPlanes, align_surfaces, nearest_planes
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, surface_at, view_points
+from dpmjax.scans.align import AlignmentLevel, align_on_host
+from dpmjax.scans.lidar import Scan, lidar_scan
+from dpmjax.scans.pairs import Pairs, nearest_planes
+from dpmjax.scans.surfaces import Surface, view_points
 from dpmjax.scans.weak_directions import (
     plane_information,
-    surface_in_corridor,
     with_least_covariance,
     without_noise_along,
 )
 from dpmjax.sequences import homogeneous
-from dpmjax.slam.config import OdometryConfig
-from dpmjax.slam.interfaces import Alignment, ThinnedScan
+from dpmjax.slam.interfaces import Alignment
 from dpmjax.slam.local_map import LocalMap
-from dpmjax.types import Pose, Poses
+from dpmjax.types import Information, Pose, Poses
 
 # Turns about the x and y axes among the further starts.
 TILTS_DEG = (-8.0, 8.0)
@@ -35,9 +34,6 @@ TURNS_DEG = (-10.0, 10.0, -20.0, 20.0, -35.0, 35.0, -50.0, 50.0)
 
 # Turns on the spot, of a robot between two scans.
 SPINS_DEG = (-80.0, 80.0, -110.0, 110.0, -145.0, 145.0, 180.0)
-
-# A scan with fewer flat surface elements counts as empty.
-MIN_NUM_POINTS = 100
 
 # Number of surface elements that the score of a pose compares.
 NUM_SAMPLES = 1000
@@ -60,17 +56,15 @@ FLOOR_RAD = 0.001
 # Number of elements of the local map that are compared with the free space of a scan.
 MAX_VIEWED = 4000
 
-# Largest number of surface elements of a scan: denser scans would align ring with ring.
-MAX_ELEMENTS = 3000
-
-# In scans of 1,000 points neighbours are farther away.
-NEIGHBOURHOODS = SurfaceConfig(sparse_radius_share=1.5)
-
-# One element of each voxel of this size is chosen first, because ground near the lidar is dense.
-SPREAD_M = 1.5
-
 # Number of starts of a search that are aligned finely.
 NUM_FINE = 3
+
+# Alignment from a first guess that is nearly right, and from other starts.
+NARROW = (AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1))
+WIDE = (AlignmentLevel(3.0, 300, 10),)
+
+# Largest distance between an element and the element of the map whose plane it meets.
+PLANE_RADIUS_M = 1.5
 
 
 class SurfaceGeometry:
@@ -78,14 +72,16 @@ class SurfaceGeometry:
 
     Args:
         model_config: preprocessing and pyramid of the encoder.
-        config: settings; None takes the defaults.
+        spacing: factor of the usual distance of elements, by which the radii of pairs grow.
     """
 
-    def __init__(self, model_config: ModelConfig, config: OdometryConfig | None = None) -> None:
-        self._model_config = model_config
-        self.config = config or OdometryConfig()
+    def __init__(self, model_config: ModelConfig, *, spacing: float = 1.0) -> None:
+        self._model_config, self._plane_radius_m = model_config, spacing * PLANE_RADIUS_M
+        self._narrow, self._wide = (
+            tuple(replace(level, radius_m=spacing * level.radius_m) for level in levels) for levels in (NARROW, WIDE)
+        )
 
-    def thin(self, points: Float[np.ndarray, "n 3"]) -> ThinnedScan | None:
+    def thin(self, points: Float[np.ndarray, "n 3"]) -> Scan | None:
         """Thins a scan as the encoder does, and estimates its surface; see `Geometry`.
 
         Args:
@@ -94,18 +90,9 @@ class SurfaceGeometry:
         Returns:
             The thinned scan; None if it is empty.
         """
-        if len(points) < MIN_NUM_POINTS:
-            return None
-        cloud = thin_scan(points, self._model_config)
-        thinned = np.asarray(cloud.points)[np.asarray(cloud.mask)].astype(np.float64)
-        surface = surface_at(thinned, _spread_rows(thinned), NEIGHBOURHOODS)
-        if np.count_nonzero(surface.flatness) < MIN_NUM_POINTS:
-            return None
-        surface, weak_axis = surface_in_corridor(surface)
-        extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
-        return ThinnedScan(cloud, MeasuredScan(surface, range_image(thinned)), extent_m, weak_axis)
+        return lidar_scan(points, self._model_config.preprocess)
 
-    def align(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Pose) -> Alignment:
+    def align(self, local_map: LocalMap, scan: Scan, T_map_scan: Pose) -> Alignment:
         """Aligns from a first guess that is nearly right; see `Geometry`.
 
         Args:
@@ -118,7 +105,7 @@ class SurfaceGeometry:
         """
         return self._aligned(local_map, scan, T_map_scan[None])[0]
 
-    def search(self, local_map: LocalMap, scan: ThinnedScan, T_map_scan: Poses) -> Alignment:
+    def search(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Alignment:
         """Aligns all first guesses coarsely and the best of them finely; see `Geometry`.
 
         Args:
@@ -129,10 +116,10 @@ class SurfaceGeometry:
         Returns:
             The pose under which most elements meet planes and fewest lie in free space.
         """
-        surface = scan.measured.surface
-        coarse = list(align_surfaces(surface, local_map.surface, T_map_scan, self.config.wide))
-        coarse.sort(key=lambda T: -_matched_share(surface, self._planes(local_map, surface, T, NUM_SAMPLES // 3)))
-        return max(self._aligned(local_map, scan, np.array(coarse[:NUM_FINE])), key=lambda found: found.score)
+        coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, self._wide).T_target_source
+        matched = _matched_shares(scan.surface, self._planes(local_map, scan, coarse, NUM_SAMPLES // 3))
+        best = np.argsort(-matched, kind="stable")[:NUM_FINE]
+        return max(self._aligned(local_map, scan, coarse[best]), key=lambda found: found.score)
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
@@ -158,47 +145,46 @@ class SurfaceGeometry:
         rotations, translations = (np.array(parts) for parts in zip(*motions, strict=True))
         return homogeneous(rotations, translations)
 
-    def _aligned(self, local_map: LocalMap, scan: ThinnedScan, starts: Poses) -> list[Alignment]:
-        found = align_surfaces(scan.measured.surface, local_map.surface, orthonormal(starts), self.config.narrow)
-        return [self._scored(local_map, scan, T) for T in found]
+    def _aligned(self, local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
+        T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), self._narrow).T_target_source
+        planes = self._planes(local_map, scan, T, NUM_SAMPLES)
+        matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
+        scores = matched - CONTRADICTION_WEIGHT * contradicted
+        columns = (column.tolist() for column in (matched, contradicted, scores))
+        information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
+        return list(map(Alignment, T, *columns, information))
 
-    def _scored(self, local_map: LocalMap, scan: ThinnedScan, T: Pose) -> Alignment:
-        surface = scan.measured.surface
-        planes = self._planes(local_map, surface, T, NUM_SAMPLES)
-        matched, contradicted = _matched_share(surface, planes), _contradicted_share(local_map, scan.measured, T)
-        pairs = planes.pairs
-        if scan.weak_axis is not None:
-            is_firm = planes.meets & (surface.flatness[surface.samples[: planes.meets.shape[1]]] > 0)
-            pairs = without_noise_along(pairs, T[:3, :3] @ scan.weak_axis, is_firm[planes.is_paired])
-        information = with_least_covariance(plane_information(pairs, T), FLOOR_M, FLOOR_RAD)
-        return Alignment(T, matched, contradicted, matched - CONTRADICTION_WEIGHT * contradicted, information)
-
-    def _planes(self, local_map: LocalMap, surface: Surface, T_map_scan: Pose, num_samples: int) -> NearestPlanes:
-        return nearest_planes(surface, local_map.surface, T_map_scan[None], self.config.plane_radius_m, num_samples)
+    def _planes(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
+        return nearest_planes(scan.surface, local_map.surface, T_map_scan, self._plane_radius_m, num_samples)
 
 
-def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
-    """Chooses points in random order: first one of each coarse voxel, then others."""
-    rng, is_first = np.random.default_rng(0), np.zeros(len(points), bool)
-    is_first[first_of_each_voxel(points, SPREAD_M)] = True
-    return np.concatenate([rng.permutation(np.flatnonzero(part)) for part in (is_first, ~is_first)])[:MAX_ELEMENTS]
+def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
+    """Returns the information of a pose by the planes that elements meet; along a corridor, firm ones alone count."""
+    pairs = planes.take(planes.is_paired)
+    if scan.weak_axis is not None:
+        is_firm = pairs.meets & (scan.surface.flatness[scan.surface.samples[: len(planes.meets)]] > 0)[planes.is_paired]
+        pairs = without_noise_along(pairs, T_map_scan[:3, :3] @ scan.weak_axis, is_firm)
+    return with_least_covariance(plane_information(pairs, T_map_scan), FLOOR_M, FLOOR_RAD)
 
 
-def _matched_share(surface: Surface, planes: NearestPlanes) -> float:
+def _matched_shares(surface: Surface, planes: Pairs) -> Float[np.ndarray, " s"]:
     """Returns the mean share of elements that meet planes, over the main directions of their normals.
 
     Ground meets ground under any motion: without the mean it would outweigh the walls.
     """
-    meets = planes.meets[0]
-    direction = np.argmax(np.abs(surface.normals[surface.samples[: len(meets)]]), axis=1)
-    counts = np.bincount(direction, minlength=3)
-    shares = np.bincount(direction, weights=meets, minlength=3) / np.maximum(counts, 1)
+    meets = planes.meets
+    is_along = np.eye(3)[np.argmax(np.abs(surface.normals[surface.samples[: meets.shape[1]]]), axis=1)]
+    counts = is_along.sum(axis=0)
     # A direction of few elements counts less, because its share is uncertain.
-    return float(np.average(shares, weights=np.minimum(counts, counts.max() / 3) + 1e-9))
+    weights = np.minimum(counts, counts.max() / 3) + 1e-9
+    return np.asarray(meets @ is_along / np.maximum(counts, 1) @ (weights / weights.sum()))
 
 
-def _contradicted_share(local_map: LocalMap, measured: MeasuredScan, T_map_scan: Pose) -> float:
+def _contradicted_shares(local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Float[np.ndarray, " s"]:
     """Returns the share of visible elements of the map that lie in the free space of the scan."""
-    points = local_map.surface.points[local_map.surface.samples[:MAX_VIEWED]]
-    views = view_points(measured.image, (points - T_map_scan[:3, 3]) @ T_map_scan[:3, :3])
-    return float(views.is_contradicted.sum()) / max(int(views.is_visible.sum()), 1)
+    surface = local_map.surface
+    points = surface.points.take(surface.samples[:MAX_VIEWED], axis=0).astype(np.float32)
+    T_scan_map = rigid.inverse(T_map_scan).astype(np.float32)
+    moved = np.matmul(T_scan_map[:, :3, :3], points.T) + T_scan_map[:, :3, 3:]
+    is_visible, is_contradicted = view_points(scan.image, moved.swapaxes(1, 2))
+    return np.asarray(is_contradicted.sum(axis=1) / np.maximum(is_visible.sum(axis=1), 1))

@@ -235,9 +235,9 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
         ValueError: if the shape is not (n, 3), or if there are not n times.
     """
     points = as_host_points("scan", scan.points if isinstance(scan, TimedScan) else scan)
-    is_finite = np.isfinite(points).all(axis=1)
+    is_finite = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
     if not isinstance(scan, TimedScan) or T_turn is None:
-        return points[is_finite]
+        return points if is_finite.all() else points[is_finite]
     offsets = np.asarray(scan.offsets)
     require_shape("scan.offsets", offsets, points.shape[:1])
     return deskew(points[is_finite], offsets[is_finite], T_turn)
