@@ -118,7 +118,7 @@ def draw(run: Run, sequence: DepthSequence, found: deepmapping.Registered) -> No
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
     assert found.start is not None
     panels = []
-    for name, T_world_camera in {"start": found.start, "fit": found.fitted.T_world_scan}.items():
+    for name, T_world_camera in {"start": found.start, "fit": found.fit}.items():
         errors = metrics.depth_errors(sequence, T_world_camera)
         ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
         panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))

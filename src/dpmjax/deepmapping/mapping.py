@@ -68,6 +68,7 @@ class Registered(NamedTuple):
         misfit: 1 less the `projective_consistency` of the keyframes at the poses of the fit, 0 or more.
         start_misfit: the same at the initial poses.
         start: (n, 4, 4) initial poses.
+        fit: (n, 4, 4) poses of the fit; images that are no keyframes follow the keyframe before them.
         keyframes: (k,) rows of the images that were fitted.
         fitted: DeepMapping of the keyframes.
         placed: the search of initial poses with its assessment; None where the poses were given.
@@ -78,6 +79,7 @@ class Registered(NamedTuple):
     misfit: float
     start_misfit: float
     start: NDArray[np.float64]
+    fit: NDArray[np.float64]
     keyframes: NDArray[np.int64]
     fitted: Fitted
     placed: PlacedImages | None = None
@@ -210,10 +212,11 @@ def register_depth(
     # Images at poses that are not finite contradict nothing.
     is_better = bool(np.isfinite(poses["fit"]).all()) and misfits["fit"] < misfits["start"]
     kept: Literal["fit", "start"] = "fit" if fitted.num_steps > 0 and is_better else "start"
-    # The other images follow the keyframe before them.
     row = np.searchsorted(keyframes, np.arange(len(given)), side="right") - 1
-    T_world_scan = given if kept == "start" else poses["fit"][row] @ np.linalg.inv(T_start)[row] @ given
-    return Registered(T_world_scan, kept, misfits["fit"], misfits["start"], given, keyframes, fitted, placed)
+    T_fit = poses["fit"][row] @ np.linalg.inv(T_start)[row] @ given
+    T_fit[keyframes] = poses["fit"]
+    T_world_scan = given if kept == "start" else T_fit
+    return Registered(T_world_scan, kept, misfits["fit"], misfits["start"], given, T_fit, keyframes, fitted, placed)
 
 
 class MapPicture(NamedTuple):

@@ -8,7 +8,7 @@ adjusted against more images. Many distinct motions are proposed, so that later 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -189,7 +189,7 @@ def _agreements(
     view = Views(PixelSample(points, everything), surface)
 
     def at(T: Float[Array, "4 4"]) -> Agreement:
-        def against(T_last_ref: AnyArray, points_ref: AnyArray, surface_ref: AnyArray) -> Agreement:
+        def against(T_last_ref: Any, points_ref: Any, surface_ref: Any) -> Agreement:
             other = Views(PixelSample(points_ref, everything), surface_ref)
             return both_ways(rigid.compose(rigid.inverse(T_last_ref), T), view, other, pinhole, tolerance)
 
