@@ -108,6 +108,13 @@ def test_poses_that_no_pair_joins_do_not_matter_to_each_other(walk) -> None:
     np.testing.assert_allclose(both[1:], np.stack(alone), atol=1e-6)
 
 
+def test_images_that_do_not_see_each_other_stay(walk) -> None:
+    images = images_of(as_depth_scans(walk.points[:2], walk.mask[:2]))
+    apart = np.tile(np.eye(4), (2, 1, 1))
+    apart[1, 0, 3] = 100.0
+    np.testing.assert_array_equal(adjust_poses(images, apart, pairs_of(2), 0.02, num_iterations=2), apart)
+
+
 def test_another_number_of_images_compiles_nothing(walk) -> None:
     images = images_of(as_depth_scans(walk.points, walk.mask))
     linearise_pairs(images, walk.T_world_camera, pairs_of(4)[:1], 0.02)

@@ -189,7 +189,9 @@ def linearise_pairs(images: DepthImages, T_world_camera: Poses, pairs: Pairs, to
         found = _linearise(*inputs, camera.pinhole, np.float32(camera.unit), np.float32(tolerance))
         blocks.append([np.asarray(values, np.float64)[: len(rows) - begin] for values in found])
     if not blocks:
-        return PairSystems(*(np.zeros(shape) for shape in ((0, 6, 6), (0, 6), 0, 0, (0, 0), (0, 0))))
+        return PairSystems(
+            *(np.zeros(shape) for shape in ((0, 6, 6), (0, 6), 0, 0, *[(0, num_samples * NUM_POINTS)] * 2))
+        )
     joined = [np.concatenate(parts).reshape(len(pairs), num_samples, -1) for parts in zip(*blocks, strict=True)]
     information, gradient, total, comparable = (values.sum(axis=1) for values in joined[:4])
     points = (values.reshape(len(pairs), -1) for values in joined[4:])
@@ -225,6 +227,8 @@ def adjust_poses(
     # Images that do not see each other have no say, and cost time.
     is_seen = here.visible > 0
     pairs, here = pairs[is_seen], PairSystems(*(values[is_seen] for values in here))
+    if not len(pairs):
+        return T
     group, num_groups = _groups(len(T), pairs, num_fixed)
     of_pair, damping = np.maximum(group[pairs[:, 0]], group[pairs[:, 1]]), np.full(num_groups, _DAMPING)
     score = group_consistency(here, of_pair, num_groups)

@@ -68,7 +68,7 @@ _LARGEST_SURPRISE = 0.3
 # Last keyframes that an image is tracked against, and keyframes around one in the last adjustment of many.
 _NUM_TRACKED, _NUM_NEAR = 4, 12
 # A trusted trajectory: least explained share of an image, and least lead over the best other trajectory.
-_LEAST_EXPLAINED, _LEAST_LEAD = 0.15, 0.03
+_LEAST_EXPLAINED, _LEAST_LEAD = 0.15, 0.01
 # An image that shares less than this of its points with the last keyframe becomes a keyframe.
 _KEYFRAME_SHARE = 0.6
 
