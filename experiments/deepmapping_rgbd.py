@@ -143,7 +143,7 @@ def chain_icp(scans: Scans, settings: dm.DeepMappingConfig, key: jax.Array) -> n
 # zero. "direct": its losses without L-Net, from L-Net's first forward pass, as in the paper.
 METHODS: dict[str, Register] = {
     "zero": lambda scans, settings, key: np.tile(np.eye(4), (len(scans.points), 1, 1)),
-    "placed": lambda scans, settings, key: rgbd.initialize_depth(scans, rgbd.depth_search(settings.motion), key=key),
+    "placed": lambda scans, settings, key: rgbd.initialize_depth(scans, settings.motion, key=key).T_world_camera,
     "deepmapping": lambda scans, settings, key: dm.register_depth(scans, settings, key=key).T_world_scan,
     "deepmapping-cold": lambda scans, settings, key: dm.fit_deepmapping(scans, settings, key=key).T_world_scan,
     "direct": lambda scans, settings, key: dm.fit_deepmapping(scans, dm.as_direct(settings), key=key).T_world_scan,

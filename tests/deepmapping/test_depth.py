@@ -20,14 +20,12 @@ from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.registration_rgbd.depth_images import (
     DepthScans,
     PixelSample,
-    SampledImages,
     as_depth_scans,
     fit_pinhole,
     image_surface,
 )
 from dpmjax.registration_rgbd.projective_consistency import (
     Agreement,
-    explained_share,
     image_agreement,
     projective_consistency,
 )
@@ -180,48 +178,6 @@ def test_the_truth_is_more_consistent_than_a_walk_with_one_wrong_turn(walk, scan
     truth, wrong = (float(projective_consistency(scans, T)) for T in (walk.T_world_camera, turned))
     assert truth > wrong + 0.02
     assert truth <= 1.0
-
-
-@pytest.mark.slow
-def test_a_point_is_explained_once(walk) -> None:
-    def share(rows: list[int], T: np.ndarray) -> float:
-        scans = as_depth_scans(walk.points[rows], walk.mask[rows])
-        return float(
-            explained_share(jnp.asarray(T, jnp.float32), SampledImages(scans, scans.pixels, 3.0), jnp.float32(0.02))
-        )
-
-    same = np.tile(np.eye(4), (4, 1, 1))
-    np.testing.assert_allclose(share([0, 0, 0, 0], same), share([0, 0], same[:2]), **ROUNDING)
-    assert share([0, 0], same[:2]) > 0.4
-    away = same[:2].copy()
-    away[1, :3, :3] = np.diag([-1.0, 1.0, -1.0])
-    assert share([0, 0], away) == 0.0
-    nearer = same[:2].copy()
-    nearer[1, 2, 3] = -0.6
-    assert share([0, 0], nearer) < -1.0
-    # A gap of one to two tolerances explains less and contradicts nothing.
-    off = same[:2].copy()
-    off[1, 2, 3] = -0.03
-    assert 0.0 < share([0, 0], off) < share([0, 0], same[:2])
-
-
-@pytest.mark.slow
-def test_near_points_have_the_leeway_of_farther_ones() -> None:
-    rays = np.stack([*np.meshgrid(np.linspace(-0.7, 0.7, 12), np.linspace(-0.4, 0.4, 8)), np.ones((8, 12))], axis=-1)
-    moved = np.tile(np.eye(4), (2, 1, 1))
-    moved[1, 2, 3] = -0.05
-
-    def share(depth: float, unit: float) -> float:
-        scans = as_depth_scans(np.stack([depth * rays] * 2))
-        return float(
-            explained_share(
-                jnp.asarray(moved, jnp.float32), SampledImages(scans, scans.pixels, unit), jnp.float32(0.02)
-            )
-        )
-
-    assert share(0.3, unit=0.3) < -5.0
-    assert abs(share(0.3, unit=4.0)) < 0.5
-    assert share(2.0, unit=4.0) > 0.0
 
 
 @pytest.mark.slow

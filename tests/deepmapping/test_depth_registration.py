@@ -13,7 +13,7 @@ import pytest
 from dpmjax import deepmapping as dm
 from dpmjax import io, simulation
 from dpmjax.geometry import typical_range
-from dpmjax.registration_rgbd import DepthScans, as_depth_scans, initialize_depth, projective_consistency
+from dpmjax.registration_rgbd import DepthScans, PlacedImages, as_depth_scans, initialize_depth, projective_consistency
 
 KEY = jax.random.key(3)
 CONFIG = replace(dm.preset("fast", "depth"), steps_per_call=1)
@@ -71,7 +71,20 @@ def test_a_fit_that_is_not_finite_or_has_no_step_is_not_kept(walk, scans) -> Non
 @pytest.mark.slow
 def test_without_a_start_the_search_is_the_start(walk, scans) -> None:
     found = dm.register_depth(scans, CONFIG, key=KEY, engine=returning(walk.T_world_camera, scans))
-    np.testing.assert_array_equal(found.start, initialize_depth(scans, key=KEY))
+    placed = initialize_depth(scans, key=KEY)
+    np.testing.assert_array_equal(found.start, placed.T_world_camera)
+    again = dm.register_depth(scans, CONFIG, key=KEY, start=placed, engine=returning(walk.T_world_camera, scans))
+    np.testing.assert_array_equal(again.T_world_scan, found.T_world_scan)
+
+
+def test_images_between_keyframes_follow_the_keyframe_before_them(walk, scans) -> None:
+    apart, rows = np.array(walk.T_world_camera), np.array([0, 2])
+    apart[2:, 0, 3] += 2.0
+    placed = PlacedImages(apart, rows, np.ones(4), 0.25)
+    engine = returning(walk.T_world_camera[rows], scans)
+    found = dm.register_depth(scans, CONFIG, key=KEY, start=placed, engine=engine)
+    assert (found.kept, list(found.keyframes)) == ("fit", [0, 2])
+    np.testing.assert_allclose(found.T_world_scan, walk.T_world_camera, atol=1e-5)
 
 
 def test_bad_input_is_named(scans) -> None:

@@ -8,9 +8,9 @@
 
 Depth is 16 bit, millimetres, 0 or 65535 for nothing. Where each image has a NAME.pose.txt, the result is measured by
 these poses. Results go to results/depth/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI
-and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png. A search gives the first
-poses and DeepMapping improves them; the poses of higher consistency are kept, chosen without ground truth. Consistency
-is the share of pixels that other images confirm; flat walls alone confirm many motions.
+and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png. Each image is placed by the
+last motion, or by a search where this is not clear. DeepMapping then adjusts the keyframes; the poses of higher
+consistency, the share of pixels that other images confirm, are kept. The verdict names images that no other explains.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def main(options: DepthOptions, run: Run) -> Numbers:
     run.say(f"{sequence.name}: {len(sequence)} images")
     recorder = cli.FitRecorder(run, "m")
     settings = deepmapping.preset(options.preset, "depth", motion="planar" if sequence.is_planar else "full")
-    key, search = jax.random.key(options.seed), registration_rgbd.depth_search(settings.motion)
-    with cli.progress_bar("search of first poses", " images") as on_image:
-        start = registration_rgbd.initialize_depth(images, search, key=key, on_image=on_image)
+    key = jax.random.key(options.seed)
+    with cli.progress_bar("poses from image to image", " images") as on_image:
+        start = registration_rgbd.initialize_depth(images, settings.motion, key=key, on_image=on_image)
     found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
     numbers = {**depth_numbers(sequence, found), **recorder.numbers}
     cli.write_poses(run.path, found.T_world_scan)
@@ -88,14 +88,24 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> Num
     assert found.start is not None
     assert found.start_misfit is not None
     before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
+    assert found.placed is not None
     consistency = 1 - (found.misfit if found.kept == "fit" else found.start_misfit)
-    verdict = f"kept: {METHODS[found.kept]}; the images agree to {consistency:.0%}"
+    is_trusted, uncertain = found.placed.is_trusted, list(found.placed.uncertain_images)
+    verdict = f"{'can be trusted' if is_trusted else 'DO NOT TRUST this map'}: the images agree to {consistency:.0%}"
+    if uncertain:
+        verdict += f"; uncertain images, which others hardly explain or contradict: {', '.join(map(str, uncertain))}"
+    elif not is_trusted:
+        verdict += "; other poses explain the images as well"
     if after:
         verdict += f"; ATE {after['ate_m']:.3f} m, map points {after['point_distance_m']:.3f} m, largest error of a "
         verdict += f"turn {after['largest_turn_error_deg']:.2f} degrees"
     return {
+        "status": "done" if is_trusted else "uncertain",
         "verdict": verdict,
+        "is_trusted": is_trusted,
+        "uncertain_images": uncertain,
         "num_images": len(sequence),
+        "num_keyframes": len(found.keyframes),
         "kept": METHODS[found.kept],
         "consistency": consistency,
         "consistency_initial": 1 - found.start_misfit,
@@ -108,7 +118,7 @@ def draw(run: Run, sequence: DepthSequence, found: deepmapping.Registered) -> No
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
     assert found.start is not None
     panels = []
-    for name, T_world_camera in {"start": found.start, "fit": found.fitted.T_world_scan}.items():
+    for name, T_world_camera in {"start": found.start, "fit": found.fit}.items():
         errors = metrics.depth_errors(sequence, T_world_camera)
         ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
         panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))

@@ -21,9 +21,8 @@ from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
-from dpmjax.registration_rgbd.motion_search import depth_search
 from dpmjax.registration_rgbd.projective_consistency import projective_consistency
-from dpmjax.registration_rgbd.trajectory_search import initialize_depth
+from dpmjax.registration_rgbd.trajectory_search import PlacedImages, initialize_depth
 from dpmjax.types import ScanSet
 
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH}
@@ -66,10 +65,13 @@ class Registered(NamedTuple):
     Attributes:
         T_world_scan: (n, 4, 4) float64, unit of the points: the poses of the smaller misfit.
         kept: source of the poses, the fit or the initial poses ("start").
-        misfit: 1 less the `projective_consistency` of the images at the poses of the fit, 0 or more.
+        misfit: 1 less the `projective_consistency` of the keyframes at the poses of the fit, 0 or more.
         start_misfit: the same at the initial poses.
         start: (n, 4, 4) initial poses.
-        fitted: DeepMapping of the images.
+        fit: (n, 4, 4) poses of the fit; images that are no keyframes follow the keyframe before them.
+        keyframes: (k,) rows of the images that were fitted.
+        fitted: DeepMapping of the keyframes.
+        placed: the search of initial poses with its assessment; None where the poses were given.
     """
 
     T_world_scan: NDArray[np.float64]
@@ -77,7 +79,10 @@ class Registered(NamedTuple):
     misfit: float
     start_misfit: float
     start: NDArray[np.float64]
+    fit: NDArray[np.float64]
+    keyframes: NDArray[np.int64]
     fitted: Fitted
+    placed: PlacedImages | None = None
 
 
 def mapping_data(
@@ -169,10 +174,12 @@ def register_depth(
     config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
-    start: ArrayLike | None = None,
+    start: ArrayLike | PlacedImages | None = None,
     engine: Callable[..., Fit] = fit,
 ) -> Registered:
     """Registers depth images by a search of initial poses and DeepMapping (section 4.2), and keeps the better poses.
+
+    DeepMapping adjusts the keyframes of the search; all images where the poses are given.
 
     Initial poses and fit are compared by `projective_consistency`, without ground truth.
 
@@ -181,7 +188,7 @@ def register_depth(
             unit where a start is given.
         config: settings of the fit, and `motion` of the search; None: `preset("fast", "depth")`.
         key: key of the search and of the fit.
-        start: (n, 4, 4) initial T_world_camera; None: `initialize_depth` searches them.
+        start: (n, 4, 4) initial T_world_camera, or the result of `initialize_depth`, which is called for None.
         engine: engine of the fit, as in `fit_deepmapping`.
 
     Returns:
@@ -192,16 +199,25 @@ def register_depth(
     """
     config = config or preset("fast", "depth")
     scans = images if isinstance(images, DepthScans) else as_depth_scans(images)
+    placed = start if isinstance(start, PlacedImages) else None
     if start is None:
-        start = initialize_depth(scans, depth_search(config.motion), key=key)
+        placed = initialize_depth(scans, config.motion, key=key)
+    given = np.asarray(start if placed is None else placed.T_world_camera, np.float64)
+    keyframes = np.arange(len(scans.mask)) if placed is None else placed.keyframes
+    chosen = scans if len(keyframes) == len(scans.mask) else scans.take(keyframes)
     # Search and fit share the key, so that a fit from found poses equals a fit from the same poses, given as `start`.
-    fitted = fit_deepmapping(scans, config, key=key, start=start, engine=engine)
-    poses = {"fit": fitted.T_world_scan, "start": np.asarray(start, np.float64)}
-    misfits = {name: 1.0 - float(projective_consistency(scans, T)) for name, T in poses.items()}
+    T_start = given[keyframes] if given.shape == (len(scans.mask), 4, 4) else given
+    fitted = fit_deepmapping(chosen, config, key=key, start=T_start, engine=engine)
+    poses = {"fit": fitted.T_world_scan, "start": T_start}
+    misfits = {name: 1.0 - float(projective_consistency(chosen, T)) for name, T in poses.items()}
     # Images at poses that are not finite contradict nothing.
     is_better = bool(np.isfinite(poses["fit"]).all()) and misfits["fit"] < misfits["start"]
     kept: Literal["fit", "start"] = "fit" if fitted.num_steps > 0 and is_better else "start"
-    return Registered(poses[kept], kept, misfits["fit"], misfits["start"], poses["start"], fitted)
+    row = np.searchsorted(keyframes, np.arange(len(given)), side="right") - 1
+    T_fit = poses["fit"][row] @ np.linalg.inv(T_start)[row] @ given
+    T_fit[keyframes] = poses["fit"]
+    T_world_scan = given if kept == "start" else T_fit
+    return Registered(T_world_scan, kept, misfits["fit"], misfits["start"], given, T_fit, keyframes, fitted, placed)
 
 
 class MapPicture(NamedTuple):

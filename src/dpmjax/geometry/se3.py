@@ -6,7 +6,7 @@ Tangents are (translation, rotation), in that order. Lengths keep their unit, an
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -69,25 +69,24 @@ def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     return jnp.eye(6, dtype=T.dtype) + ad / 2 + second * squared_ad + fourth * rigid.matmul(squared_ad, squared_ad)
 
 
-def _cross_matrix(vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=-2)
+def _cross_matrix(vector: Any) -> Any:
+    xp, (x, y, z) = rigid.namespace_of(vector), (vector[..., 0], vector[..., 1], vector[..., 2])
+    zero = xp.zeros_like(x)
+    return xp.stack([xp.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=-2)
 
 
-def adjoint(T_a_b: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
-    """The adjoint of a motion, which moves tangents from b to a.
+def adjoint(T_a_b: Any) -> Any:
+    """Makes the adjoint of a motion, which moves tangents from b to a.
 
     Args:
-        T_a_b: (..., 4, 4).
+        T_a_b: (..., 4, 4), of NumPy or of JAX.
 
     Returns:
-        (..., 6, 6) for tangents (translation, rotation).
+        (..., 6, 6) for tangents (translation, rotation), of the same kind.
     """
-    T_a_b = as_float("T_a_b", T_a_b)
-    R = T_a_b[..., :3, :3]
-    top = jnp.concatenate([R, rigid.matmul(_cross_matrix(T_a_b[..., :3, 3]), R)], axis=-1)
-    return jnp.concatenate([top, jnp.concatenate([jnp.zeros_like(R), R], axis=-1)], axis=-2)
+    xp, R = rigid.namespace_of(T_a_b), T_a_b[..., :3, :3]
+    top = xp.concatenate([R, rigid.matmul(_cross_matrix(T_a_b[..., :3, 3]), R)], axis=-1)
+    return xp.concatenate([top, xp.concatenate([xp.zeros_like(R), R], axis=-1)], axis=-2)
 
 
 def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -58,6 +58,10 @@ class DepthScans:
         """Computes the surface between the pixels of each image; see `image_surface`."""
         return jax.vmap(image_surface)(jnp.where(self.mask, self.points[..., 2], 0.0))
 
+    def take(self, rows: NDArray[np.integer]) -> DepthScans:
+        """Returns the images of these rows."""
+        return DepthScans(self.points[rows], self.mask[rows], self.pinhole)
+
     @property
     def pixels(self) -> PixelSample:
         """Returns all pixels of each image."""
@@ -75,20 +79,6 @@ class Views(NamedTuple):
 
     sample: PixelSample
     surfaces: Float[Array, "... 4 r c"]
-
-
-class SampledImages(NamedTuple):
-    """Depth images with some points of each.
-
-    Attributes:
-        scans: the images.
-        sample: points by which trajectories are compared and adjusted.
-        unit: typical range of the images, unit of the points.
-    """
-
-    scans: DepthScans
-    sample: PixelSample
-    unit: Float[Array, ""] | float
 
 
 def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthScans:
@@ -122,23 +112,24 @@ def as_depth_scans(points: ArrayLike, mask: ArrayLike | None = None) -> DepthSca
     return DepthScans(jnp.asarray(np.where(valid[..., None], cloud, 0.0)), jnp.asarray(valid), pinhole)
 
 
-def image_surface(depth: Float[Array, "h w"]) -> Float[Array, "4 r c"]:
+def image_surface(depth: Any) -> Any:
     """Computes the surface between the pixels of a depth image, by bilinear interpolation of the inverse depth.
 
     The inverse depth is linear on a plane.
 
     Args:
-        depth: depth along z, 0 at invalid pixels.
+        depth: (h, w) depth along z, 0 at invalid pixels; of NumPy or of JAX.
 
     Returns:
         For each cell of four pixels the value at the upper left pixel, the slopes along columns and rows, and the
         mixed derivative. All are 0 where the four pixels do not lie on one surface. r = h - 1, c = w - 1.
     """
-    inverse = jnp.where(depth > 0.0, 1.0 / jnp.where(depth > 0.0, depth, 1.0), 0.0)
-    corners = jnp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
+    xp = rigid.namespace_of(depth)
+    inverse = xp.where(depth > 0.0, 1.0 / xp.where(depth > 0.0, depth, 1.0), 0.0)
+    corners = xp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
     low, high = corners.min(axis=0), corners.max(axis=0)
     a, b, c, d = corners
-    return jnp.where((low > 0.0) & (high - low < _EDGE * high), jnp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
+    return xp.where((low > 0.0) & (high - low < _EDGE * high), xp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
 
 
 def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:
@@ -176,26 +167,49 @@ def surface_gap(
         Distance as a share of the surface's depth, negative behind the surface; and True for points that are projected
         to a surface, else the distance is 0.
     """
+    gap, _, is_visible = surface_slopes(T_other_camera, sample, surface_other, pinhole)
+    return gap, is_visible
+
+
+def surface_slopes(
+    T_other_camera: Float[Array, "4 4"], sample: PixelSample, surface_other: Float[Array, "4 r c"], pinhole: Pinhole
+) -> tuple[Float[Array, " p"], Float[Array, "p 3"], Bool[Array, " p"]]:
+    """Computes the distances of `surface_gap`, and how they change where a point moves.
+
+    Args:
+        T_other_camera: motion of the points into the frame of a second camera.
+        sample: points of one image.
+        surface_other: `image_surface` of that camera.
+        pinhole: pinhole of that camera.
+
+    Returns:
+        The distances; their derivatives with respect to the point in the frame of the second camera; and True for
+        points that are projected to a surface, else both are 0.
+    """
     seen = rigid.transform_points(T_other_camera, sample.points)
-    depth = seen[:, 2]
-    safe = jnp.maximum(depth, 1e-3)
-    column = pinhole.fx * seen[:, 0] / safe + pinhole.cx
-    row = pinhole.fy * seen[:, 1] / safe + pinhole.cy
-    inverse, is_smooth = _inverse_depth_at(surface_other, row, column)
-    is_visible = sample.mask & (depth > 1e-3) & is_smooth
-    return jnp.where(is_visible, 1.0 - depth * inverse, 0.0), is_visible
+    safe = jnp.maximum(seen[:, 2], 1e-3)
+    x, y = seen[:, 0] / safe, seen[:, 1] / safe
+    inverse, (along_row, along_column), is_smooth = _inverse_depth_at(
+        surface_other, pinhole.fy * y + pinhole.cy, pinhole.fx * x + pinhole.cx
+    )
+    is_visible = sample.mask & (seen[:, 2] > 1e-3) & is_smooth
+    by_x, by_y = pinhole.fx * along_column, pinhole.fy * along_row
+    slopes = -jnp.stack([by_x, by_y, inverse - by_x * x - by_y * y], axis=-1)
+    gap = jnp.where(is_visible, 1.0 - seen[:, 2] * inverse, 0.0)
+    return gap, jnp.where(is_visible[:, None], slopes, 0.0), is_visible
 
 
 def _inverse_depth_at(
     surface: Float[Array, "4 r c"], row: Float[Array, " p"], column: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Bool[Array, " p"]]:
-    """Interpolates the inverse depth between four pixels; the mask is True where they lie on one surface."""
+) -> tuple[Float[Array, " p"], tuple[Float[Array, " p"], Float[Array, " p"]], Bool[Array, " p"]]:
+    """Interpolates the inverse depth between four pixels, with its slopes; True where they lie on one surface."""
     num_rows, num_columns = surface.shape[1:]
     top = jnp.clip(jnp.floor(row).astype(jnp.int32), 0, num_rows - 1)
     left = jnp.clip(jnp.floor(column).astype(jnp.int32), 0, num_columns - 1)
     # One look-up in each of four flat arrays takes a seventh of the time of four look-ups in the image.
     cell = top * num_columns + left
-    value, along_row, along_column, twist = (flat[cell] for flat in surface.reshape(4, -1))
+    value, along_column, along_row, twist = (flat[cell] for flat in surface.reshape(4, -1))
     is_inside = (row >= 0.0) & (row <= num_rows) & (column >= 0.0) & (column <= num_columns)
     v, u = jnp.where(is_inside, row - top, 0.0), jnp.where(is_inside, column - left, 0.0)
-    return value + along_row * u + along_column * v + twist * u * v, is_inside & (value > 0.0)
+    inverse = value + along_column * u + along_row * v + twist * u * v
+    return inverse, (along_row + twist * u, along_column + twist * v), is_inside & (value > 0.0)
