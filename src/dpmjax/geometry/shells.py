@@ -1,7 +1,7 @@
 """Beams without an echo that were written as points at the largest range.
 
-SICK and Hokuyo drivers, 3DTK and simulators write such beams at one range or a few, or with noise. These points lie on a
-circle or sphere about the sensor and move with it, so that a registration finds no motion.
+SICK and Hokuyo drivers, 3DTK and simulators write such beams at one range or a few, or with noise. These points lie on
+a circle or sphere about the sensor and move with it, so that a registration finds no motion.
 """
 
 from __future__ import annotations
