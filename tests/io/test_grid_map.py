@@ -46,7 +46,6 @@ def test_a_room_is_free_within_its_walls(tmp_path, cell_m: float) -> None:
         return int(picture[row, column])
 
     assert at([0.0, 0.0]) == at([2.5, 1.5]) == 254
-    assert at([-3.025, 0.3]) == at([1.0, 2.025]) == 0
     assert picture[0, 0] == 205
     # Walls have no gaps: each beam of a finer scan meets an occupied cell near its end.
     ends = se2.transform_points(shift, room_scans(np.zeros((1, 3)), 3.025, 2.025)[0])

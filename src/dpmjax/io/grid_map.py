@@ -11,7 +11,7 @@ from dpmjax.geometry import se2
 from dpmjax.io.files import write_atomically
 
 # A cell is occupied where a larger share of the beams that reach it ends there: beams that graze a wall pass its cells.
-_OCCUPIED_SHARE = 0.25
+_OCCUPIED_SHARE = 0.15
 # Values of a cell in the picture, as the map server reads them.
 _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
 # Scans that are drawn at most; more of them add no cell.
