@@ -136,14 +136,21 @@ class BagWriter:
         self.write("/livox/lidar", kind, stamp_ns, self.make(kind, self.header(stamp_ns), *values))
 
     def write_scan(
-        self, ranges: np.ndarray, stamp_ns: int, *, topic: str = "/scan", range_max: float = 30.0, frame: str = "laser"
+        self,
+        ranges: np.ndarray,
+        stamp_ns: int,
+        *,
+        topic: str = "/scan",
+        range_max: float = 30.0,
+        frame: str = "laser",
+        delay_ns: int = 0,
     ) -> None:
         """Writes a planar scan of the whole turn."""
         step = 2 * np.pi / len(ranges)
         limits = (-np.pi, np.pi - step, step, 0.0, 0.1, 0.1, range_max)
         values = (ranges.astype(np.float32), np.zeros(0, np.float32))
         message = self.make("sensor_msgs/msg/LaserScan", self.header(stamp_ns, frame), *limits, *values)
-        self.write(topic, "sensor_msgs/msg/LaserScan", stamp_ns, message)
+        self.write(topic, "sensor_msgs/msg/LaserScan", stamp_ns + delay_ns, message)
 
     def _vector(self, values: Sequence[float]) -> Any:
         return self.make("geometry_msgs/msg/Vector3", *map(float, values))
@@ -153,7 +160,7 @@ class BagWriter:
         numbers = (np.cos(half), np.sin(half), 0.0, 0.0) if is_upside_down else (0.0, 0.0, np.sin(half), np.cos(half))
         return self.make("geometry_msgs/msg/Quaternion", *map(float, numbers))
 
-    def write_odometry(self, pose: np.ndarray, stamp_ns: int, *, topic: str = "/odom") -> None:
+    def write_odometry(self, pose: np.ndarray, stamp_ns: int, *, topic: str = "/odom", delay_ns: int = 0) -> None:
         """Writes x, y, heading as an Odometry."""
         point = self.make("geometry_msgs/msg/Point", float(pose[0]), float(pose[1]), 0.0)
         zeros = np.zeros(36)
@@ -166,7 +173,7 @@ class BagWriter:
             self.make("geometry_msgs/msg/PoseWithCovariance", covered, zeros),
             self.make("geometry_msgs/msg/TwistWithCovariance", twist, zeros),
         )
-        self.write(topic, "nav_msgs/msg/Odometry", stamp_ns, message)
+        self.write(topic, "nav_msgs/msg/Odometry", stamp_ns + delay_ns, message)
 
     def write_transform(
         self,

@@ -117,6 +117,34 @@ def test_a_missing_part_of_a_bag_is_named(tmp_path: Path) -> None:
         open_lidar_sequence(tmp_path)
 
 
+def test_a_renamed_bag_is_read_with_a_line(tmp_path: Path, clouds, caplog) -> None:
+    path = write_clouds(tmp_path / "drive", "db3", clouds)
+    (file,) = path.glob("*.db3")
+    file.rename(path / "of_monday.db3")
+    drive = open_lidar_sequence(path)
+    np.testing.assert_array_equal(drive.read_scan(2), clouds[2])
+    assert "metadata.yaml names files that are not there; of_monday.db3 is read" in caplog.text
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_clock_that_was_set_back_leaves_the_order_of_the_recording(tmp_path: Path, kind: str, clouds) -> None:
+    stamps = EPOCH_NS + STEP_NS * (np.arange(NUM) - np.where(np.arange(NUM) >= 3, 100, 0))
+    with BagWriter(tmp_path / "a", kind) as bag:
+        for index, stamp in enumerate(stamps.tolist()):
+            delay = EPOCH_NS + STEP_NS * index - stamp
+            bag.write_cloud(clouds[index], stamp, delay_ns=delay)
+            bag.write_scan(np.linspace(2.0, 3.0, 40) + 0.1 * index, stamp, delay_ns=delay)
+            bag.write_odometry(np.array([0.1 * index, 0.0, 0.0]), stamp, delay_ns=delay)
+    drive, scans = open_lidar_sequence(bag.path), read_sequence(bag.path)
+    for index in range(NUM):
+        np.testing.assert_array_equal(drive.read_scan(index), clouds[index])
+    np.testing.assert_allclose(np.linalg.norm(scans.points[:, 0], axis=1), 2.0 + 0.1 * np.arange(NUM), atol=1e-5)
+    np.testing.assert_allclose(scans.odometry_poses[:, 0], 0.1 * np.arange(NUM), atol=1e-6)
+    for notes in (drive.notes, scans.notes):
+        assert "the stamps step back by 9.9 s at message 3; the order of the recording is used" in notes[0].text
+        assert notes[0].is_doubt
+
+
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 def test_poses_beside_a_bag_are_used_where_they_have_its_times(tmp_path: Path, kind: str, clouds) -> None:
     path = write_clouds(tmp_path / "a", kind, clouds)

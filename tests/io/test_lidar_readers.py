@@ -1,7 +1,9 @@
 """Tiny drives in each layout, and the real ones."""
 
+import gzip
 import logging
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -294,3 +296,26 @@ def test_real_drives_are_opened(real_data, name):
 def test_a_name_that_is_no_utf_8_keeps_its_bytes(tmp_path):
     name = os.fsdecode(b"stra\xdfe_0.npy")
     assert write_atomically(tmp_path / "list.txt", name).read_bytes() == b"stra\xdfe_0.npy"
+
+
+@pytest.mark.parametrize("separator", [" ", ",", ";"])
+@pytest.mark.parametrize("name", ["a.xyz", "a.csv", "a.txt", "a.txt.gz"])
+def test_columns_of_text_are_points(tmp_path: Path, separator: str, name: str) -> None:
+    points = np.random.default_rng(0).uniform(-20, 20, (50, 4)).round(3)
+    header = "" if separator == " " else separator.join(["x", "y", "z", "intensity"])
+    np.savetxt(tmp_path / name, points, delimiter=separator, header=header, comments="")
+    np.testing.assert_allclose(read_lidar_file(tmp_path / name), points[:, :3], rtol=1e-6)
+
+
+def test_a_packed_scan_is_that_of_the_plain_file(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(-20, 20, (500, 4)).astype(np.float32)
+    points.tofile(tmp_path / "a.bin")
+    (tmp_path / "a.bin.gz").write_bytes(gzip.compress((tmp_path / "a.bin").read_bytes()))
+    np.testing.assert_array_equal(read_lidar_file(tmp_path / "a.bin.gz"), read_lidar_file(tmp_path / "a.bin"))
+
+
+@pytest.mark.parametrize("suffix", [".pcap", ".osf", ".feather", ".vtk", ".e57"])
+def test_a_file_to_convert_names_the_converter(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"a{suffix}").write_bytes(b"1")
+    with pytest.raises(InputError, match="play|ouster-cli|read_feather|ParaView|PDAL"):
+        read_lidar_file(tmp_path / f"a{suffix}")

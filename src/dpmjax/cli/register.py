@@ -4,9 +4,10 @@
     dpmjax register 000000.bin 000010.bin -o out  KITTI's files
     dpmjax register a.npy b.ply --no-refine       without the final point-to-plane alignment
 
-Scans are .pcd .ply .las .laz .bin .npy or .npz, in metres, each in the frame of its lidar. Results go to
-results/register/<time>/ (latest links to the newest): T_target_source.txt (4 x 4, maps points of A to the frame of B),
-metrics.json, aligned.ply (A in the frame of B, and B, in two colours) and registration.png (from above).
+Scans are .pcd .ply .las .laz .bin .npy .npz, or x y z as text (.xyz .csv .txt), in metres, each in the frame of its
+lidar. Results go to results/register/<time>/ (latest links to the newest): T_target_source.txt (4 x 4, maps points of A
+to the frame of B), metrics.json, aligned.ply (A in the frame of B, and B, in two colours) and registration.png (from
+above).
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from .files import InputError as InputError
 from .files import write_atomically as write_atomically
 from .g2o import read_g2o as read_g2o
 from .g2o import write_g2o as write_g2o
+from .grid_map import write_grid_map as write_grid_map
 from .lidar import LidarSequence as LidarSequence
 from .lidar import list_lidar_sequences as list_lidar_sequences
 from .lidar import open_lidar_sequence as open_lidar_sequence

@@ -156,6 +156,25 @@ def read_bytes(path: str | Path) -> bytes:
         raise InputError(path, f"cannot be read ({error.strerror})", "check the path and its permissions") from error
 
 
+def read_unpacked(path: str | Path) -> bytes:
+    """Reads a whole file, plain or packed by gzip.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its bytes, unpacked.
+
+    Raises:
+        InputError: there is no such file, it cannot be read, or it is damaged.
+    """
+    content = read_bytes(path)
+    if not content.startswith(b"\x1f\x8b"):
+        return content
+    with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
+        return gzip.decompress(content)
+
+
 def read_lines(path: str | Path) -> list[str]:
     """Reads the lines of a text file in UTF-8, or UTF-16 with its mark in front; other bytes are replaced.
 
@@ -168,10 +187,7 @@ def read_lines(path: str | Path) -> list[str]:
     Raises:
         InputError: there is no such file, or it cannot be read.
     """
-    content = read_bytes(path)
-    if content.startswith(b"\x1f\x8b"):
-        with refusing(path, "cannot be unpacked ({error})", "copy the file again", (OSError, EOFError, zlib.error)):
-            content = gzip.decompress(content)
+    content = read_unpacked(path)
     encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     return content.decode(encoding, errors="replace").splitlines()
 

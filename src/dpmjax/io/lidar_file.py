@@ -15,11 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.clouds import TimedCloud, parse_pcd, parse_ply
-from dpmjax.io.files import import_for, load_arrays, log_notes, read_bytes, refusing, to_float32
+from dpmjax.io.files import (
+    import_for,
+    load_arrays,
+    log_notes,
+    read_bytes,
+    read_table,
+    read_unpacked,
+    refusing,
+    to_float32,
+)
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
 
 # Of equally many files of several endings the first is read; arrays may be labels, so they are last.
-SCAN_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".bin", ".npz", ".npy")
+SCAN_SUFFIXES = (".pcd", ".ply", ".las", ".laz", ".bin", ".npz", ".npy", ".xyz")
+# Columns x y z and more as text; in a folder such files may be poses or times.
+_TEXT_SUFFIXES = (".xyz", ".csv", ".txt")
+_TO_CONVERT = {
+    ".pcap": "play it through the lidar's driver, or export PCD by its viewer",
+    ".osf": "run: ouster-cli source FILE.osf save a.pcd",
+    ".feather": "save the columns x y z: numpy.save('a.npy', pandas.read_feather(FILE)[['x', 'y', 'z']])",
+    ".vtk": "export PLY by ParaView, or by meshio",
+    ".e57": "export PLY or LAS by CloudCompare or PDAL",
+}
 _NPZ_KEYS, _NPZ_TIMES = ("lidar_pcd", "points", "xyz", "arr_0"), "times"
 # Least range, usual range and largest range of lidars on the ground, m; nearly all points are within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
@@ -51,7 +69,8 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
 
     Args:
         path: `.bin` (float32 rows of x, y, z and more, as of KITTI), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
-            `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las` or `.laz`.
+            `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las`, `.laz`, or columns of text (`.xyz`, `.csv`, `.txt`).
+            All but `.npy` and `.npz` may be packed (`.gz`).
         bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None
             infers it from the values.
 
@@ -82,8 +101,8 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
         InputError: the file cannot be read any more.
     """
     path = Path(path)
-    is_raw = path.suffix.lower() == ".bin"
-    columns = find_columns(path, read_bytes(path), bin_columns)[1] if is_raw else None
+    is_raw = _suffix_of(path) == ".bin"
+    columns = find_columns(path, read_unpacked(path), bin_columns)[1] if is_raw else None
     return [note for note in (columns, unit_note(points, path)) if note is not None]
 
 
@@ -102,18 +121,26 @@ def read_point_times(path: str | Path) -> FloatArray | None:
         InputError: see `read_lidar_file`.
     """
     path = Path(path)
-    return None if path.suffix.lower() in (".bin", ".npy") else read_timed_cloud(path, None).times
+    return None if _suffix_of(path) in (".bin", ".npy") else read_timed_cloud(path, None).times
 
 
 def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
     """Reads points and times of a scan of any kind, checked; see `read_lidar_file`."""
-    suffix = path.suffix.lower()
+    suffix = _suffix_of(path)
     require(not path.is_dir(), path, "a folder", "give one scan file")
-    found = f"an unknown kind of scan, {suffix or 'without ending'}"
-    require(suffix in SCAN_SUFFIXES, path, found, f"give one of {' '.join(SCAN_SUFFIXES)}")
+    found, known = (
+        f"an unknown kind of scan, {suffix or 'without ending'}",
+        dict.fromkeys(SCAN_SUFFIXES + _TEXT_SUFFIXES),
+    )
+    advice = _TO_CONVERT.get(suffix, f"give one of {' '.join(known)}")
+    require(suffix in known, path, found, advice)
     if suffix in (".npy", ".npz"):
         return check_scan(_read_arrays(path), path)
-    content = read_bytes(path)
+    if suffix in _TEXT_SUFFIXES:
+        table = read_table(path)
+        require(table.shape[1] >= 3, path, f"rows of {table.shape[1]} numbers", "give rows of x y z")
+        return check_scan(TimedCloud(to_float32(table[:, :3]), None), path)
+    content = read_unpacked(path)
     if suffix == ".bin":
         columns = bin_columns or find_columns(path, content)[0]
         check_size(path, len(content), columns)
@@ -121,6 +148,11 @@ def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
     else:
         cloud = {".pcd": parse_pcd, ".ply": parse_ply}.get(suffix, _parse_las)(content, str(path))
     return check_scan(cloud, path)
+
+
+def _suffix_of(path: Path) -> str:
+    """Returns the ending of a file in small letters, of a packed one the ending before .gz."""
+    return Path(path.name.lower().removesuffix(".gz")).suffix
 
 
 def _read_arrays(path: Path) -> TimedCloud:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import struct
 import threading
 import weakref
@@ -19,6 +21,7 @@ from dpmjax.io.lidar_file import check_scan
 from dpmjax.io.poses import interpolate_poses
 from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, homogeneous, pad_scans, require
 
+_log = logging.getLogger(__name__)
 _LIVOX_CLOUDS = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 _CLOUDS = ("sensor_msgs/msg/PointCloud2", *_LIVOX_CLOUDS)
 _MULTI_ECHO_SCAN = "sensor_msgs/msg/MultiEchoLaserScan"
@@ -38,6 +41,8 @@ _OTHER_KINDS = {
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Frames whose motion against the robot is the result of a mapping, not odometry.
 _MAP_FRAMES = ("map", "world", "earth")
+# A stamp that steps back further than this, s, comes from a clock that was set, not from messages out of order.
+_OVERTAKING_S = 1.0
 # Odometry may end this long before or after a scan, s, for this share of the scans at least.
 _SLACK_S, _LEAST_SHARE = 0.2, 0.9
 _KINDS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError)
@@ -74,11 +79,19 @@ def _bag_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     metadata = path / "metadata.yaml"
-    # Another program's metadata.yaml lies beside its scans.
-    if metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes():
+    text = metadata.read_text("utf-8", "replace") if metadata.is_file() else ""
+    # Another program's metadata.yaml lies beside its scans; that of a renamed bag names files that are not there.
+    is_bag_2 = "rosbag2_bagfile_information" in text
+    if is_bag_2 and not _missing_files(path, text):
         return [path]
     parts = (sorted(path.glob(f"*{suffix}"), key=lambda file: natural_key(file.name)) for suffix in _SUFFIXES)
-    return next((found for found in parts if found), [])
+    return next((found for found in parts if found), [path] if is_bag_2 else [])
+
+
+def _missing_files(path: Path, metadata: str) -> list[str]:
+    """Lists the files that the metadata of a bag names and its folder lacks."""
+    named = re.findall(r"[^\s'\"\[\],]+\.(?:db3|mcap)\b", metadata)
+    return [name for name in named if not (path / name).is_file()]
 
 
 class _Bag:
@@ -92,10 +105,14 @@ class _Bag:
         typesys = import_for(path, "rosbags.typesys", "ros")
         self.path = path
         self._lock = threading.Lock()
+        files = _bag_files(path)
+        if path.is_dir() and files != [path] and (path / "metadata.yaml").is_file():
+            names = ", ".join(file.name for file in files)
+            _log.warning("%s: metadata.yaml names files that are not there; %s is read", path, names)
         with _refusing_bag(path):
             # A bag without definitions of its types has the standard ones.
             types = typesys.get_typestore(typesys.Stores.LATEST)
-            self._reader: Any = highlevel.AnyReader(_bag_files(path), default_typestore=types)
+            self._reader: Any = highlevel.AnyReader(files, default_typestore=types)
             self._reader.open()
             weakref.finalize(self, self._reader.close)
             # Type and number of messages by name.
@@ -113,6 +130,9 @@ class _Bag:
         found = f"no topic {topic}, it has {held}"
         require(topic is None or len(named) > 0, self.path, found, "name one of those with --topic")
         fitting = [name for name in self.of_kinds(kinds) if name in named]
+        silent = [name for name in named if self.topics[name][0] in kinds and self.topics[name][1] == 0]
+        found = f"the topic {', '.join(silent)} has no message"
+        require(bool(fitting) or not silent, self.path, found, "record it again while the driver runs")
         others = (advice for others, advice in _OTHER_KINDS.items() if {types[name] for name in named} & set(others))
         found = f"no {what}{'' if topic is None else f' in topic {topic}'}; its topics are {held}"
         advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
@@ -130,20 +150,24 @@ class _Bag:
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Reads all messages of a topic in the order of the recording."""
+        return (message for _, message in self.recorded(topic))
+
+    def recorded(self, topic: str) -> Iterator[tuple[float, Any]]:
+        """Reads the times of the recording, s, and the messages of a topic, in the order of the recording."""
         with self._lock, _refusing_bag(self.path):
-            for connection, _, content in self._messages(topic):
-                yield self._reader.deserialize(content, connection.msgtype)
+            for connection, recorded_ns, content in self._messages(topic):
+                yield 1e-9 * recorded_ns, self._reader.deserialize(content, connection.msgtype)
 
     def _messages(self, topic: str, **times: int) -> Iterator[Any]:
         return self._reader.messages([each for each in self._reader.connections if each.topic == topic], **times)
 
-    def places(self, topic: str) -> list[_Place]:
+    def places(self, topic: str) -> tuple[list[_Place], str | None]:
         """Finds the messages of a topic, which begin with a header, in the order of the times of their headers.
 
-        Where a header has no time, the times of the recording are taken.
+        Where a header has no time, or a clock was set back, the times of the recording are taken.
 
         Returns:
-            The places.
+            The places, and the fault of the headers' times, if any.
         """
         places: list[_Place] = []
         with self._lock, _refusing_bag(self.path):
@@ -155,9 +179,20 @@ class _Bag:
                 order = ">" if self._reader.is2 and content[1] == 0 else "<"
                 seconds, nanoseconds = struct.unpack_from(f"{order}II", content, 4)
                 places.append(_Place(seconds * 10**9 + nanoseconds, recorded_ns, number))
-        if any(place.stamp_ns <= 0 for place in places):
+        fault = _fault_of_stamps(np.array([1e-9 * place.stamp_ns for place in places]))
+        if fault is not None:
             places = [place._replace(stamp_ns=place.recorded_ns) for place in places]
-        return sorted(places)
+        return sorted(places), fault
+
+
+def _fault_of_stamps(stamps: FloatArray) -> str | None:
+    """Returns why the times (n,) of headers, s, give no order; messages that overtook each other are no fault."""
+    if len(stamps) and stamps.min() <= 0:
+        return "a header without a time"
+    back = np.diff(stamps, prepend=stamps[:1])
+    if len(stamps) and back.min() < -_OVERTAKING_S:
+        return f"the stamps step back by {-back.min():.3g} s at message {int(back.argmin())}"
+    return None
 
 
 def _refusing_bag(path: Path) -> Any:
@@ -186,15 +221,16 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
     chosen, kind = bag.choose(_PLANAR_SCANS, topic, "planar scans")
     with refusing(path, "a broken message ({error})", "record the topic again", _KINDS):
         messages = [
-            (_stamp_of(message), message.header.frame_id.strip("/"), _ends_of(message, kind))
-            for message in bag.messages(chosen)
+            (_stamp_of(message), recorded_s, message.header.frame_id.strip("/"), _ends_of(message, kind))
+            for recorded_s, message in bag.recorded(chosen)
         ]
-        stamps, frames, scans = zip(*messages, strict=True)
-        if min(stamps) <= 0:
-            stamps = tuple(place.stamp_ns * 1e-9 for place in bag.places(chosen))
-        order = np.argsort(stamps, kind="stable")
-        times = np.array(stamps)[order]
-        T_odom_laser, is_upside_down, notes = _odometry(bag, frames[order[0]], times)
+        stamps, recorded, frames, scans = zip(*messages, strict=True)
+        fault = _fault_of_stamps(np.array(stamps))
+        order = np.argsort(stamps if fault is None else recorded, kind="stable")
+        times = np.array(stamps if fault is None else recorded)[order]
+        T_odom_laser, is_upside_down, notes = _odometry(bag, frames[order[0]], times, by_recording=fault is not None)
+        if fault is not None:
+            notes = (Note(f"{path}: {fault}; the order of the recording is used", is_doubt=True), *notes)
     points, mask = pad_scans([scans[index] for index in order])
     if is_upside_down:
         points = points * np.array([1, -1], np.float32)
@@ -247,27 +283,29 @@ def _motion_of(parent: str, rows: list[tuple[float, FloatArray]]) -> _Motion:
     return _Motion(parent, times, np.array([rows[i][1] for i in first]))
 
 
-def _transforms(bag: _Bag) -> dict[str, _Motion]:
+def _transforms(bag: _Bag, *, by_recording: bool) -> dict[str, _Motion]:
     """Reads the motion of each frame in its parent, from /tf and /tf_static; of several parents, that of the most."""
     rows: dict[tuple[str, str], list[tuple[float, FloatArray]]] = {}
     for topic in bag.of_kinds(_TRANSFORMS):
-        for message in bag.messages(topic):
+        for recorded_s, message in bag.recorded(topic):
             for each in message.transforms:
                 T = _pose_of(each.transform.translation, each.transform.rotation)
                 ends = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-                rows.setdefault(ends, []).append((_stamp_of(each), T))
+                rows.setdefault(ends, []).append((recorded_s if by_recording else _stamp_of(each), T))
     ordered = sorted(rows.items(), key=lambda entry: len(entry[1]))
     return {child: _motion_of(parent, found) for (parent, child), found in ordered}
 
 
-def _odometry(bag: _Bag, frame: str, times: FloatArray) -> tuple[FloatArray | None, bool, tuple[Note, ...]]:
+def _odometry(
+    bag: _Bag, frame: str, times: FloatArray, *, by_recording: bool = False
+) -> tuple[FloatArray | None, bool, tuple[Note, ...]]:
     """Computes the odometry of the laser: the motion of the robot after the chain of constant transforms to the laser.
 
     Returns:
         T_odom_laser at the times of the scans, None where the bag has no odometry; True where the laser is upside down;
         and notes.
     """
-    motions, T_top_laser, top = _transforms(bag), np.eye(4), frame
+    motions, T_top_laser, top = _transforms(bag, by_recording=by_recording), np.eye(4), frame
     for _ in range(len(motions)):  # transforms may form a circle
         if top in motions and motions[top].is_constant and motions[top].parent not in _MAP_FRAMES:
             T_top_laser, top = motions[top].T_parent_child[0] @ T_top_laser, motions[top].parent
@@ -276,7 +314,10 @@ def _odometry(bag: _Bag, frame: str, times: FloatArray) -> tuple[FloatArray | No
     is_chain = above is not None and not above.is_constant and above.parent not in _MAP_FRAMES
     if len(topics) == 1 and not is_chain:
         what = f"odometry of {topics[0]}"
-        poses = [(_stamp_of(message), message.pose.pose) for message in bag.messages(topics[0])]
+        poses = [
+            (recorded_s if by_recording else _stamp_of(message), message.pose.pose)
+            for recorded_s, message in bag.recorded(topics[0])
+        ]
         found = _motion_of("odom", [(stamp, _pose_of(pose.position, pose.orientation)) for stamp, pose in poses])
     elif moving is not None and not (is_chain or moving.is_constant or moving.parent in _MAP_FRAMES):
         found, what = moving, f"odometry of the transforms to {frame}"
@@ -310,7 +351,8 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
     """
     bag = _Bag(path)
     chosen, kind = bag.choose(_CLOUDS, topic, "point clouds")
-    places = bag.places(chosen)
+    places, fault = bag.places(chosen)
+    notes = () if fault is None else (Note(f"{path}: {fault}; the order of the recording is used", is_doubt=True),)
     times = np.array([place.stamp_ns for place in places], np.float64) * 1e-9
     sources = tuple(f"{path} {chosen} {index}" for index in range(len(places)))
 
@@ -321,7 +363,7 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
         return check_scan(cloud, sources[index])
 
     name = path.resolve().stem
-    return LidarSequence(name, sources, lambda i: read(i).points, None, times, lambda i: read(i).times)
+    return LidarSequence(name, sources, lambda i: read(i).points, None, times, lambda i: read(i).times, notes)
 
 
 def _cloud_of(message: Any, kind: str) -> TimedCloud:

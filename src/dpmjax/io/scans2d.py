@@ -11,6 +11,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from dpmjax.geometry.shells import shell_radius
 from dpmjax.io.carmen import read_carmen_log
 from dpmjax.io.clouds import parse_pcd
 from dpmjax.io.files import load_arrays, load_mat, log_notes, natural_key, read_bytes, refusing, to_float32
@@ -25,10 +26,8 @@ _ARCHIVES, _ARRAYS, _LOGS = (".tar", ".tar.gz", ".tgz"), (".npy", ".npz"), (".lo
 _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
 _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
-# Beams within `_SAME_RANGE` of the largest range, as a share of it, have this range. They are the code for no echo if
-# their number, their share of all beams and the number of scans with them reach the limits. The last limit is the least
-# share of scans that also have other beams.
-_SAME_RANGE, _LEAST_MAXIMA, _LEAST_SHARE, _LEAST_SCANS, _LEAST_OTHERS = 1e-5, 20, 0.005, 3, 0.5
+# Least number of scans with beams at the largest range, and least share of scans that keep others.
+_LEAST_SCANS, _LEAST_OTHERS = 3, 0.5
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask (n, b), times (n,), poses, odometry, unit"
 # Largest difference between the third coordinates of planar points.
 _LARGEST_HEIGHT = 1e-3
@@ -53,8 +52,8 @@ def read_sequence(
         topic: topic of planar scans of a bag; None: the only one.
 
     Returns:
-        The sequence: at least two scans of at least 17 beams, each with at least one valid beam. Beams of the largest
-        range are masked where many have exactly this one.
+        The sequence: at least two scans of at least 17 beams, each with at least one valid beam. Beams at the
+        largest range are masked where they are no echoes (`shell_radius`).
 
     Raises:
         InputError: one line with the file, the finding and the advice. The file is missing, of an unknown format or
@@ -102,19 +101,17 @@ def _read(path: Path, unit: Unit | None, topic: str | None) -> ScanSequence:
 
 
 def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
-    """Masks the beams at the largest range, where many have exactly this range, the code for no echo."""
-    if not sequence.mask.any():
+    """Masks beams without an echo, which many scanners write at their largest ranges."""
+    radius = shell_radius(sequence.points[sequence.mask])
+    if radius is None:
         return sequence
-    ranges = np.where(sequence.mask, np.linalg.norm(sequence.points.astype(np.float64), axis=2), 0.0)
-    is_maximum = ranges >= (1.0 - _SAME_RANGE) * ranges.max()
-    share = is_maximum.sum() / sequence.mask.sum()
-    is_code = (
-        is_maximum.sum() >= _LEAST_MAXIMA and share >= _LEAST_SHARE and is_maximum.any(axis=1).sum() >= _LEAST_SCANS
-    )
-    mask = sequence.mask & ~is_maximum
-    if not is_code or mask.any(axis=1).mean() < _LEAST_OTHERS:
+    is_echo = np.linalg.norm(sequence.points.astype(np.float64), axis=2) < radius
+    mask, share = sequence.mask & is_echo, (sequence.mask & ~is_echo).sum() / sequence.mask.sum()
+    # A sensor that hardly sees anything else stands in a round room.
+    num_scans = (sequence.mask & ~is_echo).any(axis=1).sum()
+    if num_scans < _LEAST_SCANS or mask.any(axis=1).mean() < _LEAST_OTHERS:
         return sequence
-    found = f"{100 * share:.1f} % of the beams have the largest range, {ranges.max():.4g} {sequence.unit}: no echo"
+    found = f"{100 * share:.1f} % of the beams lie at the largest range, from {radius:.4g} {sequence.unit} on: no echo"
     points = np.where(mask[..., None], sequence.points, np.float32(0))
     return replace(sequence, mask=mask, points=points, notes=(*sequence.notes, Note(f"{path}: {found}")))
 
