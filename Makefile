@@ -11,7 +11,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv check test slow demo slam bench clean
+.PHONY: help venv check test slow demo slam bench docs clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -25,12 +25,13 @@ $(STAMP): pyproject.toml
 
 venv: $(STAMP)  ## make the environment and install dpmjax with its development tools
 
-check: $(STAMP)  ## lint, docstrings, format, types, import rules
+check: $(STAMP)  ## lint, docstrings, format, types, import rules, links of the site
 	$(BIN)/ruff check .
 	$(BIN)/ruff check --preview --select DOC,D417 src
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/test_import_rules.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 test: $(STAMP)  ## the test suite, without what is slow
 	$(BIN)/python -m pytest -n 2 --dist worksteal
@@ -48,6 +49,9 @@ slam: $(STAMP)  ## map a simulated town from 3-D scans; pictures in results/slam
 
 bench: $(STAMP)  ## speed and accuracy of everything that is measured
 	$(BIN)/python -m benchmarks
+
+docs: $(STAMP)  ## the site of the documentation: build/site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:  ## remove the environments and the caches (results/ stays)
 	rm -rf .venv .venv-* build dist .pytest_cache .ruff_cache .mypy_cache src/*.egg-info
