@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PairPrior, match_pairs
+from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PairPrior, fan, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.sequence_search import search_sequence
 from dpmjax.registration2d.steps import StepPrior, usual_motion
@@ -64,8 +64,8 @@ def incremental_icp(
         prior = usual_motion(rough, unit)
     else:
         prior = prior or StepPrior.of_poses(odometry, unit)
-        fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5, -1.5, 1.5], [0.0, 0.0, 1.0])
-        guesses = se2.relative(odometry[:-1], odometry[1:])[:, None] + fan
+        turns = fan(np.radians(_TURN_STEP) * np.array([0.0, -0.5, 0.5, -1.5, 1.5]))
+        guesses = se2.relative(odometry[:-1], odometry[1:])[:, None] + turns
         loose = prior.as_pair_prior(_COARSE_RESIDUAL * unit)
         rough = match_pairs(source, target, guesses, COARSE, loose, metric=metric)
     # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
@@ -99,8 +99,8 @@ def scan_odometry(scans: PlanarScans) -> Floats:
 
 def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
     """Returns coarse matches from zero motion and small turns."""
-    fan = np.radians(_TURN_STEP) * np.outer([0.0, -0.5, 0.5], [0.0, 0.0, 1.0])
-    return match_pairs(source, target, np.broadcast_to(fan, (len(source), 3, 3)), COARSE, metric=metric)
+    guesses = fan(np.radians(_TURN_STEP) * np.array([0.0, -0.5, 0.5]))
+    return match_pairs(source, target, np.broadcast_to(guesses, (len(source), 3, 3)), COARSE, metric=metric)
 
 
 def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
@@ -108,23 +108,15 @@ def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> P
     unit, rough = source.typical_range, match_near(source, target, metric)
     prior = usual_motion(rough, unit).as_pair_prior(_COARSE_RESIDUAL * unit)
     # Around the predicted translations, then far from zero.
-    near, far = _fan(unit, (0.0, 0.15), 4), _fan(unit, (0.3, 0.525), 8, turn_share=0.5)
+    turns = np.radians(np.arange(-_MAX_TURN, _MAX_TURN + 1.0, _TURN_STEP))
+    near, far = fan(turns, (0.0, 0.15 * unit), 4), fan(turns[3:-3], (0.3 * unit, 0.525 * unit), 8)
     centre = np.asarray(prior.mean) * [1.0, 1.0, 0.0]
-    for limit, fan, middle in ((_GOOD_FITNESS, near, centre), (_POOR_FITNESS, far, 0.0 * centre)):
+    for limit, guesses, middle in ((_GOOD_FITNESS, near, centre), (_POOR_FITNESS, far, 0.0 * centre)):
         rows = np.flatnonzero(rough.fitness < limit)
         belief = PairPrior(prior.mean[rows], prior.information[rows])
-        guesses = middle[rows][:, None] + fan
-        wide = match_pairs(source.take(rows), target.take(rows), guesses, COARSE, belief, metric=metric)
+        around = middle[rows][:, None] + guesses
+        wide = match_pairs(source.take(rows), target.take(rows), around, COARSE, belief, metric=metric)
         better = wide.fitness > rough.fitness[rows]
         for kept, found in zip(rough, wide, strict=True):
             kept[rows[better]] = found[better]
     return rough
-
-
-def _fan(typical_range: float, radii: tuple[float, ...], num_ways: int, *, turn_share: float = 1.0) -> Floats:
-    """Returns guesses (h, 3) of a step: every turn at shifts by `radii` (typical ranges) in `num_ways` directions."""
-    last = turn_share * _MAX_TURN
-    turns = np.radians(np.arange(-last, last + 1e-6, _TURN_STEP))
-    ways = 2 * np.pi * np.arange(num_ways) / num_ways
-    shifts = [(r * np.cos(w), r * np.sin(w)) for r in radii for w in (ways if r else ways[:1])]
-    return np.array([(typical_range * x, typical_range * y, turn) for turn in turns for x, y in shifts])

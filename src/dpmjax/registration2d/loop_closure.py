@@ -16,7 +16,7 @@ import scipy.spatial
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, join_rows, take_rows
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior, Schedule, match_pairs
+from dpmjax.registration2d.pair_alignment import PairMatches, PairPrior, Schedule, fan, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import contradicted_share, weak_steps
 from dpmjax.registration2d.steps import BEAM_DEVIATION, pose_steps
@@ -175,9 +175,8 @@ def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, 
 
 def _guesses(predicted: Floats, typical_range: float) -> Floats:
     """Returns guesses (p, h, 3) of each pair: near shifts, with headings around the predicted one."""
-    shifts = 1.5 * _NEARBY * typical_range * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-    fan = np.array([(x, y, turn) for turn in np.radians([0.0, -12.0, 12.0]) for x, y in shifts])
-    guesses = fan + predicted[:, None] * [0.0, 0.0, 1.0]
+    around = fan(np.radians([0.0, -12.0, 12.0]), (0.0, 1.5 * _NEARBY * typical_range), 4)
+    guesses = around + predicted[:, None] * [0.0, 0.0, 1.0]
     return np.concatenate([guesses, predicted[:, None]], axis=1)
 
 

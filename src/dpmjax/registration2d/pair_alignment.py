@@ -6,6 +6,7 @@ right, T_target_source @ exp(delta). So every pair costs a 3 x 3 matrix and a 3-
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
@@ -89,6 +90,13 @@ class PairMatches(NamedTuple):
         return np.asarray(np.linalg.eigvalsh(self.information[:, :2, :2])[:, 0], np.float64)
 
 
+def fan(turns: Sequence[float] | Floats, radii: Sequence[float] = (0.0,), num_ways: int = 1) -> Floats:
+    """Returns guesses (h, 3) of a motion: every turn at shifts by `radii` in `num_ways` directions."""
+    ways = 2 * np.pi * np.arange(num_ways) / num_ways
+    shifts = [(r * np.cos(w), r * np.sin(w)) for r in radii for w in (ways if r else ways[:1])]
+    return np.array([(x, y, turn) for turn in turns for x, y in shifts])
+
+
 class PairPrior(NamedTuple):
     """Prior of relative poses, which constrains the directions that the scans do not constrain.
 
@@ -149,7 +157,7 @@ def linearise_pair(
     residuals = [(x - goal_x) * axis_x + (y - goal_y) * axis_y for axis_x, axis_y in axes]
     squared = sum(residual**2 for residual in residuals)
     weight = jnp.where(counts, (kernel**2 / (kernel**2 + squared)) ** 2, 0.0)
-    information, gradient = jnp.zeros((3, 3)), jnp.zeros(3)
+    information, gradient = jnp.zeros((3, 3), pose.dtype), jnp.zeros(3, pose.dtype)
     # Sums of products, because products of small matrices are slow on a CPU.
     for residual, (axis_x, axis_y) in zip(residuals, axes, strict=True):
         lever = (x - pose[0]) * axis_y - (y - pose[1]) * axis_x
