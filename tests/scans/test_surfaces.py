@@ -5,7 +5,7 @@ import pytest
 
 from dpmjax.geometry import estimate_normals
 from dpmjax.geometry.neighbours import HostTree
-from dpmjax.scans.align import LEVELS, AlignmentLevel, align_on_host
+from dpmjax.scans.align import LEVELS, align_on_host
 from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, SurfaceConfig, firm_surface, scan_surface, surface_at
 from tests.scans.surface_scenes import motion, street
@@ -53,7 +53,6 @@ def test_surface_of_hardly_any_point_is_flat_nowhere(num_points: int) -> None:
     [
         (lambda: SurfaceConfig(voxel_size_m=0.0), "voxel_size_m"),
         (lambda: SurfaceConfig(min_range_m=90.0), "min_range_m"),
-        (lambda: AlignmentLevel(0.0, 10, 1), "radius_m"),
     ],
 )
 def test_settings_out_of_range_are_named(make, name: str) -> None:

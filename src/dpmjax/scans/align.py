@@ -11,7 +11,6 @@ step (Chen and Medioni 1992) with a Geman-McClure kernel. They differ in the sea
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +19,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from dpmjax.checks import require_count, require_positive
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import along_curve, k_nearest
 from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
@@ -49,8 +47,7 @@ PAIR_COSINE = 0.3
 MIN_PAIRS = 20
 
 
-@dataclass(frozen=True)
-class AlignmentLevel:
+class AlignmentLevel(NamedTuple):
     """One radius of the pairs.
 
     Attributes:
@@ -64,12 +61,6 @@ class AlignmentLevel:
     num_points: int
     num_iterations: int
     kernel_m: float | None = None
-
-    def __post_init__(self) -> None:
-        require_positive("radius_m", self.radius_m)
-        require_positive("kernel_m", 1.0 if self.kernel_m is None else self.kernel_m)
-        require_count("num_points", self.num_points)
-        require_count("num_iterations", self.num_iterations)
 
     @property
     def kernel_width_m(self) -> float:

@@ -72,6 +72,9 @@ class NetworkMatcher:
 
         Returns:
             The compact scan.
+
+        Raises:
+            ValueError: if the scan has no thinned points.
         """
         config = self._model.config
         if scan.cloud is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -78,7 +77,7 @@ class SurfaceGeometry:
     def __init__(self, model_config: ModelConfig, *, spacing: float = 1.0) -> None:
         self._model_config, self._plane_radius_m = model_config, spacing * PLANE_RADIUS_M
         self._narrow, self._wide = (
-            tuple(replace(level, radius_m=spacing * level.radius_m) for level in levels) for levels in (NARROW, WIDE)
+            tuple(level._replace(radius_m=spacing * level.radius_m) for level in levels) for levels in (NARROW, WIDE)
         )
 
     def thin(self, points: Float[np.ndarray, "n 3"]) -> Scan | None:
