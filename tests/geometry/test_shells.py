@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.geometry.shells import shell_radius
+from dpmjax.geometry.shells import shell_radius, without_shell
 
 
 def directions(count: int, dim: int, seed: int = 0) -> np.ndarray:
@@ -53,3 +53,12 @@ def test_walls_are_no_shell(dim: int) -> None:
 def test_few_points_are_no_shell() -> None:
     assert shell_radius(np.zeros((0, 3))) is None
     assert shell_radius(np.concatenate([room(3), 40.0 * directions(8, 3)])) is None
+
+
+def test_a_shell_is_left_out_with_a_warning() -> None:
+    walls = room(3)
+    scan = np.concatenate([walls, 40.0 * directions(200, 3, seed=1), np.full((1, 3), np.nan)])
+    with pytest.warns(UserWarning, match="without an echo"):
+        kept = without_shell(scan)
+    np.testing.assert_array_equal(kept, np.concatenate([walls, scan[-1:]]))
+    assert without_shell(walls) is walls

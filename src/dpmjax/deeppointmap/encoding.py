@@ -16,6 +16,7 @@ from dpmjax.checks import as_host_points, require_positive, require_some, requir
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
+from dpmjax.geometry.shells import without_shell
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
@@ -129,6 +130,8 @@ def thin_scan(points: RawScan, config: ModelConfig, *, scale: float = 1.0) -> Po
     require_positive("scale", scale)
     array, mask = (points.points, points.mask) if isinstance(points, PointCloud) else (points, None)
     array = as_host_points("points", array)
+    if mask is None:
+        array = without_shell(array)
     if scale != 1:
         array = array * np.float32(scale)
     return preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)

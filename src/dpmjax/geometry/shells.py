@@ -6,6 +6,8 @@ a circle or sphere about the sensor and move with it, so that a registration fin
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from jaxtyping import Float
 
@@ -46,3 +48,22 @@ def shell_radius(points: Float[np.ndarray, "n d"]) -> float | None:
     x, y = points[ranges >= chosen, :2].T
     sectors = np.unique(np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * _NUM_SECTORS))
     return chosen if len(sectors) >= _LEAST_SECTORS else None
+
+
+def without_shell(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Leaves out the points of a scan that are no echoes, and warns of them.
+
+    Args:
+        points: in the frame of the lidar; those that are not finite stay.
+
+    Returns:
+        The remaining points.
+    """
+    is_finite = np.isfinite(points).all(axis=1)
+    radius = shell_radius(points[is_finite])
+    if radius is None:
+        return points
+    # The same text each time, so that Python shows it once.
+    warnings.warn("beams without an echo were written at the largest range of the lidar: left out", stacklevel=3)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return points[~(np.linalg.norm(points.astype(np.float64), axis=1) >= radius)]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from dpmjax.geometry.shells import without_shell
 from dpmjax.scans.preprocess import PreprocessConfig, as_cloud, filter_points, first_of_each_voxel
 from dpmjax.scans.surfaces import (
     RangeImage,
@@ -71,7 +72,7 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
     """
     if len(points) < MIN_NUM_POINTS:
         return None
-    tree, rows = filter_points(points, None, config)
+    tree, rows = filter_points(without_shell(points), None, config)
     thinned = tree.points.take(rows, axis=0)
     is_inlier = np.zeros(len(tree.points), bool)
     is_inlier[rows] = True
@@ -95,7 +96,7 @@ def measure_scan(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = DENSE
     Returns:
         Surface and free space.
     """
-    surface = scan_surface(points, config)
+    surface = scan_surface(without_shell(points), config)
     return Scan(surface, range_image(surface.points))
 
 
