@@ -101,12 +101,10 @@ def choose_beams(num_beams: int, phase: PhaseConfig, first: Int[Array, ""] | int
 
 
 def _planar_init(config: DeepMappingConfig, key: jax.Array, data: MappingData) -> Params:
-    """Makes initial parameters for planar scans (`Problem.init`); without initial poses the start is zero.
-
-    From given poses there is no L-Net (no weights) where no phase trains one, because it would compile for seconds.
-    """
+    """Makes initial parameters for planar scans (`Problem.init`); without initial poses the start is zero."""
     net_key, map_key = jax.random.split(key)
     scans, (phase, *later) = data.scans, phases_of(config, data)
+    # From given poses there is no L-Net where no phase trains one, because it would compile for seconds.
     has_net = data.start is None or any(some.poses == "network" for some in (phase, *later))
     poses = start = jnp.zeros((scans.mask.shape[0], 3)) if data.start is None else data.start
     make_net = partial(LocalizationNet(config.localization).init, points=scans.points[0], mask=scans.mask[0])

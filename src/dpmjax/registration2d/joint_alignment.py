@@ -200,6 +200,9 @@ def choose_pairs(poses: Floats, radius: float) -> Pairs:
     Args:
         poses: (n, 3).
         radius: largest distance of a pair, unit of the poses.
+
+    Returns:
+        Rows of the sources and of the targets.
     """
     tree, count = scipy.spatial.cKDTree(poses[:, :2]), min(len(poses), 6 * _NUM_NEAREST)
     distances, rows = (np.atleast_2d(x) for x in tree.query(poses[:, :2], k=count, distance_upper_bound=radius))

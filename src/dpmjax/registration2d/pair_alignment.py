@@ -206,10 +206,8 @@ def _align_batches(
     pairs: tuple[Lines, Lines], rows: tuple[Indices, Indices], guesses: Floats, prior: PairPrior | None, scales: Floats,
     *, metric: Metric = "plane",
 ) -> _Aligned:  # fmt: skip
-    """Aligns t pairs, rows of the sources and of the targets, in batches of one shape.
-
-    Gate and kernel of the last row of `scales` (i, 2) are those of the result: with one row, no pair moves.
-    """
+    """Aligns t pairs, rows of the sources and of the targets, in batches of one shape."""
+    # Gate and kernel of the last row of `scales` (i, 2) are those of the result: with one row, no pair moves.
     found = _Aligned(*(np.zeros((len(guesses), *size)) for size in ((3,), (3, 3), (3,), ())))
     batch = _LIVE_DISTANCES // (pairs[0].mask.shape[1] * pairs[1].mask.shape[1])
     for part, some in batches(len(guesses), 1 << int(np.log2(np.clip(batch, 1, _MAX_BATCH)))):

@@ -150,6 +150,9 @@ def _spectra(
         turn: radians.
         cell: side of a cell.
         config: settings.
+
+    Returns:
+        Spectra of the hits, and of the evidence.
     """
     surface, near, slant, is_seen = views
     inner = config.num_cells // 2

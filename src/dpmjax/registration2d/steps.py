@@ -285,6 +285,9 @@ def _slide_scores(scans: PlanarScans, pairs: Pairs, places: Floats, costs: Float
         pairs: sources and targets.
         places: (k, s, 3) poses; the one in the middle has no shift.
         costs: (k, s) of the prior, nats.
+
+    Returns:
+        (k, s) scores.
     """
     column, middle, rows = np.arange(places.shape[1]), places.shape[1] // 2, np.arange(len(places))
     is_first, scores = (column - middle) % _STRIDE == 0, np.zeros(places.shape[:2])
