@@ -15,9 +15,14 @@ import dpmjax
 hits = []
 jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
 jnp.arange(3).block_until_ready()  # JAX has compiled before
-folder = dpmjax.enable_compile_cache(sys.argv[1])
-jax.jit(lambda x: jnp.sin(x) * 7 + 1)(jnp.arange(5.0)).block_until_ready()
-print(folder, sum(hits))
+from dpmjax.checks import runs_on_host
+work = lambda: jax.jit(lambda x: jnp.sin(x) * 7 + 1)(jnp.arange(5.0)).block_until_ready()
+if len(sys.argv) > 1:
+    dpmjax.enable_compile_cache(sys.argv[1])
+    work()
+else:
+    runs_on_host("")(work)()
+print(jax.config.jax_compilation_cache_dir, sum(hits))
 """
 
 
@@ -25,8 +30,8 @@ print(folder, sum(hits))
     ("variables", "expected"),
     [
         ({"XDG_CACHE_HOME": "/caches"}, "/caches/dpmjax"),
-        ({"DPMJAX_COMPILATION_CACHE": "/here"}, "/here"),
-        ({"DPMJAX_COMPILATION_CACHE": "off"}, None),
+        ({"DPMJAX_CACHE": "/here"}, "/here"),
+        ({"DPMJAX_CACHE": "0"}, None),
         ({"JAX_COMPILATION_CACHE_DIR": "/mine"}, "/mine"),
     ],
 )
@@ -46,15 +51,18 @@ def test_programs_are_kept_where_the_user_says(variables, expected, monkeypatch)
 
 
 @pytest.mark.slow
-def test_a_second_process_loads_what_the_first_has_compiled(tmp_path) -> None:
+@pytest.mark.parametrize("is_named", [True, False])
+def test_a_second_process_loads_what_the_first_has_compiled(tmp_path, is_named: bool) -> None:
+    """A pipeline keeps its programs without being asked."""
     folder = tmp_path / "programs"
     variables = {name: value for name, value in os.environ.items() if "CACHE" not in name}
     numbers = []
     for _ in range(2):
-        command = [sys.executable, "-c", PROGRAM, str(folder)]
+        command = [sys.executable, "-c", PROGRAM, *[str(folder)] * is_named]
+        variables["XDG_CACHE_HOME"] = str(tmp_path)
         done = subprocess.run(command, capture_output=True, text=True, check=True, env=variables)
         where, hits = done.stdout.split()
-        assert where == str(folder)
+        assert where == str(folder) if is_named else where.startswith(str(tmp_path / "dpmjax"))
         numbers.append(int(hits))
     assert numbers[0] == 0
     assert numbers[1] > 0

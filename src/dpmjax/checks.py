@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.types import AnyArray, ScanSet
 
 Arguments = ParamSpec("Arguments")
@@ -20,7 +21,7 @@ Result = TypeVar("Result")
 
 
 def runs_on_host(instead: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Makes a pipeline refuse traced arguments with one `ValueError`, at its first line.
+    """Makes a pipeline refuse traced arguments with one `ValueError`, at its first line, and keep compiled programs.
 
     Args:
         instead: what to do inside a transformation, for the message, such as "call icp there".
@@ -35,6 +36,8 @@ def runs_on_host(instead: str) -> Callable[[Callable[Arguments, Result]], Callab
             if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
                 name = function.__qualname__
                 raise ValueError(f"{name}: runs on the host and cannot be traced by jit, vmap or grad; {instead}")
+            if jax.config.jax_compilation_cache_dir is None:
+                enable_compile_cache()
             return function(*args, **kwargs)
 
         return checked

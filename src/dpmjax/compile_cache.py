@@ -19,19 +19,19 @@ _SETTINGS = {
 def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
     """Keeps compiled programs in a folder, from which later processes load them.
 
-    The command `dpmjax` calls it by itself. In a script, call it before the first computation. The environment variable
-    `DPMJAX_COMPILATION_CACHE=off` turns the cache off.
+    Commands and pipelines call it by themselves where JAX has no cache yet; for kernels alone, call it before the first
+    computation. The environment variable `DPMJAX_CACHE=0` turns the cache off.
 
     Args:
-        folder: folder of the programs; None takes the environment variables `DPMJAX_COMPILATION_CACHE` and
+        folder: folder of the programs; None takes the environment variables `DPMJAX_CACHE` and
             `JAX_COMPILATION_CACHE_DIR`, then `$XDG_CACHE_HOME/dpmjax` or the user's folder for caches, where each kind
             of processor has a folder.
 
     Returns:
         The folder; None where the cache is off.
     """
-    chosen = os.environ.get("DPMJAX_COMPILATION_CACHE", "")
-    if chosen == "off":
+    chosen = os.environ.get("DPMJAX_CACHE", "")
+    if chosen in ("0", "off"):
         return None
     path = Path(folder or chosen or os.environ.get("JAX_COMPILATION_CACHE_DIR") or _user_folder())
     settings = {"jax_compilation_cache_dir": str(path), **_SETTINGS}
