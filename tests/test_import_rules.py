@@ -14,7 +14,7 @@ PACKAGE = ROOT / "src" / "dpmjax"
 EVERYBODY_MAY = {"types", "checks", "sequences"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
-    "checks": set(),
+    "checks": {"compile_cache"},
     "sequences": set(),
     "checkpoints": set(),
     "compile_cache": set(),
