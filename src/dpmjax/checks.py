@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dpmjax.compile_cache import enable_compile_cache
+from dpmjax.compile_cache import keep_programs
 from dpmjax.types import AnyArray, ScanSet
 
 Arguments = ParamSpec("Arguments")
@@ -36,8 +36,7 @@ def runs_on_host(instead: str) -> Callable[[Callable[Arguments, Result]], Callab
             if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
                 name = function.__qualname__
                 raise ValueError(f"{name}: runs on the host and cannot be traced by jit, vmap or grad; {instead}")
-            if jax.config.jax_compilation_cache_dir is None:
-                enable_compile_cache()
+            keep_programs()
             return function(*args, **kwargs)
 
         return checked

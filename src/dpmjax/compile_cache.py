@@ -7,6 +7,7 @@ import platform
 import sys
 import zlib
 from pathlib import Path
+from typing import Any
 
 CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
 # Hundreds of small programs take seconds together, so programs of any size and compile time are kept.
@@ -45,6 +46,15 @@ def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
             jax.config.update(name, value)
         compilation_cache.reset_cache()  # JAX looks for a cache once, when it first compiles
     return path
+
+
+def keep_programs() -> None:
+    """Switches the cache on where JAX has none yet."""
+    import jax
+
+    options: Any = jax.config
+    if options.jax_compilation_cache_dir is None:
+        enable_compile_cache()
 
 
 def cpu_model() -> str:

@@ -79,7 +79,7 @@ def with_value(index, value):
     ("arrays", "found"),
     [
         ({"points": with_value((0, 1, 0), np.nan)}, r"scan, beam \[\[0, 1\]\]"),
-        ({"points": with_value((2,), np.nan)}, r"1 of 6 scans .* scan \[2\]"),
+        ({"points": with_value((slice(2, 5),), np.nan)}, r"3 of 6 scans .* \[2\]"),
         ({"points": with_value((), np.nan)}, "6 of 6 scans have no valid beam"),
         ({"points": POINTS[0]}, r"give points \(n, b, 2\)"),
         ({"points": np.concatenate([POINTS, POINTS[..., :1]], axis=2)}, "the third coordinates of the points differ"),
@@ -229,3 +229,11 @@ def test_odometry_of_one_pose_is_none(tmp_path, is_constant, caplog):
     np.savez(tmp_path / "a.npz", ranges=ranges, angles=np.linspace(-2, 2, 40), odometry=odometry)
     assert (read_sequence(tmp_path / "a.npz").odometry_poses is None) == is_constant
     assert ("same pose at every scan" in caplog.text) == is_constant
+
+
+def test_one_covered_scan_is_named_and_stays(tmp_path, caplog):
+    ranges = np.random.default_rng(0).uniform(1, 5, (6, 40))
+    ranges[3] = np.nan
+    read = read_sequence(save(tmp_path, "a.npz", ranges=ranges, angles=np.linspace(-2, 2, 40)))
+    assert len(read) == 6
+    assert "no echo in scan 3; put between the scans before and after" in caplog.text

@@ -186,7 +186,7 @@ def test_a_cold_start_has_no_poses_and_is_not_refined(few) -> None:
         (lambda points: {"scans": points[:, :, 0]}, r"scans: expected shape \(n, b, 2\)"),
         (lambda points: {"scans": points[:1]}, "scans: expected at least 2"),
         (lambda points: {"scans": points[[0, 0, 0]]}, "scans: expected two different ones, got 3"),
-        (lambda points: {"scans": points * [[[0.0]], *[[[1.0]]] * 9]}, "scans: scan 0 has no valid beam"),
+        (lambda points: {"scans": points * [*[[[0.0]]] * 6, *[[[1.0]]] * 4]}, "scans: scan 0 has no valid beam"),
         (lambda points: {"start": np.zeros((3, 3))}, "start: expected shape"),
         (lambda points: {"start": np.full((10, 3), np.nan)}, "start: expected finite"),
         (lambda points: {"start": "guess"}, "start: expected one of auto"),

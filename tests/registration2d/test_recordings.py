@@ -9,7 +9,14 @@ import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d import planar_scans
-from dpmjax.registration2d.recordings import align_between, choose_by_motion, choose_scans, fill_between
+from dpmjax.registration2d.recordings import (
+    Recording,
+    align_between,
+    choose_by_motion,
+    choose_scans,
+    fill_between,
+    in_runs,
+)
 from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 
@@ -108,3 +115,38 @@ def test_scans_recorded_twice_and_a_standing_robot_add_no_scan() -> None:
     found = choose_scans(ScanSet(noisy, walk.mask[standing]), true[standing], 1.0, 0.5)
     np.testing.assert_array_equal(standing[found.chosen], np.arange(12))
     np.testing.assert_allclose(found.between(true), true[standing], atol=1e-9)
+
+
+def test_scans_without_an_echo_are_put_between_their_neighbours() -> None:
+    walk = simulate_sequence(0, 8)
+    mask = walk.mask.copy()
+    mask[[0, 3, 4]] = False
+    scans = ScanSet(np.where(mask[..., None], walk.points, 0), mask)
+    recording = choose_scans(scans, None, 1.0, 1.0)
+    np.testing.assert_array_equal(recording.chosen, [1, 2, 5, 6, 7])
+    poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
+    found = recording.between(poses[recording.chosen])
+    np.testing.assert_allclose(found[1:, 0], np.arange(1.0, 8.0), atol=1e-6)
+    np.testing.assert_allclose(found[0], found[1])
+
+
+def test_runs_of_members_are_found() -> None:
+    is_member = np.array([1, 1, 0, 1, 1, 1, 0, 0, 1], bool)
+    np.testing.assert_array_equal(np.flatnonzero(in_runs(is_member, 3)), [3, 4, 5])
+    np.testing.assert_array_equal(in_runs(is_member, 1), is_member)
+    assert not in_runs(is_member, 4).any()
+    assert in_runs(np.ones(5, bool), 5).all()
+
+
+def test_scans_that_follow_a_silent_odometry_are_named() -> None:
+    """From scan 8 to 16 the odometry stands while the robot drives on, and the scans between are not registered."""
+    walk = simulate_sequence(0, 24)
+    true, rows = walk.reference_poses, np.array([0, 8, 16, 23])
+    odometry = true.copy()
+    odometry[9:16] = odometry[8]
+    recording = Recording(ScanSet(walk.points, walk.mask), rows, odometry, np.arange(24))
+    poses, lost = recording.aligned(true[rows])
+    off = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
+    assert set(np.flatnonzero(off > 20)) <= set(lost)
+    honest = recording._replace(motion=true)
+    assert not len(honest.aligned(true[rows])[1])

@@ -45,12 +45,13 @@ _PLANAR_MARGIN, _DEPTH_MARGIN = 1.15, 1.2
 _MAX_COORDINATE = 1e4
 
 
-def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
+def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2, may_be_blind: bool = False) -> ScanSet:
     """Checks scans; beams with coordinates that are not finite, or both zero, are invalid.
 
     Args:
         scans: (n, b, 2) in the sensor frames, any unit; or a ScanSet.
         min_scans: the smallest number of scans.
+        may_be_blind: True where some scans may have no valid beam, fewer than half.
 
     Returns:
         The scans, zeros at invalid beams.
@@ -63,7 +64,7 @@ def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2) -> ScanSet:
     if beams.points.shape[0] < min_scans:
         raise ValueError(f"scans: expected at least {min_scans}, got {beams.points.shape[0]}")
     empty = np.flatnonzero(~np.asarray(beams.mask).any(-1))
-    if len(empty):
+    if len(empty) > (may_be_blind * (len(beams.mask) - 1)) // 2:
         raise ValueError(f"scans: scan {empty[0]} has no valid beam; leave it out ({len(empty)} such scans)")
     return beams
 

@@ -52,13 +52,13 @@ def read_sequence(
         topic: topic of planar scans of a bag; None: the only one.
 
     Returns:
-        The sequence: at least two scans of at least 17 beams, each with at least one valid beam. Beams at the
+        The sequence: at least two scans of at least 17 beams, most of them with a valid beam. Beams at the
         largest range are masked where they are no echoes (`shell_radius`).
 
     Raises:
         InputError: one line with the file, the finding and the advice. The file is missing, of an unknown format or
-            damaged, or an argument is out of range. Also for too few scans or beams, a scan without a valid beam, scans
-            of a single point, or impossible lengths.
+            damaged, or an argument is out of range. Also for too few scans or beams, most scans without a valid beam,
+            scans of a single point, or impossible lengths.
     """
     path = Path(path)
     start, stop, stride = selection.start or 0, selection.stop, 1 if selection.step is None else selection.step
@@ -70,8 +70,8 @@ def read_sequence(
     is_part = len(sequence) < len(whole)
     found = f"{len(sequence)} of {len(whole)} scans chosen" if is_part else counted(len(whole), "scan")
     require(len(sequence) >= 2, path, found, "give two or more")
-    _check_beams(sequence, path, range(start, len(whole), stride))
-    sequence = replace(sequence, notes=(*sequence.notes, *_check_unit(sequence, path)))
+    notes = _check_beams(sequence, path, range(start, len(whole), stride)) + _check_unit(sequence, path)
+    sequence = replace(sequence, notes=(*sequence.notes, *notes))
     log_notes(sequence.notes)
     return sequence
 
@@ -125,8 +125,8 @@ def _without_constant_odometry(sequence: ScanSequence, path: Path) -> ScanSequen
     return replace(sequence, odometry_poses=None, notes=(*sequence.notes, note))
 
 
-def _check_beams(sequence: ScanSequence, path: Path, numbers: range) -> None:
-    """Refuses scans of too few beams, or of no valid one; the numbers are those of the scans in the file."""
+def _check_beams(sequence: ScanSequence, path: Path, numbers: range) -> list[Note]:
+    """Refuses scans of too few beams, or of no valid one; names few without an echo by their numbers in the file."""
     num_beams = sequence.mask.shape[1]
     advice = f"give {_LEAST_BEAMS} beams or more; arrays are (scans, beams, 2)"
     require(num_beams >= _LEAST_BEAMS, path, f"scans of {num_beams} beams", advice)
@@ -135,10 +135,14 @@ def _check_beams(sequence: ScanSequence, path: Path, numbers: range) -> None:
     found = (
         f"{len(empty)} of {len(sequence)} scans have no valid beam below the maximum range, the first is scan {first}"
     )
-    require(not empty, path, found, "check the ranges, remove such scans, or choose others")
+    require(2 * len(empty) < len(sequence), path, found, "check the ranges, remove such scans, or choose others")
     points = sequence.points[np.arange(len(sequence)), sequence.mask.argmax(axis=1)]
     differ = (sequence.points != points[:, None]).any(axis=2) & sequence.mask
     require(differ.any(), path, "all points of each scan are one and the same", "give scans that see some surroundings")
+    if not empty:
+        return []
+    which = f"scan {first[0]}" if len(empty) == 1 else f"{len(empty)} scans, the first is scan {first[0]}"
+    return [Note(f"{path}: no echo in {which}; put between the scans before and after", is_doubt=True)]
 
 
 def _check_unit(sequence: ScanSequence, path: Path) -> list[Note]:

@@ -26,7 +26,7 @@ from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
 from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, choose_trajectory
-from dpmjax.registration2d.recordings import Recording, choose_scans, take_scans
+from dpmjax.registration2d.recordings import Recording, choose_scans, interpolate, take_scans
 from dpmjax.registration2d.refinement import refine
 from dpmjax.registration2d.steps import StepPrior
 from dpmjax.types import ScanSet
@@ -175,7 +175,7 @@ def register_scans(
 
     Args:
         scans: (n, b, 2) beam end points in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
-            ScanSet.
+            ScanSet. An ordered scan without any beam is put between its neighbours.
         config: settings.
         key: of the fit.
         start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The name "odometry" is the given
@@ -195,7 +195,7 @@ def register_scans(
     """
     config, hooks, key = config or RegistrationConfig(), hooks or RegistrationHooks(), as_key("key", key)
     require_type("config", config, RegistrationConfig, "RegistrationConfig")
-    all_scans = as_scan_set(scans)
+    all_scans = as_scan_set(scans, may_be_blind=config.is_ordered)
     count = len(all_scans.points)
     odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, count)
     kind, given = _checked_start(start, odometry_poses, count, config)
@@ -225,11 +225,12 @@ def register_scans(
         kept, scores, assessment = _choose(run, found)
     if recording.motion is not None:
         hooks.report(_BETWEEN, "poses between the registered scans")
-    poses = recording.aligned(found[kept])
+    poses, lost = recording.aligned(found[kept])
     hooks.on_share(1.0)
     candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
-    uncertain = tuple(recording.chosen[list(assessment.uncertain_scans)].tolist())
-    assessment = assessment._replace(uncertain_scans=uncertain)
+    uncertain = np.union1d(recording.chosen[list(assessment.uncertain_scans)], lost).astype(int).tolist()
+    is_trusted = assessment.is_trusted and not len(lost)
+    assessment = assessment._replace(uncertain_scans=tuple(uncertain), is_trusted=is_trusted)
     return RegisteredScans(poses, kept, start_name, candidates, assessment, fitted, recording)
 
 
@@ -296,7 +297,8 @@ def _choose_scans(
         return choose_scans(scans, None, 1.0, 1.0)
     if motion is None and len(scans.points) > _MAX_WHOLE:
         hooks.report(_MOTION, "odometry from the scans")
-        motion = scan_odometry(planar_scans(scans))
+        seen = np.flatnonzero(np.asarray(scans.mask).any(axis=1))
+        motion = interpolate(len(scans.points), seen, scan_odometry(planar_scans(take_scans(scans, seen))))
     return choose_scans(scans, motion, config.min_distance, config.min_turn)
 
 

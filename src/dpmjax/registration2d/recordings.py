@@ -17,7 +17,7 @@ from dpmjax.checks import require_positive
 from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, PairPrior, match_pairs
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, PlanarScans, planar_scans
-from dpmjax.registration2d.range_profiles import contradicted_share
+from dpmjax.registration2d.range_profiles import WEAK_SCORE, contradicted_share, pair_scores
 from dpmjax.types import ScanSet
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
@@ -29,6 +29,8 @@ _LOOSE_SIGMA, _TURNS = (0.01, 0.1), (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
 _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 # A robot stands still where it moves by less than this share of the least distance of registered scans.
 _STANDING = 0.02
+# So many successive scans that fit no neighbour are lost; fewer are covered, or passed by people.
+_LEAST_LOST = 3
 # Scans that are aligned at a time.
 _BLOCK = 1024
 # Range noise, in typical ranges, above which no two scans are equal.
@@ -43,7 +45,8 @@ class Recording(NamedTuple):
         chosen: rows of the k registered scans, in order.
         motion: (n, 3) poses whose steps are the motion between registered scans; None where all scans except repeated
             ones are registered.
-        originals: (n,) row of the scan that each scan repeats beam by beam; the row of the scan itself for others.
+        originals: (n,) row of the scan that each scan repeats beam by beam; the row of the scan itself for others. A
+            scan without an echo counts as a repetition, and is put between its neighbours.
     """
 
     scans: ScanSet
@@ -56,16 +59,37 @@ class Recording(NamedTuple):
         rows, copies = np.unique(self.originals, return_inverse=True)
         if self.motion is not None:
             poses = fill_between(np.searchsorted(rows, self.chosen), poses, self.motion[rows])
-        return poses[copies]
+        return self._with_blind(poses[copies])
 
-    def aligned(self, poses: Floats) -> Floats:
-        """Returns poses of all scans, each scan aligned with the nearest registered one."""
+    def aligned(self, poses: Floats) -> tuple[Floats, Indices]:
+        """Aligns each scan with the nearest registered one; returns all poses, and rows that fit no neighbour in time.
+
+        Single scans may fit no other, where something covers the sensor; the rows are those of three scans or more.
+        """
         poses = self.between(poses)
         if self.motion is None:
-            return poses
+            return poses, np.zeros(0, np.int64)
         rows, copies = np.unique(self.originals, return_inverse=True)
         scans = planar_scans(take_scans(self.scans, rows))
-        return align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])[copies]
+        found = align_between(scans, np.searchsorted(rows, self.chosen), poses[rows])
+        later = np.arange(1, len(rows))
+        scores = pair_scores(scans, later, later - 1, se2.relative(found[:-1], found[1:]))
+        best = np.maximum(np.append(scores, -np.inf), np.append(-np.inf, scores))
+        return self._with_blind(found[copies]), rows[in_runs(best < WEAK_SCORE, _LEAST_LOST)]
+
+    def _with_blind(self, poses: Floats) -> Floats:
+        """Puts scans without any echo between their neighbours."""
+        seen = np.flatnonzero(np.asarray(self.scans.mask).any(axis=1))
+        return poses if len(seen) == len(poses) else interpolate(len(poses), seen, poses[seen])
+
+
+def in_runs(is_member: Booleans, length: int) -> Booleans:
+    """Returns True for members of a run of at least this many members."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], is_member, [False]])))
+    is_long = np.zeros(len(is_member), bool)
+    for first, last in ends.reshape(-1, 2):
+        is_long[first:last] = last - first >= length
+    return is_long
 
 
 def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
@@ -75,17 +99,19 @@ def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
 
 
 def find_originals(scans: ScanSet) -> Indices:
-    """Finds scans that repeat the scan before beam by beam.
+    """Finds scans that repeat the scan before beam by beam, and scans without any echo.
 
     Args:
         scans: n scans in the order of time.
 
     Returns:
-        (n,) row of the first scan of each such run.
+        (n,) row of the first scan of each such run; of a scan without an echo, a row that is never its own.
     """
     points, mask = np.asarray(scans.points), np.asarray(scans.mask)
     repeats = np.append(False, (points[1:] == points[:-1]).all((1, 2)) & (mask[1:] == mask[:-1]).all(1))
-    return np.maximum.accumulate(np.where(repeats, 0, np.arange(len(points))))
+    is_seen = mask.any(axis=1)
+    first = int(is_seen.argmax())
+    return np.maximum(np.maximum.accumulate(np.where(repeats | ~is_seen, 0, np.arange(len(points)))), first)
 
 
 def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float) -> Recording:
