@@ -62,9 +62,11 @@ class Recording(NamedTuple):
         return self._with_blind(poses[copies])
 
     def aligned(self, poses: Floats) -> tuple[Floats, Indices]:
-        """Aligns each scan with the nearest registered one; returns all poses, and rows that fit no neighbour in time.
+        """Aligns each scan with the nearest registered one.
 
-        Single scans may fit no other, where something covers the sensor; the rows are those of three scans or more.
+        Returns:
+            Poses of all scans, and the rows of three successive scans or more that fit no neighbour in time: single
+            ones may be covered.
         """
         poses = self.between(poses)
         if self.motion is None:
