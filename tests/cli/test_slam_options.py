@@ -94,8 +94,6 @@ def test_options_of_odometry_and_loops_reach_the_settings(room) -> None:
     given = slam.slam_methods(slam.SlamOptions(weights=str(weights), odometry="network", no_loop=True))
     assert given.config.odometry.proposer == "network"
     assert not given.config.loops.is_on
-    # Those of the geometry and of the matcher are the same.
-    assert given.geometry.config is given.config.odometry
     assert slam.slam_methods(slam.SlamOptions(weights=str(weights))).config == SlamConfig()
     paper = slam.slam_methods(slam.SlamOptions(weights=str(weights), preset="paper", no_loop=True)).config
     assert paper == replace(slam_preset("paper"), loops=given.config.loops)

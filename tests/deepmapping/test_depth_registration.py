@@ -81,7 +81,7 @@ def test_images_between_keyframes_follow_the_keyframe_before_them(walk, scans) -
     apart, rows = np.array(walk.T_world_camera), np.array([0, 2])
     apart[2:, 0, 3] += 2.0
     placed = PlacedImages(apart, rows, np.ones(4), 0.25)
-    engine = returning(walk.T_world_camera[rows], scans)
+    engine = returning(walk.T_world_camera[rows], scans.take(rows))
     found = dm.register_depth(scans, CONFIG, key=KEY, start=placed, engine=engine)
     assert (found.kept, list(found.keyframes)) == ("fit", [0, 2])
     np.testing.assert_allclose(found.T_world_scan, walk.T_world_camera, atol=1e-5)

@@ -242,7 +242,7 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
     some = slice(None, None, max(1, len(kept) // _NUM_MEDIAN))
     median_m = np.median(ranges[some])
     found, advice = f"the median range is {median_m:.4g} m", "convert millimetres or centimetres to metres"
-    if _is_far_place(kept[some]):
+    if _is_far_place(kept[some].astype(np.float64)):
         at = " ".join(f"{value:.0f}" for value in np.median(kept, axis=0))
         found = f"{found}, around one place far away: coordinates of a map, such as UTM"
         advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
