@@ -28,7 +28,7 @@ from dpmjax.sequences import DepthSequence
 
 _NUM_SIMULATED = 8
 # Names of the sets of poses, in the order of the picture.
-METHODS = {"start": "search of first poses", "fit": "DeepMapping"}
+METHODS = {"start": "tracking and search", "fit": "DeepMapping"}
 # Typical ranges that a radian equals in the alignment of poses, for positions on a line.
 _LEVER = 0.1
 
