@@ -16,7 +16,7 @@ from dpmjax.registration_rgbd.depth_alignment import (
     DepthImages,
     adjust_poses,
     depth_view,
-    linearise_pairs,
+    linearise_images,
     step_poses,
 )
 from dpmjax.registration_rgbd.motion_search import MAX_TRANSLATION, propose_motions, slide_margin
@@ -88,11 +88,11 @@ def test_the_gradient_of_a_pair_is_that_of_its_gaps(walk) -> None:
 
     def cost(step: np.ndarray) -> float:
         moved = np.stack([T[0], step_poses(T[1:], step[None])[0]])
-        match = linearise_pairs(twice, moved, pair, wide).match
+        match = linearise_images(twice, moved, pair, wide).match
         return float(-np.log(match[match > 0]).sum())
 
     slope = np.array([(cost(step) - cost(-step)) / 2e-3 for step in 1e-3 * np.eye(6)])
-    gradient = linearise_pairs(twice, T, pair, wide).gradient[0]
+    gradient = linearise_images(twice, T, pair, wide).gradient[0]
     np.testing.assert_allclose(2.0 * gradient, slope, rtol=0.1, atol=0.02 * np.abs(slope).max())
 
 
@@ -117,9 +117,9 @@ def test_images_that_do_not_see_each_other_stay(walk) -> None:
 
 def test_another_number_of_images_compiles_nothing(walk) -> None:
     images = images_of(as_depth_scans(walk.points, walk.mask))
-    linearise_pairs(images, walk.T_world_camera, pairs_of(4)[:1], 0.02)
+    linearise_images(images, walk.T_world_camera, pairs_of(4)[:1], 0.02)
     before = depth_alignment._linearise._cache_size()
-    linearise_pairs(images._replace(num_samples=40), walk.T_world_camera, pairs_of(4), 0.03)
+    linearise_images(images._replace(num_samples=40), walk.T_world_camera, pairs_of(4), 0.03)
     assert depth_alignment._linearise._cache_size() == before
 
 

@@ -28,7 +28,7 @@ from dpmjax.registration_rgbd.projective_consistency import UNSEEN_SHARE, agreem
 NUM_POINTS = 100
 # Samples of an image at least; an image with fewer valid points repeats some.
 _LEAST_SAMPLES = 3
-# Pairs that are linearised by one call of the program.
+# ImagePairs that are linearised by one call of the program.
 _NUM_PAIRS = 128
 # Damping as a share of the mean information: first value, least value, divisor after an accepted step, and factor
 # after a rejected step.
@@ -38,7 +38,7 @@ _LONGEST_STEP = 4.0
 
 Floats = np.ndarray
 Poses = Float[np.ndarray, "_ 4 4"]
-Pairs = Int[np.ndarray, "p 2"]
+ImagePairs = Int[np.ndarray, "p 2"]
 
 
 class DepthView(NamedTuple):
@@ -159,7 +159,7 @@ def _linearise(
     return jax.vmap(one)(samples, surfaces, T_other_camera)
 
 
-def linearise_pairs(images: DepthImages, T_world_camera: Poses, pairs: Pairs, tolerance: float) -> PairSystems:
+def linearise_images(images: DepthImages, T_world_camera: Poses, pairs: ImagePairs, tolerance: float) -> PairSystems:
     """Compares the points of the first image of each pair with the surface of the second.
 
     Args:
@@ -201,7 +201,7 @@ def linearise_pairs(images: DepthImages, T_world_camera: Poses, pairs: Pairs, to
 def adjust_poses(
     images: DepthImages,
     T_world_camera: Poses,
-    pairs: Pairs,
+    pairs: ImagePairs,
     tolerance: float,
     *,
     num_iterations: int,
@@ -223,7 +223,7 @@ def adjust_poses(
         (n, 4, 4) poses.
     """
     T = np.array(T_world_camera)
-    here = linearise_pairs(images, T, pairs, tolerance)
+    here = linearise_images(images, T, pairs, tolerance)
     # Images that do not see each other have no say, and cost time.
     is_seen = here.visible > 0
     pairs, here = pairs[is_seen], PairSystems(*(values[is_seen] for values in here))
@@ -238,7 +238,7 @@ def adjust_poses(
         step = np.zeros((len(T), 6))
         step[num_fixed:, images.camera.axes] = _damped_step(*system, group[num_fixed:], damping)
         moved = np.concatenate([T[:num_fixed], step_poses(T[num_fixed:], scales * step[num_fixed:])])
-        there = linearise_pairs(images, moved, pairs, tolerance)
+        there = linearise_images(images, moved, pairs, tolerance)
         tried = group_consistency(there, of_pair, num_groups)
         is_better = tried > score
         T[num_fixed:] = _chosen(is_better[group[num_fixed:]], moved[num_fixed:], T[num_fixed:])
@@ -252,7 +252,7 @@ def _chosen(is_first: Floats, first: Floats, second: Floats) -> Floats:
     return np.where(is_first.reshape(-1, *[1] * (first.ndim - 1)), first, second)
 
 
-def _groups(num_nodes: int, pairs: Pairs, num_fixed: int) -> tuple[Floats, int]:
+def _groups(num_nodes: int, pairs: ImagePairs, num_fixed: int) -> tuple[Floats, int]:
     """Labels the free nodes that pairs join, directly or through others; -1 for fixed nodes."""
     joined = pairs[(pairs >= num_fixed).all(axis=1)] - num_fixed
     num_free = num_nodes - num_fixed
@@ -277,7 +277,7 @@ def group_consistency(systems: PairSystems, group: Floats, num_groups: int) -> F
 
 
 def _normal_equations(
-    systems: PairSystems, T: Poses, pairs: Pairs, scales: Floats, axes: list[int]
+    systems: PairSystems, T: Poses, pairs: ImagePairs, scales: Floats, axes: list[int]
 ) -> tuple[Floats, Floats]:
     """Returns the matrix (n, n, k, k) and the gradient (n, k) of all poses, each in its own tangent, in `scales`."""
     # A step of the second camera moves the points by minus the adjoint of T_camera_other.

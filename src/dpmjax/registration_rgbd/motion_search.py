@@ -25,7 +25,7 @@ from dpmjax.registration_rgbd.depth_alignment import (
     DepthView,
     adjust_poses,
     group_consistency,
-    linearise_pairs,
+    linearise_images,
     step_poses,
 )
 from dpmjax.registration_rgbd.depth_images import Pinhole, PixelSample, Views
@@ -136,11 +136,11 @@ def propose_motions(
         moves = _motions((_FIRST_SPREAD * 0.5**step * widths * noise).reshape(-1, 6))
         T = (best @ moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = search.scores(T, config.tolerances[_NUM_ROUNDS - 1], _NUM_REFERENCES)
-    T = _slid(distinct_motions(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
+    T = _slid(motions_apart(T, scores, _NUM_SLID, _DIFFERENT), view.directions)
     scores = search.scores(T, config.tolerances[_NUM_ROUNDS], NUM_CHECKED)
-    T = distinct_motions(T, scores, _NUM_ADJUSTED, _SLID_APART)
+    T = motions_apart(T, scores, _NUM_ADJUSTED, _SLID_APART)
     T, scores = search.adjusted(T, config.tolerances[_NUM_ROUNDS:])
-    return distinct_motions(T, scores, _NUM_DISTINCT, _SLID_APART)
+    return motions_apart(T, scores, _NUM_DISTINCT, _SLID_APART)
 
 
 def motion_cost(T_before_after: Float[np.ndarray, "*m 4 4"], motion: Motion) -> Float[np.ndarray, "*m"]:
@@ -242,7 +242,7 @@ class _Search(NamedTuple):
         T = np.concatenate([self.T_last_reference, T_last_scan])
         for tolerance in tolerances:
             T = adjust_poses(images, T, near, tolerance, num_iterations=_NUM_ITERATIONS, num_fixed=num_fixed)
-        found = linearise_pairs(images, T, pairs, tolerances[-1])
+        found = linearise_images(images, T, pairs, tolerances[-1])
         consistency = group_consistency(found, pairs.max(axis=1) - num_fixed, count)
         return T[num_fixed:], self._less_cost(consistency, T[num_fixed:])
 
@@ -259,7 +259,7 @@ class _Search(NamedTuple):
         return _References(T, *arrays, is_there.astype(np.float32))
 
 
-def distinct_motions(T: Poses, scores: Float[np.ndarray, " m"], count: int, shares: tuple[float, float]) -> Poses:
+def motions_apart(T: Poses, scores: Float[np.ndarray, " m"], count: int, shares: tuple[float, float]) -> Poses:
     """Selects the best motions that differ by these shares of the largest translation or turn from better ones.
 
     Args:
@@ -311,6 +311,6 @@ def slide_margin(images: DepthImages, T_world_camera: Poses, tolerance: float, d
     own, other = np.divmod(np.arange((1 + len(moves)) * count), count)
     pairs = np.stack([np.r_[own + count, other], np.r_[other, own + count]], axis=1)
     shifted = images._replace(views=[*images.views, *[view] * len(moves)])
-    found = linearise_pairs(shifted, nodes, pairs, tolerance)
+    found = linearise_images(shifted, nodes, pairs, tolerance)
     scores = group_consistency(found, pairs.max(axis=1) - count, 1 + len(moves))
     return float(scores[0]), float(scores[0] - scores[1:].max())

@@ -22,11 +22,11 @@ from dpmjax.registration_rgbd.depth_alignment import (
     DepthCamera,
     DepthImages,
     DepthView,
-    Pairs,
+    ImagePairs,
     PairSystems,
     adjust_poses,
     depth_view,
-    linearise_pairs,
+    linearise_images,
 )
 from dpmjax.registration_rgbd.depth_images import DepthScans
 from dpmjax.registration_rgbd.motion_search import (
@@ -260,7 +260,7 @@ def _tracked(beam: _Beam, view: DepthView) -> _Tracked | None:
     if consistency < _CLEAR_CONSISTENCY or margin < _CLEAR_MARGIN or is_far:
         return None
     pair = DepthImages([beam.views[-1], view], camera, _NUM_SAMPLES)
-    systems = linearise_pairs(pair, np.stack([np.eye(4), found]), _all_pairs(2), tolerance)
+    systems = linearise_images(pair, np.stack([np.eye(4), found]), _all_pairs(2), tolerance)
     return _Tracked(found, float(systems.visible.mean()))
 
 
@@ -273,7 +273,7 @@ def _finished(beam: _Beam, views: list[DepthView]) -> PlacedImages:
         pairs = _near_pairs(one, camera.unit)
         for tolerance in np.geomspace(config.tolerance[1], config.final_tolerance, _NUM_TOLERANCES):
             one[:] = adjust_poses(images, one, pairs, tolerance, num_iterations=_NUM_ITERATIONS)
-        found = linearise_pairs(images, one, pairs, config.final_tolerance)
+        found = linearise_images(images, one, pairs, config.final_tolerance)
         shares.append(_shares(_evidence(found, pairs[:, 0], len(one))))
         explained.append(float(shares[-1].mean()))
     scores = np.array(explained) - _mean_cost(T, camera.motion)
@@ -307,11 +307,11 @@ def _adjusted_between(
     return T[count:]
 
 
-def _all_pairs(count: int) -> Pairs:
+def _all_pairs(count: int) -> ImagePairs:
     return np.argwhere(~np.eye(count, dtype=bool))
 
 
-def _near_pairs(T_world_camera: Poses, unit: float) -> Pairs:
+def _near_pairs(T_world_camera: Poses, unit: float) -> ImagePairs:
     """Returns the pairs of each image with the images around it, in both directions."""
     count = len(T_world_camera)
     if count <= _NUM_WINDOW:
@@ -359,12 +359,12 @@ def explained_shares(
     """
     count, num_last = len(T_world_camera), len(T_world_last)
     pairs = _all_pairs(count)
-    before = linearise_pairs(images, T_world_camera, pairs, tolerance)
+    before = linearise_images(images, T_world_camera, pairs, tolerance)
     candidates = images._replace(views=[*images.views[:-1], *[images.views[-1]] * num_last])
     nodes, T = np.arange(num_last) + count, np.concatenate([T_world_camera, T_world_last])
     new, old = (x.ravel() for x in np.meshgrid(nodes, np.arange(count), indexing="ij"))
-    there = linearise_pairs(candidates, T, np.stack([new, old], axis=1), tolerance)
-    back = linearise_pairs(candidates, T, np.stack([old, new], axis=1), tolerance)
+    there = linearise_images(candidates, T, np.stack([new, old], axis=1), tolerance)
+    back = linearise_images(candidates, T, np.stack([old, new], axis=1), tolerance)
     num_points = there.match.shape[1]
     base = _evidence(before, pairs[:, 0], count) if len(pairs) else _Evidence(*np.zeros((2, count, num_points)))
     shares = []
