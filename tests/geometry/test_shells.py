@@ -50,6 +50,10 @@ def test_walls_are_no_shell(dim: int) -> None:
     assert shell_radius(cut[np.linalg.norm(cut, axis=1) < 20.0]) is None
 
 
+def test_a_round_tank_is_no_shell() -> None:
+    assert shell_radius(5.0 * directions(2000, 3)) is None
+
+
 def test_few_points_are_no_shell() -> None:
     assert shell_radius(np.zeros((0, 3))) is None
     assert shell_radius(np.concatenate([room(3), 40.0 * directions(8, 3)])) is None

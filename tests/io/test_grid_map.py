@@ -62,3 +62,11 @@ def test_beams_without_an_echo_do_not_matter(tmp_path) -> None:
     points[~mask] = 1e3
     write_grid_map(tmp_path / "b", poses, points, mask)
     np.testing.assert_array_equal(read(tmp_path / "a")[0], read(tmp_path / "b")[0])
+
+
+def test_a_wide_map_has_larger_cells(tmp_path) -> None:
+    points = np.array([[[3000.0, 1.0], [-3000.0, 2.0], [10.0, -5.0]]])
+    write_grid_map(tmp_path / "map", np.zeros((1, 3)), points, np.ones((1, 3), bool))
+    picture, settings = read(tmp_path / "map")
+    assert max(picture.shape) <= 4010
+    assert float(settings["resolution"]) == pytest.approx(1.5)

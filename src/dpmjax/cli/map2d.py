@@ -92,9 +92,9 @@ def main(options: Map2dOptions, run: Run) -> Numbers:
     start_poses = result.recording.between(result.candidates[result.start].poses)
     for name, poses in (("trajectory", result.poses), ("start", start_poses)):
         cli.write_poses(run.path, poses, name, times=sequence.times, unit=sequence.unit)
+    run.write_numbers(numbers)  # also where a picture fails
     if sequence.unit == "m":
         io.write_grid_map(run / "map", result.poses, sequence.points, sequence.mask)
-    run.write_numbers(numbers)  # also where a picture fails
     registered = sequence.take(result.recording.chosen)
     limits = results.draw_map(run, registered, result, numbers)
     if recorder.has_map:

@@ -15,6 +15,8 @@ from jaxtyping import Float
 _WIDTHS = (0.002, 0.004, 0.007, 0.012, 0.02, 0.03)
 # A shell holds this share of all points at least, and this number; else it does no harm.
 _LEAST_SHARE, _LEAST_COUNT = 0.003, 20
+# A larger share of the points is the surrounding itself, such as a tank about the sensor.
+_MOST_SHARE = 0.9
 # A shell is this many times as dense as the same width below it. Real surfaces end gradually.
 _LEAST_CONTRAST = 3.0
 # The points of a shell are seen in this many of 72 directions: a wall lies within 1.5 % of one range over 20 degrees.
@@ -40,7 +42,8 @@ def shell_radius(points: Float[np.ndarray, "n d"]) -> float | None:
     ordered = np.sort(ranges)
     count = len(ranges) - np.searchsorted(ordered, inner)
     below = np.searchsorted(ordered, inner - 0.3 * width) - np.searchsorted(ordered, inner - 1.3 * width)
-    excess = np.where(count >= _LEAST_CONTRAST * below, count - below, 0)
+    is_shell = (count >= _LEAST_CONTRAST * below) & (count <= _MOST_SHARE * len(ranges))
+    excess = np.where(is_shell, count - below, 0)
     if excess.max() < least:
         return None
     # The narrowest one that holds nearly all.

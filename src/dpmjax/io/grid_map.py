@@ -14,8 +14,9 @@ from dpmjax.io.files import write_atomically
 _OCCUPIED_SHARE = 0.15
 # Values of a cell in the picture, as the map server reads them.
 _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
-# Scans that are drawn at most; more of them add no cell.
-_MOST_SCANS = 2000
+# Scans that are drawn at most, because more of them add no cell; and cells along a side, because planners hold the map in
+# memory: larger places have larger cells.
+_MOST_SCANS, _MOST_CELLS = 2000, 4000
 
 
 def write_grid_map(
@@ -33,7 +34,7 @@ def write_grid_map(
         poses: T_world_scan as x, y, heading; metres, radians.
         points: end points of the beams in the frames of the scans, metres.
         mask: False for beams without an echo.
-        cell_m: side of a cell.
+        cell_m: side of a cell; larger where the map would have more than 4,000 cells along a side.
 
     Returns:
         The path of the `.yaml`.
@@ -41,6 +42,7 @@ def write_grid_map(
     rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MOST_SCANS)).astype(int))
     ends = np.asarray(se2.transform_points(poses[rows], points[rows]), np.float64)
     hits = ends[mask[rows]]
+    cell_m = max(cell_m, float(np.ptp(hits, axis=0).max()) / _MOST_CELLS)
     low = np.floor(hits.min(axis=0) / cell_m) - 2
     width, height = (np.floor(hits.max(axis=0) / cell_m) - low + 3).astype(int)
     passed, ended = np.zeros(width * height), np.zeros(width * height)
@@ -52,9 +54,9 @@ def write_grid_map(
         column, row = np.clip(np.floor(way / cell_m) - low, 0, [width - 1, height - 1]).astype(int).transpose(2, 0, 1)
         cells = row * width + column
         is_new = np.append(np.ones((1, len(beams)), bool), cells[1:] != cells[:-1], axis=0)
-        passed += np.bincount(cells[is_new], minlength=len(passed))
+        np.add.at(passed, cells[is_new], 1)
         column, row = (np.floor(beams / cell_m) - low).astype(int).T
-        ended += np.bincount(row * width + column, minlength=len(ended))
+        np.add.at(ended, row * width + column, 1)
     share = ended / np.maximum(passed + ended, 1)
     values = np.where(share > _OCCUPIED_SHARE, _OCCUPIED, np.where(passed + ended > 0, _FREE, _UNKNOWN))
     # The first row of the picture has the largest y.

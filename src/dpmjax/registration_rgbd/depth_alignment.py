@@ -28,7 +28,7 @@ from dpmjax.registration_rgbd.projective_consistency import UNSEEN_SHARE, agreem
 NUM_POINTS = 100
 # Samples of an image at least; an image with fewer valid points repeats some.
 _LEAST_SAMPLES = 3
-# ImagePairs that are linearised by one call of the program.
+# Pairs that are linearised by one call of the program.
 _NUM_PAIRS = 128
 # Damping as a share of the mean information: first value, least value, divisor after an accepted step, and factor
 # after a rejected step.

@@ -26,7 +26,7 @@ OUTLIER_SLACK = 1 + 1e-5
 
 
 def evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
-    """Returns rows of up to `capacity` of so many points.
+    """Returns rows of up to `capacity` of this many points.
 
     Args:
         num_kept: number of points.
@@ -70,7 +70,7 @@ def find_inliers(tree: HostTree, num_neighbours: int) -> Bool[np.ndarray, " k"]:
 
 
 def _is_lonely(points: Float[np.ndarray, "n 3"], cell_m: float, num_neighbours: int) -> Bool[np.ndarray, " n"]:
-    """Returns True for points with at most so many others in the 27 cells around; all, where there are many cells."""
+    """Returns True for points with at most this many others in the 27 cells around; all, where there are many cells."""
     columns = np.ascontiguousarray(points.T)
     columns -= columns.min(axis=1, keepdims=True)
     columns /= max(cell_m, 1e-9)
