@@ -14,8 +14,8 @@ from dpmjax.io.files import write_atomically
 _OCCUPIED_SHARE = 0.15
 # Values of a cell in the picture, as the map server reads them.
 _OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
-# Scans that are drawn at most, because more of them add no cell; and cells along a side, because planners hold the map in
-# memory: larger places have larger cells.
+# Scans that are drawn at most, because more of them add no cell. Most cells along a side, because planners hold the map
+# in memory; larger places have larger cells.
 _MOST_SCANS, _MOST_CELLS = 2000, 4000
 
 
