@@ -10,6 +10,7 @@ from . import losses as losses
 from . import metrics as metrics
 from . import nets as nets
 from . import pose_graph as pose_graph
+from . import registration as registration
 from . import registration2d as registration2d
 from . import registration_rgbd as registration_rgbd
 from . import saved_maps as saved_maps
@@ -34,7 +35,6 @@ from .deeppointmap.model_config import ModelConfig as ModelConfig
 from .deeppointmap.model_config import model_preset as model_preset
 from .deeppointmap.overlap_prediction import overlap as overlap
 from .deeppointmap.overlap_prediction import overlap_pairs as overlap_pairs
-from .deeppointmap.scan_registration import register as register
 from .deeppointmap.scan_registration import register_pairs as register_pairs
 from .deeppointmap.training.curriculum import training_preset as training_preset
 from .deeppointmap.training.loop import TrainingHooks as TrainingHooks
@@ -60,12 +60,14 @@ from .pose_graph.graph import Edges as Edges
 from .pose_graph.graph import PoseGraph as PoseGraph
 from .pose_graph.optimize import PoseGraphConfig as PoseGraphConfig
 from .pose_graph.optimize import optimize_pose_graph as optimize_pose_graph
+from .registration import register as register
+from .registration import register_scans as register_scans
 from .registration2d.icp import icp as icp
 from .registration2d.pipeline import RegistrationConfig as RegistrationConfig
-from .registration2d.pipeline import register_scans as register_scans
 from .registration2d.refinement import refine as refine
 from .saved_maps.map_file import load_map as load_map
 from .saved_maps.map_file import save_map as save_map
+from .scans.pair_registration import ScanRegistration as ScanRegistration
 from .slam.agents import AgentsResult as AgentsResult
 from .slam.agents import merge_maps as merge_maps
 from .slam.agents import run_agents as run_agents
@@ -75,9 +77,11 @@ from .slam.localization import Localization as Localization
 from .slam.localization import localize as localize
 from .slam.system import SlamResult as SlamResult
 from .slam.system import run_slam as run_slam
+from .slam.unposed import RegisteredClouds as RegisteredClouds
 from .types import DescriptorCloud as DescriptorCloud
 from .types import Neighbours as Neighbours
 from .types import PointCloud as PointCloud
+from .types import Registration as Registration
 from .types import ScanSet as ScanSet
 from .weights.model_file import load_model as load_model
 from .weights.model_file import save_model as save_model

@@ -70,6 +70,7 @@ from .scan_registration import match_clouds as match_clouds
 from .scan_registration import register as register
 from .scan_registration import register_clouds as register_clouds
 from .scan_registration import register_pairs as register_pairs
+from .surface_registration import register_surfaces as register_surfaces
 from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import OverlapConfig as OverlapConfig
 from .training.curriculum import TrainingConfig as TrainingConfig

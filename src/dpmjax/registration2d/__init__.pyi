@@ -6,6 +6,7 @@ from .incremental import incremental_icp as incremental_icp
 from .incremental import scan_odometry as scan_odometry
 from .loop_closure import LoopConfig as LoopConfig
 from .loop_closure import correct_by_loops as correct_by_loops
+from .pair_registration import register_planar as register_planar
 from .pipeline import DEEPMAPPING as DEEPMAPPING
 from .pipeline import GIVEN_POSES as GIVEN_POSES
 from .pipeline import START_NAMES as START_NAMES

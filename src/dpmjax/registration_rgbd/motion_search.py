@@ -269,7 +269,7 @@ def motions_apart(T: Poses, scores: Float[np.ndarray, " m"], count: int, shares:
         shares: of the largest translation, and of the largest turn.
 
     Returns:
-        The motions, the best one first.
+        The motions, the best one first; the first motion alone where no score is finite.
     """
     far, turn = shares[0] * MAX_TRANSLATION, shares[1] * np.deg2rad(MAX_TURN_DEG)
     kept: list[np.ndarray] = []
@@ -281,7 +281,7 @@ def motions_apart(T: Poses, scores: Float[np.ndarray, " m"], count: int, shares:
         # The trace gives the angle without a logarithm.
         cosine = 0.5 * (np.einsum("ij,mij->m", best[:3, :3], T[:, :3, :3]) - 1.0)
         left[is_near & (cosine > np.cos(turn))] = -np.inf
-    return np.stack(kept)
+    return np.stack(kept or [T[0]])
 
 
 def _slid(T: Poses, directions: Float[np.ndarray, "a 3"]) -> Poses:

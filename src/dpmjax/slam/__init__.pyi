@@ -51,3 +51,5 @@ from .system import place_scans as place_scans
 from .system import prepare_ahead as prepare_ahead
 from .system import run_slam as run_slam
 from .system import step_slam as step_slam
+from .unposed import RegisteredClouds as RegisteredClouds
+from .unposed import register_unposed as register_unposed

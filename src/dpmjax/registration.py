@@ -1,0 +1,119 @@
+"""Registration of scans of any sensor, by one name each: `register` for two, `register_scans` for a set.
+
+The shape of the arrays tells the sensor: planar scans are (n, 2), depth images (h, w, 3), lidar scans (n, 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, overload
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dpmjax import deeppointmap, registration2d, registration_rgbd
+from dpmjax.deeppointmap.matching import MatchConfig
+from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.prepared_scans import RawScan, ScanOrCloud
+from dpmjax.registration2d.pipeline import RegisteredScans, RegistrationConfig
+from dpmjax.scans.pair_registration import ScanRegistration
+from dpmjax.slam.unposed import RegisteredClouds, register_unposed
+from dpmjax.types import Registration, ScanSet
+
+
+@overload
+def register(
+    model: Model,
+    source: ScanOrCloud,
+    target: ScanOrCloud,
+    *,
+    config: MatchConfig | None = None,
+    refine: bool | None = None,
+    scale: float = 1.0,
+) -> Registration: ...
+
+
+@overload
+def register(model: None, source: ArrayLike, target: ArrayLike) -> ScanRegistration: ...
+
+
+def register(model: Model | None, source: Any, target: Any, **options: Any) -> Registration | ScanRegistration:
+    """Registers two scans of one sensor without a first guess.
+
+    With a model, lidar scans, maps and descriptor clouds are registered by `deeppointmap.register` (DeepPointMap
+    section 3.2); without one, lidar scans by their views from above and their surfaces. Planar scans (an exhaustive
+    search) and depth images (a search of motions up to 0.7 m and 75 degrees) need no model.
+
+    Args:
+        model: a trained model; None for none.
+        source: planar scan (n, 2), any unit; depth image (h, w, 3) in the frame of the camera, or lidar scan (n, 3),
+            metres. With a model also a prepared scan or a descriptor cloud.
+        target: the same.
+        **options: of `deeppointmap.register`, with a model only: config, refine, scale.
+
+    Returns:
+        `T_target_source`, which maps points of the source to the target; `confidence`, the probability that it is
+        right; and the weak direction. `ScanRegistration` has the lead over the best other motion, too.
+
+    Raises:
+        ValueError: wrong shapes, scans of two sensors, or too few points.
+    """
+    kinds = {_kind(scan) for scan in (source, target)}
+    if kinds == {"planar"}:
+        return registration2d.register_planar(source, target)
+    if kinds == {"depth"}:
+        return registration_rgbd.register_images(source, target)
+    if kinds & {"planar", "depth"}:
+        shapes = " and ".join(str(np.shape(scan)) for scan in (source, target))
+        raise ValueError(f"source, target: expected scans of one sensor, (n, 2), (h, w, 3) or (n, 3), got {shapes}")
+    if model is None:
+        return deeppointmap.register_surfaces(source, target)
+    return deeppointmap.register(model, source, target, **options)
+
+
+def _kind(scan: Any) -> str:
+    """Returns the sensor of a scan by the shape of its array."""
+    shape = np.shape(scan) if isinstance(scan, np.ndarray | jax.Array | list) else ()
+    if len(shape) == 3 and shape[2] == 3:
+        return "depth"
+    return "planar" if len(shape) == 2 and shape[1] == 2 else "lidar"
+
+
+@overload
+def register_scans(model: Model, scans: Sequence[RawScan], *, is_ordered: bool = False) -> RegisteredClouds: ...
+
+
+@overload
+def register_scans(
+    scans: ScanSet | ArrayLike, config: RegistrationConfig | None = None, *, key: jax.Array, **options: Any
+) -> RegisteredScans: ...
+
+
+def register_scans(*scans: Any, is_ordered: bool | None = None, **options: Any) -> RegisteredScans | RegisteredClouds:
+    """Registers a set of scans of one sensor: planar scans, or 3-D scans without poses and order by a model.
+
+        register_scans(scans, config, key=key)              # planar: `registration2d.register_scans`
+        register_scans(model, clouds, is_ordered=False)     # 3-D: `slam.register_unposed`
+
+    Args:
+        *scans: planar scans (n, b, 2) and perhaps their settings; or a model and a list of (n, 3) arrays, metres.
+        is_ordered: True where the scans are in the order of time. None: as the settings say for planar scans, and
+            False for 3-D scans, which `run_slam` maps in order.
+        **options: of `registration2d.register_scans`: key, start, odometry, hooks.
+
+    Returns:
+        Poses of all scans, and what is needed to trust them.
+
+    Raises:
+        ValueError: see the two functions; or ordered 3-D scans.
+    """
+    if isinstance(scans[0], Model):
+        if is_ordered:
+            raise ValueError("is_ordered: expected False for 3-D scans; run_slam maps them in the order of time")
+        return register_unposed(*scans, **options)
+    if is_ordered is not None:
+        config = (scans[1] if len(scans) > 1 else options.pop("config", None)) or RegistrationConfig()
+        scans = (scans[0], replace(config, is_ordered=is_ordered))
+    return registration2d.register_scans(*scans, **options)

@@ -1,0 +1,199 @@
+"""Registration of a set of 3-D scans without any poses or order.
+
+Pairs that may overlap are registered. Motions join the scans to parts, the surest ones first; less sure ones join two
+parts where several agree. Each part is refined jointly. Parts that no motion joins have frames of their own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from dpmjax.deeppointmap.encoding import pooled_vector
+from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
+from dpmjax.deeppointmap.prepared_scans import RawScan, descriptors_of, prepare_scans
+from dpmjax.deeppointmap.scan_registration import register_each
+from dpmjax.geometry import rigid
+from dpmjax.geometry.se3 import are_near
+from dpmjax.scans.lidar import Scan
+from dpmjax.slam.joint import near_pairs, refine_jointly
+from dpmjax.types import Pose, Poses
+
+# Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
+# ones that are registered: fewer leave scans alone, more take longer.
+NUM_SIMILAR, NUM_REGISTERED = 16, 6
+
+# Least probability of overlap of a registered pair.
+MIN_OVERLAP = 0.1
+
+# Parts are joined where the probabilities of agreeing motions add up to this, and those of agreeing contradicting
+# ones to at most this share of it.
+SURE, MAX_RIVAL = 0.9, 0.5
+
+# Less probable motions support nothing.
+LEAST_CONFIDENCE = 0.05
+
+# Two motions agree if they put a scan to the same place.
+AGREE_M, AGREE_RAD = 2.0, math.radians(5.0)
+
+
+class PairMotion(NamedTuple):
+    """A registered pair.
+
+    Attributes:
+        source: row of a scan.
+        target: row of the second scan.
+        T_target_source: its motion.
+        confidence: probability that the motion is right.
+        is_used: True where the poses agree with it.
+    """
+
+    source: int
+    target: int
+    T_target_source: Pose
+    confidence: float
+    is_used: bool = False
+
+
+class RegisteredClouds(NamedTuple):
+    """Poses of a set of scans.
+
+    Attributes:
+        T_world_scan: (n, 4, 4) float64 poses; the world of each part is the frame of its first scan.
+        part: (n,) number of the part of each scan, from 0. Poses of different parts cannot be compared.
+        pairs: all registered pairs, the most probable ones first.
+    """
+
+    T_world_scan: Poses
+    part: Int[np.ndarray, " n"]
+    pairs: tuple[PairMotion, ...]
+
+    @property
+    def is_joined(self) -> bool:
+        """True where all scans have one frame."""
+        return not self.part.any()
+
+
+def register_unposed(
+    model: Model,
+    scans: Sequence[RawScan],
+    *,
+    on_stage: Callable[[str], None] = lambda _stage: None,
+) -> RegisteredClouds:
+    """Registers 3-D scans that have no poses and no order.
+
+    Args:
+        model: a trained model.
+        scans: two or more, (n, 3) points in metres, each in the frame of its lidar.
+        on_stage: called with the name of each stage.
+
+    Returns:
+        The poses, and the parts that they are comparable in.
+
+    Raises:
+        ValueError: there are fewer than two scans, or the points of one are no real numbers (n, 3).
+    """
+    if len(scans) < 2:
+        raise ValueError(f"scans: expected two or more, got {len(scans)}")
+    on_stage(f"encoding of {len(scans)} scans")
+    prepared = prepare_scans(model, scans)
+    pairs = _probable_pairs(model, prepared)
+    on_stage(f"registration of {len(pairs)} pairs")
+    found = register_each(model, [(prepared[a], prepared[b]) for a, b in pairs])
+    motions = [
+        PairMotion(*pair, np.asarray(match.T_target_source, np.float64), float(match.confidence))
+        for pair, match in zip(pairs, found, strict=True)
+    ]
+    motions.sort(key=lambda motion: -motion.confidence)
+    T_world, part = join_parts(motions, len(scans))
+    on_stage("joint refinement")
+    for number in range(part.max() + 1):
+        rows = np.flatnonzero(part == number)
+        some = [prepared[row].surface for row in rows]
+        T_world[rows] = refine_jointly(some, T_world[rows], near_pairs(some, T_world[rows]))
+    used = [motion._replace(is_used=_agrees(motion, T_world, part)) for motion in motions]
+    first = np.array([np.flatnonzero(part == number)[0] for number in part])
+    return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(used))
+
+
+def _probable_pairs(model: Model, scans: Sequence[Scan]) -> list[tuple[int, int]]:
+    """Returns the pairs of each scan with the scans that it most probably overlaps, each pair once."""
+    clouds = [descriptors_of(scan) for scan in scans]
+    vectors = np.stack([pooled_vector(cloud.described) for cloud in clouds])
+    similarity = vectors @ vectors.T
+    np.fill_diagonal(similarity, -np.inf)
+    nearest = np.argsort(-similarity, axis=1)[:, : min(NUM_SIMILAR, len(scans) - 1)]
+    ends = {tuple(sorted((row, int(other)))) for row, others in enumerate(nearest) for other in others}
+    pairs = np.array(sorted(ends))
+    described = [cloud.described for cloud in clouds]
+    overlaps = np.asarray(overlap_pairs(model, [described[a] for a, _ in pairs], [described[b] for _, b in pairs]))
+    is_taken = np.zeros(len(pairs), bool)
+    for row in range(len(scans)):
+        own = np.flatnonzero((pairs == row).any(axis=1))
+        best = own[np.argsort(-overlaps[own], kind="stable")[:NUM_REGISTERED]]
+        is_taken[best[overlaps[best] >= MIN_OVERLAP]] = True
+    return [(int(a), int(b)) for a, b in pairs[is_taken]]
+
+
+def join_parts(motions: Sequence[PairMotion], count: int) -> tuple[Poses, Int[np.ndarray, " n"]]:
+    """Joins scans to parts, by the motions with most support first.
+
+    Args:
+        motions: of pairs, the most probable first.
+        count: number of scans.
+
+    Returns:
+        Poses of the scans in the frames of their parts, and the number of the part of each.
+    """
+    T_world, part = np.tile(np.eye(4), (count, 1, 1)), np.arange(count)
+    while (best := _best_supported(motions, T_world, part)) is not None:
+        into, moved = part[best.target], part[best.source]
+        T_new_world = T_world[best.target] @ best.T_target_source @ rigid.inverse(T_world[best.source])
+        rows = part == moved
+        T_world[rows] = T_new_world @ T_world[rows]
+        part[rows] = into
+    return T_world, np.unique(part, return_inverse=True)[1]
+
+
+def _best_supported(motions: Sequence[PairMotion], T_world: Poses, part: np.ndarray) -> PairMotion | None:
+    """Returns the motion between two parts that has most support; None where none has enough."""
+    between: dict[tuple[int, ...], list[_Joint]] = {}
+    for motion in motions:
+        ends = part[motion.source], part[motion.target]
+        if ends[0] != ends[1] and motion.confidence >= LEAST_CONFIDENCE:
+            T = T_world[motion.target] @ motion.T_target_source @ rigid.inverse(T_world[motion.source])
+            at = T_world[motion.source if ends[0] < ends[1] else motion.target]
+            joint = _Joint(motion, T if ends[0] < ends[1] else rigid.inverse(T), at)
+            between.setdefault(tuple(sorted(ends)), []).append(joint)
+    best, most = None, SURE
+    for joints in between.values():
+        confidences = np.array([joint.motion.confidence for joint in joints])
+        agrees = np.array([[one.agrees(other) for other in joints] for one in joints])
+        supports = agrees @ confidences
+        first = int(supports.argmax())
+        rival = supports[~agrees[first]].max(initial=0.0)
+        if supports[first] >= most and rival <= MAX_RIVAL * supports[first]:
+            best, most = joints[first].motion, supports[first]
+    return best
+
+
+class _Joint(NamedTuple):
+    # A motion between two parts: the motion of their worlds, and the pose of its scan in the first part.
+    motion: PairMotion
+    T_second_first: Pose
+    T_first_scan: Pose
+
+    def agrees(self, other: _Joint) -> bool:
+        """Returns True where both put the scan of this motion to the same place."""
+        T_first_scan = self.T_first_scan
+        return are_near(self.T_second_first @ T_first_scan, other.T_second_first @ T_first_scan, AGREE_M, AGREE_RAD)
+
+
+def _agrees(motion: PairMotion, T_world: Poses, part: np.ndarray) -> bool:
+    T = rigid.inverse(T_world[motion.target]) @ T_world[motion.source]
+    return bool(part[motion.source] == part[motion.target]) and are_near(T, motion.T_target_source, AGREE_M, AGREE_RAD)
