@@ -23,7 +23,7 @@ import dpmjax
 from dpmjax import cli, io, simulation
 from dpmjax import deeppointmap as dpm
 from dpmjax.geometry import rigid, se2, se3
-from dpmjax.scans.pair_registration import PairEvidence
+from dpmjax.scans import PairEvidence
 
 EXPERIMENT = "pair_probability"
 NUM_SCANS, PLANAR_STEPS, DEPTH_STEPS = 160, (1, 4, 8, 16, 32, 64, 128), (1, 1, 2, 3)

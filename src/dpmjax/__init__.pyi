@@ -6,6 +6,7 @@ from . import deepmapping as deepmapping
 from . import deeppointmap as deeppointmap
 from . import geometry as geometry
 from . import io as io
+from . import kept_programs as kept_programs
 from . import losses as losses
 from . import metrics as metrics
 from . import nets as nets

@@ -9,6 +9,8 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+# Environment variable with the folder of traced programs (`kept_programs`), for this process and those that it starts.
+TRACED_FOLDER = "DPMJAX_TRACED"
 CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
 # Hundreds of small programs take seconds together, so programs of any size and compile time are kept.
 _SETTINGS = {
@@ -38,6 +40,7 @@ def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
     settings = {"jax_compilation_cache_dir": str(path), **_SETTINGS}
     # Processes that this one starts inherit the settings.
     os.environ |= {name.upper(): str(value) for name, value in settings.items()}
+    os.environ[TRACED_FOLDER] = str(path / "traced")
     if "jax" in sys.modules:
         import jax
         from jax.experimental.compilation_cache import compilation_cache

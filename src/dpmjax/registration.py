@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax import deeppointmap, registration2d, registration_rgbd
+from dpmjax.checks import runs_on_host
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import RawScan, ScanOrCloud
@@ -39,6 +40,7 @@ def register(
 def register(model: None, source: ArrayLike, target: ArrayLike) -> ScanRegistration: ...
 
 
+@runs_on_host("call icp, or correlate and weighted_svd, there")
 def register(model: Model | None, source: Any, target: Any, **options: Any) -> Registration | ScanRegistration:
     """Registers two scans of one sensor without a first guess.
 

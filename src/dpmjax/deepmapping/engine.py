@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import as_key, require_count
 from dpmjax.deepmapping.problem import Problem
+from dpmjax.kept_programs import kept_jit, prepare_program
 
 
 @flax.struct.dataclass
@@ -264,23 +265,14 @@ def resume(
     while not is_finished(problem, state) and not stop():
         begun = time.perf_counter()
         state = _enter_phase(problem, state, data)
-        # Compiled ahead, so that compile time is counted apart; JAX keeps the program of each phase and number of
-        # starts. Under `jax.disable_jit` there is nothing to compile.
-        program: Callable[..., Any] = partial(_advance, problem, _scalar(state.phase))
-        if not _is_jit_disabled():
-            program = _advance.lower(problem, _scalar(state.phase), state, data).compile()
+        # Compiled ahead, so that compile time is counted apart.
+        advance = prepare_program(_advance, problem, _scalar(state.phase), state, data)
         compiled = time.perf_counter()
-        state, report = jax.block_until_ready(program(state, data))
+        state, report = jax.block_until_ready(advance())
         compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled
         share = min(1.0, _scalar(state.step) / total)
         on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
     return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
-
-
-def _is_jit_disabled() -> bool:
-    """Returns True in a block of `jax.disable_jit`."""
-    config: Any = jax.config  # stubs of some versions of JAX lack the flag
-    return bool(config.jax_disable_jit)
 
 
 def _scalar(count: Array) -> int:
@@ -338,12 +330,12 @@ def _over_starts(function: Callable[..., Any], state: FitState, data: Any) -> An
     return jax.vmap(function, in_axes=(0, None))(state, data) if state.step.ndim else function(state, data)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@kept_jit("problem", "phase")
 def _current_poses(problem: Problem, phase: int, state: FitState, data: Any) -> Any:
     return _over_starts(lambda s, d: problem.poses(problem.config, problem.phases[phase], s.params, d), state, data)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@kept_jit("problem", "phase_index")
 def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> tuple[FitState, Report]:
     """Runs one call of steps of a phase."""
     phase = problem.phases[phase_index]

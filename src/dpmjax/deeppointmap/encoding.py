@@ -17,6 +17,7 @@ from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.geometry.shells import without_shell
+from dpmjax.kept_programs import kept_jit
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
@@ -152,7 +153,7 @@ def pyramid_of_cloud(cloud: PointCloud, config: ModelConfig, *, num_threads: int
     return build_pyramid_on_host(scaled, np.asarray(cloud.mask), config.pyramid, num_threads=num_threads)
 
 
-@functools.partial(jax.jit, static_argnames="num_elements")
+@kept_jit("num_elements")
 def _encode_chunk(model: Model, pyramids: Any, *, num_elements: int | None) -> DescriptorCloud:
     return jax.lax.map(functools.partial(encode_pyramid, model, num_elements=num_elements), pyramids)
 

@@ -21,6 +21,7 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.geometry.pyramid import build_pyramid_on_host
+from dpmjax.kept_programs import kept_jit
 from dpmjax.nets.decoder import DescriptorDecoder
 from dpmjax.nets.point_encoder import PointEncoder, frame_directions, without_masked
 from dpmjax.types import DescriptorCloud, PointPyramid
@@ -117,7 +118,7 @@ def model_fingerprint(model: Model) -> str:
     return digest.hexdigest()[:16]
 
 
-@functools.partial(jax.jit, static_argnames="num_elements")
+@kept_jit("num_elements")
 def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes one scan to descriptors in metres, in the frame of the lidar (DeepPointMap section 3.1).
 

@@ -9,7 +9,6 @@ their head.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,6 +26,7 @@ from dpmjax.deeppointmap.prepared_scans import ScanOrCloud, descriptors_of
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
+from dpmjax.kept_programs import kept_jit
 from dpmjax.scans.lidar import Scan
 from dpmjax.types import DescriptorCloud, RawScan
 
@@ -242,7 +242,7 @@ def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud],
     return join_chunks([_apply_to_chunk(function, model, some) for some in chunks], len(pairs))
 
 
-@functools.partial(jax.jit, static_argnames="function")
+@kept_jit("function")
 def _apply_to_chunk(function: Any, model: Model, pairs: Any) -> Any:
     """Applies a function of one pair to the pairs of a chunk, in one compiled program."""
     return jax.vmap(lambda pair: function(model, *pair))(pairs)

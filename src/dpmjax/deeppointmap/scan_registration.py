@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -26,6 +25,7 @@ from dpmjax.deeppointmap.prepared_scans import (
 )
 from dpmjax.deeppointmap.verification import NUM_THREADS, VerificationConfig
 from dpmjax.geometry.bearing import directions_of
+from dpmjax.kept_programs import kept_jit
 from dpmjax.scans.align import LEVELS, align_on_host
 from dpmjax.scans.lidar import Scan, measured_elements
 from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
@@ -302,7 +302,7 @@ def _as_registration(model: Model, hypotheses: Registration, motion: _Registered
     return with_confidence(match, evidence, model.config.calibration)
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@kept_jit("config")
 def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig) -> Registration:
     """Matches two clouds as `match_clouds` does, inside a compiled program.
 

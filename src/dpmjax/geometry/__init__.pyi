@@ -1,5 +1,6 @@
 from . import rigid as rigid
 from . import se2 as se2
+from . import se3 as se3
 from .alignment import weighted_svd as weighted_svd
 from .consensus import Consensus as Consensus
 from .consensus import ConsensusConfig as ConsensusConfig

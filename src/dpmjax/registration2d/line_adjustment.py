@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.kept_programs import kept_jit
 from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans
 
@@ -74,7 +75,7 @@ class _Fit(NamedTuple):
     is_line: Bool[Array, " b"]
 
 
-@jax.jit
+@kept_jit()
 def _find_nearest(own: Lines, others: Lines, poses: Float[Array, "s 3"]) -> Int[Array, "b s"]:
     """Finds the beam of each neighbouring scan that ends nearest to each beam."""
     search = jax.vmap(lambda some, mask: k_nearest(own.points, some, 1, mask=mask).indices[:, 0], out_axes=1)
@@ -134,7 +135,7 @@ def _wide(values: Float[Array, " b"]) -> Float[Array, "b 1 1"]:
     return values[:, None, None]
 
 
-@jax.jit
+@kept_jit()
 def _linearise(
     own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"], noise: Float[Array, ""]
 ) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:

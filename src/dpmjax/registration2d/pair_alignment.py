@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
+from dpmjax.kept_programs import kept_jit
 from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans, batches
 from dpmjax.types import AnyArray
 
@@ -168,7 +169,7 @@ def linearise_pair(
     return PairSystem(information, gradient, weight.sum())
 
 
-@partial(jax.jit, static_argnames="metric")
+@kept_jit("metric")
 def _linearise(
     source: Lines, target: Lines, poses: Float[Array, "p 3"], scale: Float[Array, " 2"], *, metric: Metric
 ) -> PairSystem:

@@ -58,6 +58,10 @@ _MAX_WHOLE = 256
 # A fit is not refined if its map has a code length above this multiple of that of the refined initial poses.
 _LEAST_PROMISING = 1.15
 
+# Trajectories whose scans differ by less, in typical ranges and radians, have one refinement: it starts its search of
+# matching beams with three times this distance.
+_SAME_PLACE = 0.02
+
 
 @dataclass(frozen=True)
 class RegistrationConfig:
@@ -365,10 +369,17 @@ def _fit(run: _Run, start: Floats | None, *, key: jax.Array) -> Fitted:
     return fit_in_order(scans, config.fit, key=key, start=start, is_ordered=config.is_ordered, engine_of=engine_of)
 
 
+def _are_near(lines: PlanarScans, poses: Floats, others: Floats) -> bool:
+    """Returns True where each scan lies at the same place in both trajectories, relative to the first scan."""
+    apart = se2.relative(poses[0], poses) - se2.relative(others[0], others)
+    return bool(se2.is_within(apart, _SAME_PLACE * lines.typical_range, _SAME_PLACE).all())
+
+
 def _refined_candidates(run: _Run, candidates: dict[str, Floats]) -> dict[str, Floats]:
     """Returns the refined initial poses and fits, without fits whose map is worse than that of the initial poses.
 
     From good initial poses the fit gives the sharper map. The initial poses keep the motion that odometry has measured.
+    A fit that lies where the refined initial poses lie is not refined: the result would be the same.
     """
     (start, start_poses), *fits = candidates.items()
     found: dict[str, Floats] = {}
@@ -382,6 +393,8 @@ def _refined_candidates(run: _Run, candidates: dict[str, Floats]) -> dict[str, F
     if start != START_NAMES["zero"]:
         add_refined(start, start_poses)
     for name, poses in fits:
+        if any(_are_near(run.lines, poses, refined) for refined in found.values()):
+            continue  # its refinement would end at the same map
         scores = choose_trajectory(run.lines, {name: poses, **found}, prior=run.prior)[1]
         nats = [score.code_length for score in scores.values()]
         if nats[0] <= _LEAST_PROMISING * nats[-1]:

@@ -6,7 +6,6 @@ unobserved region. The score of two scans is the agreement of their visible beam
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dpmjax.geometry import se2
+from dpmjax.kept_programs import kept_jit
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, Tolerances, batches
 from dpmjax.registration2d.views import Views
 from dpmjax.types import AnyArray
@@ -60,7 +60,7 @@ def _bearing(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..
     return jnp.where(y < 0, 2 * jnp.pi - half, half)
 
 
-@partial(jax.jit, static_argnames="stride")
+@kept_jit("stride")
 def _look(
     views: Views, pairs: tuple[Int[Array, " p"], Int[Array, " p"]], poses: Float[Array, "p h 3"],
     tolerances: Tolerances, *, stride: int,

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from dpmjax.geometry import rigid, se3
 from dpmjax.geometry.normals import image_normals
 from dpmjax.geometry.se3 import Motion
+from dpmjax.kept_programs import kept_jit
 from dpmjax.registration_rgbd.depth_images import DepthScans, Pinhole, PixelSample, image_surface, surface_slopes
 from dpmjax.registration_rgbd.projective_consistency import UNSEEN_SHARE, agreement_of_gaps, explain_points
 
@@ -136,7 +137,7 @@ class DepthImages(NamedTuple):
     num_samples: int = 1
 
 
-@jax.jit
+@kept_jit()
 def _linearise(
     samples: Float[Array, "b p 3"],
     surfaces: Float[Array, "b 4 r c"],

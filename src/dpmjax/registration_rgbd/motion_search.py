@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import Motion
+from dpmjax.kept_programs import kept_jit
 from dpmjax.registration_rgbd.depth_alignment import (
     NUM_POINTS,
     DepthCamera,
@@ -175,7 +176,7 @@ class _References(NamedTuple):
     weights: Float[AnyArray, " r"]
 
 
-@jax.jit
+@kept_jit()
 def _agreements(
     T_last_scan: Float[Array, "m 4 4"],
     points: Float[Array, "p 3"],

@@ -13,6 +13,7 @@ from .lidar import Scan as Scan
 from .lidar import lidar_scan as lidar_scan
 from .lidar import measure_scan as measure_scan
 from .lidar import measured_elements as measured_elements
+from .pair_registration import PairEvidence as PairEvidence
 from .preprocess import PreprocessConfig as PreprocessConfig
 from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host

@@ -16,6 +16,7 @@ from safetensors.numpy import save
 
 from dpmjax.deeppointmap.model import Model, model_shapes
 from dpmjax.deeppointmap.model_config import ModelConfig
+from dpmjax.kept_programs import keep_result
 from dpmjax.weights.config_json import config_from_json
 
 SHIPPED = Path(__file__).parent
@@ -124,9 +125,14 @@ def model_from_arrays(arrays: dict[str, np.ndarray], config: ModelConfig, source
     Raises:
         ValueError: if a parameter is missing, unknown, or has another shape.
     """
-    shapes = flax.traverse_util.flatten_dict(model_shapes(config), sep=".")
+
+    def trace() -> dict[str, tuple[int, ...]]:
+        shapes = flax.traverse_util.flatten_dict(model_shapes(config), sep=".")
+        return {name: leaf.shape for name, leaf in shapes.items()}
+
+    shapes = keep_result("weights.model_shapes", config, trace)
     for name in sorted(shapes.keys() | arrays.keys()):
-        expected = shapes[name].shape if name in shapes else "none"
+        expected = shapes.get(name, "none")
         found = arrays[name].shape if name in arrays else "none"
         if expected != found:
             raise ValueError(f"{source}: parameter {name}: expected shape {expected}, got {found}")
