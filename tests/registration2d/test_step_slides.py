@@ -16,6 +16,7 @@ from dpmjax.registration2d import (
 )
 from dpmjax.registration2d.joint_alignment import restore_torn
 from dpmjax.registration2d.odometry import calibrate_odometry
+from dpmjax.registration2d.refinement import put_back_slid
 from dpmjax.registration2d.steps import StepPrior, slide_steps
 from dpmjax.simulation import scan_world, simulate_odometry
 
@@ -33,11 +34,17 @@ def truth() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scans(truth) -> PlanarScans:
+    return scans_of(truth)
+
+
+def scans_of(truth: np.ndarray, niches: tuple[int, ...] = ()) -> PlanarScans:
     solid = np.ones((200, 700), bool)
     solid[85:115, 20:680] = False
     for left, right in ((20, 140), (560, 680)):
         solid[40:160, left:right] = False
         solid[60:75, left + 30 : left + 50] = solid[130:140, left + 60 : left + 95] = True
+    for left in niches:
+        solid[81:85, left : left + 12] = False
     points, mask = scan_world(
         solid, truth, max_range=REACH_PX, num_beams=256, range_noise_px=0.4, rng=np.random.default_rng(1)
     )
@@ -184,3 +191,17 @@ def test_the_prior_of_steps_that_nothing_is_known_of_is_unknown(odometry) -> Non
     np.testing.assert_allclose(known.through(rows).deviations, summed)
     unknown = known._replace(deviations=np.full_like(known.deviations, np.inf))
     assert (unknown.through(rows).deviations == np.inf).all()
+
+
+def test_a_step_that_collapsed_in_a_passage_is_named(scans, truth) -> None:
+    assert {10, 11} <= set(assess_trajectory(scans, torn_in_the_corridor(truth, -20.0)).uncertain_scans)
+    assert put_back_slid(scans, torn_in_the_corridor(truth, -20.0)) is None  # no shift along a bare wall is better
+
+
+def test_a_collapsed_step_is_put_back_by_what_little_the_passage_shows(truth) -> None:
+    scans = scans_of(truth, niches=(260, 330, 352, 430))
+    found = put_back_slid(scans, torn_in_the_corridor(truth, -20.0))
+    assert found is not None
+    off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 8.0
+    assert put_back_slid(scans, truth) is None

@@ -16,12 +16,12 @@ import numpy as np
 import scipy.spatial
 
 from dpmjax.geometry import se2
-from dpmjax.pose_graph.graph import Edges, join_rows
+from dpmjax.pose_graph.graph import Edges, join_rows, take_rows
 from dpmjax.pose_graph.normal_equations import solve_blocks
 from dpmjax.registration2d.pair_alignment import Schedule, linearise_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
-from dpmjax.registration2d.steps import StepPrior, held_steps, pose_steps, prior_steps, slide_steps
+from dpmjax.registration2d.steps import Slides, StepPrior, held_steps, pose_steps, prior_steps, slide_steps
 
 # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
 _ROUND_DISTANCES = 1.5e9
@@ -36,6 +36,8 @@ _LOST_SCORE, _LEAST_WEIGHT = 0.25, 0.01
 _MAX_TURN, _NUM_NEAREST = 2.0, 8
 # A pair of scans more steps apart may cross a torn step.
 _FEW_STEPS = 3
+# Pairs up to this number of steps apart that cross a slid step have slid with it.
+_FAR_STEPS = 20
 _NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
@@ -114,6 +116,34 @@ def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float
     weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
     restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
     edges = join_rows(_fitting_pairs(scans, poses, radius), Edges(later, later - 1, restored, weights))
+    scale = np.diag([1.0, 1.0, scans.typical_range**2])
+    edges = edges._replace(information=edges.information[:, None, None] * scale)
+    return _relax(edges, poses, _NUM_TORN_ROUNDS)
+
+
+def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: float) -> Floats:
+    """Puts slid steps back to their modes, and distributes the difference over the pairs that do not cross them.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) T_world_scan.
+        slides: of their steps, from `slid_steps`.
+        radius: largest distance of neighbours in space, typical ranges.
+
+    Returns:
+        (n, 3) T_world_scan; to align them again would let the steps slide again.
+    """
+    later, steps = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
+    is_moved = slides.is_torn & (slides.scores > WEAK_SCORE)
+    pairs = _fitting_pairs(scans, poses, radius)
+    crossed = np.append(0, np.cumsum(is_moved))
+    # Scans that have collapsed onto each other hold each other there.
+    is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > _FAR_STEPS)
+    restored = np.where(is_moved[:, None], slides.moved(steps), steps)
+    edges = join_rows(
+        take_rows(pairs, np.flatnonzero(is_kept)),
+        Edges(later, later - 1, restored, np.maximum(slides.scores, _LEAST_WEIGHT)),
+    )
     scale = np.diag([1.0, 1.0, scans.typical_range**2])
     edges = edges._replace(information=edges.information[:, None, None] * scale)
     return _relax(edges, poses, _NUM_TORN_ROUNDS)

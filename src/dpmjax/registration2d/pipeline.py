@@ -27,7 +27,7 @@ from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, choose_trajectory
 from dpmjax.registration2d.recordings import Recording, choose_scans, interpolate, take_scans
-from dpmjax.registration2d.refinement import refine
+from dpmjax.registration2d.refinement import put_back_slid, refine
 from dpmjax.registration2d.steps import StepPrior
 from dpmjax.types import ScanSet
 
@@ -220,6 +220,13 @@ def register_scans(
         found |= _refined_candidates(run, found)
     hooks.report(_CHOICE, "choice and assessment")
     kept, scores, assessment = _choose(run, found)
+    if evidence is None and config.is_ordered and config.refine and len(lines) > 2 and not hooks.stop():
+        restored = put_back_slid(lines, found[kept])
+        if restored is not None:
+            kept = f"{kept}, slid steps put back"
+            found[kept] = restored
+            _, own, assessment = _choose(run, {kept: restored})
+            scores |= own
     is_doubtful = evidence is not None and not evidence.is_mirrored and not assessment.is_trusted
     if is_doubtful and isinstance(start, str) and start == "auto" and config.refine and not hooks.stop():
         report = partial(hooks.report, _RETRIAL, "the map from odometry cannot be trusted: registration without it")

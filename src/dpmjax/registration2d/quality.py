@@ -27,7 +27,7 @@ from dpmjax.pose_graph.graph import label_parts
 from dpmjax.registration2d.pair_search import Hypotheses
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import compare_pairs, pair_scores
-from dpmjax.registration2d.steps import Slides, StepPrior, slide_steps
+from dpmjax.registration2d.steps import Slides, StepPrior, slid_steps, slide_steps
 
 # Maps whose code lengths differ by less than this share are compared by their misfits, because the position of the
 # walls in the cells changes the code length by some percent.
@@ -291,6 +291,10 @@ def assess_trajectory(
     is_open = deviations > _MAX_DEVIATION * scans.typical_range
     if prior is None:
         is_open |= _turns_freely(scans)
+        if scans.is_ordered:
+            slid = slid_steps(scans, poses)
+            later = 1 + np.flatnonzero(slid.is_torn & (slid.scores > _MIN_CONNECTION))
+            is_open[np.concatenate([later, later - 1])] = True
     is_open &= ~is_alone
     is_trusted = is_clear and is_whole and not is_open.any() and fault is None
     uncertain = tuple(np.flatnonzero(is_alone | is_open).tolist())

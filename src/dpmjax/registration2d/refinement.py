@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import as_beams, runs_on_host
 from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import incremental_icp
-from dpmjax.registration2d.joint_alignment import align_all, restore_open, restore_torn
+from dpmjax.registration2d.joint_alignment import align_all, restore_open, restore_slid, restore_torn
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
 from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
@@ -23,7 +23,7 @@ from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import pair_scores
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
-from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps
+from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps, slid_steps
 from dpmjax.types import ScanSet
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
@@ -31,6 +31,8 @@ from dpmjax.types import ScanSet
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
 # Largest number of repetitions of the alignment after torn steps are restored.
 _NUM_REPAIRS = 2
+# Slid steps are put back where the code length of the map falls by more than this share.
+_LEAST_GAIN = 0.005
 # Scans are adjusted to common lines above this range noise, in typical ranges.
 _MIN_NOISE = 1.5e-4
 # Shares of a refinement that are usually done after the steps, the loops and the joint alignment.
@@ -155,6 +157,25 @@ def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: Refineme
     restored = restore_torn(scans, steps, poses, config.radius, prior)
     is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
     return restored if restored is not None and is_better else poses
+
+
+def put_back_slid(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Floats | None:
+    """Puts steps back that have slid along passages, for scans without odometry.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) T_world_scan.
+        config: settings.
+
+    Returns:
+        (n, 3) poses; None where no step has slid, or where the map does not become clearly better.
+    """
+    slides = slid_steps(scans, poses)
+    if not slides.is_torn.any():
+        return None
+    restored = restore_slid(scans, poses, slides, (config or RefinementConfig()).radius)
+    is_better = map_code_length(scans, restored) < (1.0 - _LEAST_GAIN) * map_code_length(scans, poses)
+    return restored if is_better else None
 
 
 def _better_steps(scans: PlanarScans, steps: Floats, others: Floats) -> Floats:

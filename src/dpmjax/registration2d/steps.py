@@ -20,14 +20,16 @@ from jaxtyping import Bool, Float
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, take_rows
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, PairPrior, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
-from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, find_evidence
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, PlanarScans
+from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, find_evidence, pair_scores
 
 # Standard deviations of a step of poses of unknown accuracy: typical ranges, radians.
 _USUAL_DEVIATION = (0.0225, 0.15)
 # Clear steps predict the translation of another step if the turns differ by less than this, in radians. Least number of
 # such steps; with fewer, all clear steps predict. Least deviation of such a prediction, typical ranges.
 _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_SPREAD = 0.15, 5, 0.015
+# Score above which a step is clear at final poses.
+_CLEAR_SCORE = 0.45
 # Scales of the motion prior: deviations backward, forward and sideways in usual steps; radians.
 _SHORT, _LONG, _SIDEWAYS, _TURN = 0.6, 1.5, 0.5, 0.8
 # Turns (radians) of the arcs that a robot may drive in a step, and their lengths in usual steps.
@@ -116,16 +118,21 @@ def usual_motion(matches: PairMatches, typical_range: float) -> StepPrior:
     """
     eigenvalue = matches.weakest_eigenvalue()
     is_clear = (eigenvalue >= np.median(eigenvalue)) & (matches.fitness >= np.median(matches.fitness))
-    clear, turns = matches.poses[is_clear], matches.poses[:, 2]
-    steps, deviations = np.zeros((len(turns), 3)), np.full((len(turns), 3), np.inf)
+    return _usual_steps(matches.poses, is_clear, typical_range)
+
+
+def _usual_steps(steps: Floats, is_clear: Booleans, typical_range: float) -> StepPrior:
+    """Predicts the translation of each step by the clear steps of a similar turn."""
+    clear, turns = steps[is_clear], steps[:, 2]
+    predicted, deviations = np.zeros((len(turns), 3)), np.full((len(turns), 3), np.inf)
     for row, turn in enumerate(turns):
         alike = clear[np.abs(se2.wrap_angle(clear[:, 2] - turn)) < _SIMILAR_TURN]
         alike = alike if len(alike) >= _LEAST_CLEAR else clear
         if len(alike) >= _LEAST_CLEAR:
-            steps[row, :2] = np.median(alike[:, :2], axis=0)
-            spread = 1.4826 * np.median(np.abs(alike[:, :2] - steps[row, :2]), axis=0)
+            predicted[row, :2] = np.median(alike[:, :2], axis=0)
+            spread = 1.4826 * np.median(np.abs(alike[:, :2] - predicted[row, :2]), axis=0)
             deviations[row, :2] = spread + _LEAST_SPREAD * typical_range
-    return StepPrior(steps, deviations)
+    return StepPrior(predicted, deviations)
 
 
 class MotionPrior(NamedTuple):
@@ -321,6 +328,24 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
     probability /= probability.sum(axis=1, keepdims=True)
     means, best = probability @ shifts, shifts[nats.argmax(axis=1)]
     return means, np.sqrt((probability * (shifts - best[:, None]) ** 2).sum(axis=1))
+
+
+def slid_steps(scans: PlanarScans, poses: Floats) -> Slides:
+    """Computes the shifts of steps against the usual motion at these poses, for scans without odometry.
+
+    A refinement may let the steps in a corridor collapse: the scans fit at every shift, and the robot would have stood.
+
+    Args:
+        scans: n scans in time order.
+        poses: (n, 3) T_world_scan.
+
+    Returns:
+        Slides of the n - 1 steps; a torn step has slid.
+    """
+    later, steps = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]), np.float64)
+    free = slide_steps(scans, steps)
+    is_clear = (pair_scores(scans, later, later - 1, steps) > _CLEAR_SCORE) & ~free.is_open & ~free.is_torn
+    return slide_steps(scans, steps, _usual_steps(steps, is_clear, scans.typical_range))
 
 
 def matched_steps(matches: PairMatches, slides: Slides) -> Edges:
