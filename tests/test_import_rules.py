@@ -11,11 +11,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "dpmjax"
 
-EVERYBODY_MAY = {"types", "checks", "sequences"}
+EVERYBODY_MAY = {"types", "checks", "sequences", "reading"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "checks": {"compile_cache"},
     "sequences": set(),
+    "reading": set(),
     "checkpoints": set(),
     "compile_cache": set(),
     "geometry": set(),

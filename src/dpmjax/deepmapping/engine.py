@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import as_key, require_count
 from dpmjax.deepmapping.problem import Problem
+from dpmjax.types import with_short_repr
 
 
 @flax.struct.dataclass
@@ -46,6 +47,7 @@ class FitState:
     step: Int[Array, "*starts"]
 
 
+@with_short_repr
 class Report(NamedTuple):
     """Result of one call of the step; for several starts every leaf has a leading axis.
 
@@ -85,6 +87,7 @@ class Progress(NamedTuple):
     compile_s: float
 
 
+@with_short_repr
 class Fit(NamedTuple):
     """Result of `fit`.
 

@@ -72,6 +72,7 @@ from .scan_registration import register_clouds as register_clouds
 from .scan_registration import register_pairs as register_pairs
 from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import OverlapConfig as OverlapConfig
+from .training.curriculum import SamplingConfig as SamplingConfig
 from .training.curriculum import TrainingConfig as TrainingConfig
 from .training.curriculum import training_preset as training_preset
 from .training.curriculum import without as without
@@ -106,7 +107,6 @@ from .training.preparation import prepared_path as prepared_path
 from .training.preparation import stored_bytes as stored_bytes
 from .training.preparation import why_useless as why_useless
 from .training.processes import join_processes as join_processes
-from .training.sampling import SamplingConfig as SamplingConfig
 from .training.sampling import ScanTable as ScanTable
 from .training.scan_store import SampleMaker as SampleMaker
 from .training.scan_store import ScanStore as ScanStore
