@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
-QUICK = "06"
-"""The example of seconds; the others train, or map a drive."""
+QUICK = ("06", "10")
+"""Examples of seconds; the others train, or map a drive."""
 LONG = (pytest.mark.slow, pytest.mark.timeout(900))
 
 

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import inspect
 import pkgutil
 import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -58,8 +58,7 @@ def test_no_module_hides_a_public_name(package) -> None:
 
 
 def test_version_is_the_one_of_the_distribution() -> None:
-    configuration = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
-    assert dpmjax.__version__ == configuration["project"]["version"]
+    assert dpmjax.__version__ == importlib.metadata.version("dpmjax")
 
 
 def test_results_of_public_functions_are_public() -> None:

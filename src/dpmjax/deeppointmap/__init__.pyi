@@ -27,6 +27,7 @@ from .encoding import encode as encode
 from .encoding import encode_scans as encode_scans
 from .encoding import pooled_vector as pooled_vector
 from .encoding import pyramid_of_cloud as pyramid_of_cloud
+from .encoding import pyramid_of_scan as pyramid_of_scan
 from .evaluation_pairs import DISTANCE_BANDS_M as DISTANCE_BANDS_M
 from .evaluation_pairs import PlaceSplit as PlaceSplit
 from .evaluation_pairs import ScanPair as ScanPair
