@@ -11,10 +11,10 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv check test slow demo slam bench docs clean
+.PHONY: help venv check test slow demo slam bench docs release-check clean
 
 help:  ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
 
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -34,7 +34,7 @@ check: $(STAMP)  ## lint, docstrings, format, types, import rules, links of the 
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 test: $(STAMP)  ## the test suite, without what is slow
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(PYTEST_OPTIONS)
 
 slow: $(STAMP)  ## the tests that train, start processes, or compile for seconds
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
@@ -52,6 +52,17 @@ bench: $(STAMP)  ## speed and accuracy of everything that is measured
 
 docs: $(STAMP)  ## the site of the documentation: build/site/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+release-check: $(STAMP)  ## build wheel and sdist, and use the wheel in bare environments of each Python that is found
+	rm -rf build/release && mkdir -p build/release
+	$(BIN)/python -m build --outdir build/release
+	$(BIN)/twine check --strict build/release/*
+	for version in 3.11 3.12 3.13; do \
+	  python$$version --version >/dev/null 2>&1 || { echo "python$$version: not found, left out"; continue; }; \
+	  python$$version -m venv build/release/$$version && \
+	  build/release/$$version/bin/pip install --quiet build/release/*.whl && \
+	  (cd build/release && $$version/bin/python ../../docs/quick_start.py && $$version/bin/dpmjax info) || exit 1; \
+	done
 
 clean:  ## remove the environments and the caches (results/ stays)
 	rm -rf .venv .venv-* build dist .pytest_cache .ruff_cache .mypy_cache src/*.egg-info

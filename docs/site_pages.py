@@ -1,6 +1,7 @@
 """Pages of the site that are made from other files, and links that leave the site.
 
-index.md is README.md, reference.md has the docstring of each name of api.md, and examples.md has the code of examples/.
+index.md is README.md, reference.md has the docstring of each name of api.md, and examples.md has the examples and
+what they printed.
 Links to files outside docs/ lead to the repository, where its address is known.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import posixpath
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +54,13 @@ def reference() -> str:
 
 
 def examples() -> str:
-    """Returns the page of the examples: the code of each."""
+    """Returns the page of the examples: the code of each, and what it printed."""
     parts = ["# Examples\n\nEach is a file in `examples/`, which the tests run.\n"]
-    for path in sorted((ROOT / "examples").glob("[0-9]*.py")):
+    made = runpy.run_path(str(ROOT / "docs" / "run_examples.py"))
+    outputs = made["outputs"]()
+    for path in made["EXAMPLES"]:
         title = path.stem[3:].replace("_", " ").capitalize()
         parts.append(f"## {title}\n\n```python\n{path.read_text(encoding='utf-8')}```\n")
+        if path.name in outputs:
+            parts.append(f"It prints:\n\n```\n{outputs[path.name]['output']}```\n")
     return "\n".join(parts)

@@ -15,7 +15,7 @@ walks = [simulation.simulate_sequence(seed, 8, num_beams=64) for seed in range(8
 config = deepmapping.with_steps(deepmapping.preset("fast"), 60)
 
 # The data of a problem are arrays in units of the typical range; stacked, they are eight data sets.
-data, units = zip(*(deepmapping.mapping_data(dpmjax.ScanSet(walk.points, walk.mask)) for walk in walks), strict=True)
+data, units = zip(*(deepmapping.mapping_data(walk) for walk in walks), strict=True)
 problem = deepmapping.mapping_problem(config, data[0])
 stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *data)
 references = jnp.stack([walk.reference_poses[:, :2] / unit for walk, unit in zip(walks, units, strict=True)])

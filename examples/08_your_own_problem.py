@@ -36,4 +36,4 @@ problem = deepmapping.Problem(
 )  # fmt: skip
 fitted = deepmapping.fit(problem, scans, key=jax.random.key(0))
 error = dpmjax.absolute_trajectory_error(fitted.poses[:, :2] * unit, walk.reference_poses[:, :2])
-print(f"loss {fitted.report.loss:.4f}, ATE {error:.2f} {walk.unit} after {fitted.run_s:.1f} s")
+print(f"ATE {error:.2f} {walk.unit} after {fitted.run_s:.1f} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -29,6 +30,9 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 import jax
 import jaxtyping
 import pytest
+
+# Once a process, at a moment that depends on the caches: no test of a message may meet it.
+logging.getLogger("dpmjax.compile_cache").setLevel(logging.ERROR)
 
 # Before the first import of the package, so that the functions of these rooms (kernels and network) are wrapped: all
 # rooms would take twelve seconds of each worker. An integer is a float, as for mypy.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -66,3 +67,18 @@ def test_a_second_process_loads_what_the_first_has_compiled(tmp_path, is_named: 
         numbers.append(int(hits))
     assert numbers[0] == 0
     assert numbers[1] > 0
+
+
+def test_long_compilation_is_announced_once_and_loading_never(caplog) -> None:
+    from dpmjax.compile_cache import announcer
+
+    caplog.set_level(logging.INFO, logger="dpmjax.compile_cache")
+    announce = announcer("and so on")
+    compiled, loaded = "/jax/core/compile/backend_compile_duration", "/jax/compilation_cache/cache_retrieval_time_sec"
+    for _ in range(9):
+        announce(loaded, 1.0)
+        announce(compiled, 1.1)
+    assert not caplog.messages
+    for _ in range(9):
+        announce(compiled, 1.1)
+    assert len(caplog.messages) == 1

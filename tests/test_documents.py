@@ -67,6 +67,14 @@ def test_settings_page_is_that_of_the_code() -> None:
     assert page == made["page"](), "run: python docs/make_settings.py"
 
 
+def test_printed_outputs_are_those_of_the_examples() -> None:
+    made = runpy.run_path(str(ROOT / "docs" / "run_examples.py"))
+    codes = {path.name: made["fingerprint"](path) for path in made["EXAMPLES"]}
+    kept = {name: found["code"] for name, found in made["outputs"]().items()}
+    assert kept
+    assert kept.items() <= codes.items(), "run: python docs/run_examples.py"
+
+
 def test_dependencies_page_has_a_line_for_each_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     tables = (ROOT / "docs" / "dependencies.md").read_text(encoding="utf-8").partition("## Extras")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import runpy
 import subprocess
@@ -13,8 +14,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
-QUICK = "06"
-"""The example of seconds; the others train, or map a drive."""
+QUICK = ("06", "10")
+"""Examples of seconds; the others train, or map a drive."""
 LONG = (pytest.mark.slow, pytest.mark.timeout(900))
 
 
@@ -60,6 +61,23 @@ def test_code_of_a_guide_defines_all_its_names(guide, tmp_path) -> None:
     code.write_text("\n".join(_blocks(guide)))
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "concise"]
     done = subprocess.run([*ruff, str(code)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_code_of_pages_and_examples_has_no_type_error_by_the_library(tmp_path) -> None:
+    pages = [ROOT / "README.md", ROOT / "docs" / "quickstart.md", *GUIDES]
+    for path in (*pages, *EXAMPLES):
+        code = path.read_text(encoding="utf-8") if path.suffix == ".py" else "\n".join(_blocks(path))
+        (tmp_path / f"{path.suffix[1:]}_{path.stem.lower()}.py").write_text(code)
+    # The functions of the pages are short and have no annotations, and optax ships none.
+    own = ["no-untyped-def", "no-untyped-call", "import-untyped", "no-redef", "untyped-decorator"]
+    options = ["--strict", "--follow-imports=silent", *(f"--disable-error-code={code}" for code in own)]
+    mypy = [sys.executable, "-m", "mypy", *options, "--cache-dir", str(ROOT / ".mypy_cache" / "pages")]
+    environment = os.environ | {"MYPYPATH": str(ROOT / "src")}
+    done = subprocess.run(
+        [*mypy, *map(str, sorted(tmp_path.iterdir()))], capture_output=True, text=True, env=environment
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -1,16 +1,18 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import inspect
 import pkgutil
 import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from types import ModuleType
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import dpmjax
@@ -56,8 +58,27 @@ def test_no_module_hides_a_public_name(package) -> None:
 
 
 def test_version_is_the_one_of_the_distribution() -> None:
-    configuration = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
-    assert dpmjax.__version__ == configuration["project"]["version"]
+    assert dpmjax.__version__ == importlib.metadata.version("dpmjax")
+
+
+def test_results_of_public_functions_are_public() -> None:
+    functions = [value for name in dpmjax.__all__ if inspect.isfunction(value := getattr(dpmjax, name))]
+    results = [inspect.signature(function).return_annotation for function in functions]
+    records = {result for result in results if re.fullmatch(r"[A-Z]\w+", str(result))} - {"Path", "None"}
+    assert len(records) > 20
+    assert records <= set(dpmjax.__all__)
+
+
+def test_a_record_prints_one_line_of_shapes() -> None:
+    edges = dpmjax.Edges(np.array([0]), np.array([1]), np.zeros((1, 3)), np.eye(3)[None])
+    graph = dpmjax.PoseGraph.create(np.zeros((500, 3)), edges)
+    assert repr(graph).startswith("PoseGraph(poses=float64[500, 3], edges=")
+    match = dpmjax.IcpResult(jnp.zeros((4, 4)), jnp.float32(0.25), jnp.int32(3), jnp.bool_(True))
+    assert "T_target_source=float32[4, 4], rmse=0.25, num_inliers=3" in repr(match)
+    for record in (graph, match, dpmjax.ScanSet(jnp.zeros((99, 9, 2)), jnp.ones((99, 9), bool))):
+        assert len(repr(record)) < 300
+        assert "\n" not in repr(record)
+    jax.jit(lambda result: len(repr(result)))(match)  # tracers have no numbers
 
 
 def test_compile_counter_counts(count_compilations) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -14,10 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dpmjax.compile_cache import keep_programs
+from dpmjax.reading import read_path
+from dpmjax.sequences import ScanSequence
 from dpmjax.types import AnyArray, ScanSet
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+# Planar scans: beam end points (n, b, 2), with a mask or without, or the file or folder of a sequence.
+Beams = ScanSet | ScanSequence | ArrayLike | Path
 
 
 def runs_on_host(instead: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
@@ -113,12 +118,12 @@ def as_points(name: str, value: AnyArray, dimensions: tuple[int, ...] | None = N
     return array
 
 
-def as_host_points(name: str, value: ArrayLike) -> np.ndarray:
+def as_host_points(name: str, value: ArrayLike | Path) -> np.ndarray:
     """Makes points in space, on the host; the dtype is kept.
 
     Args:
         name: name of the argument, for messages.
-        value: the array.
+        value: the array, or the file of a scan.
 
     Returns:
         (n, 3) points, an array of NumPy.
@@ -126,7 +131,7 @@ def as_host_points(name: str, value: ArrayLike) -> np.ndarray:
     Raises:
         ValueError: the shape is another one, or the numbers are not real.
     """
-    array = np.asarray(value)
+    array = np.asarray(read_path(value, "io.read_lidar_file"))
     if array.ndim != 2 or array.shape[1] != 3:
         hint = "; pass points[:, :3] without the reflectance" if array.shape[1:] == (4,) else ""
         raise ValueError(f"{name}: expected shape (n, 3), got {array.shape}{hint}")
@@ -156,12 +161,13 @@ def as_mask(name: str, value: AnyArray | None, shape: tuple[int, ...], xp: Modul
     return array
 
 
-def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
+def as_beams(name: str, value: Beams) -> ScanSet:
     """Makes planar scans with a mask; beams with coordinates that are not finite, or both zero, measured nothing.
 
     Args:
         name: name of the argument, for messages.
-        value: (n, b, 2) beam end points in the sensor frames; or a ScanSet, whose mask is kept.
+        value: (n, b, 2) beam end points in the sensor frames; a ScanSet or ScanSequence, whose mask is kept; or
+            the file or folder of a sequence.
 
     Returns:
         The scans, zeros where nothing was measured.
@@ -169,14 +175,15 @@ def as_beams(name: str, value: ScanSet | ArrayLike) -> ScanSet:
     Raises:
         ValueError: the shape is another one, or a valid beam of a ScanSet is not finite.
     """
+    value = cast(Beams, read_path(value, "io.read_sequence"))
     try:
-        points: Any = value.points if isinstance(value, ScanSet) else value
+        points: Any = value.points if isinstance(value, ScanSet | ScanSequence) else value
         points = np.asarray(points, np.float32)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers (n, b, 2), got {type(value).__name__}") from error
     if points.ndim != 3 or points.shape[-1] != 2:
         raise ValueError(f"{name}: expected shape (n, b, 2), got {points.shape}")
-    if isinstance(value, ScanSet):
+    if isinstance(value, ScanSet | ScanSequence):
         mask = np.asarray(value.mask, bool)
     else:
         mask = np.isfinite(points).all(-1) & (np.abs(points).sum(-1) > 0)

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+import logging
+import math
 import os
 import platform
 import sys
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+_log = logging.getLogger(__name__)
+# A pipeline that compiles for longer than this says so; a process that loads its programs stays below.
+_SILENT_S = 2.0
+# Seconds of each program, compiled or loaded, and seconds of those that were loaded.
+_SHARES = {"/jax/core/compile/backend_compile_duration": 1.0, "/jax/compilation_cache/cache_retrieval_time_sec": -1.0}
 # Environment variable with the folder of traced programs (`kept_programs`), for this process and those that it starts.
 TRACED_FOLDER = "DPMJAX_TRACED"
 CACHES = "Library/Caches" if sys.platform == "darwin" else ".cache"
@@ -51,13 +60,38 @@ def enable_compile_cache(folder: str | Path | None = None) -> Path | None:
     return path
 
 
+@functools.cache
 def keep_programs() -> None:
-    """Switches the cache on where JAX has none yet."""
+    """Switches the cache on where JAX has none yet, and logs where compilation takes long."""
     import jax
 
     options: Any = jax.config
     if options.jax_compilation_cache_dir is None:
         enable_compile_cache()
+    folder = options.jax_compilation_cache_dir
+    later = f"later processes load the programs from {folder}" if folder else "the cache of programs is off"
+    jax.monitoring.register_event_duration_secs_listener(announcer(later))
+
+
+def announcer(later: str) -> Callable[..., None]:
+    """Makes a listener to events of JAX that warns once, after two seconds of compilation.
+
+    Args:
+        later: end of the message, on the next process.
+
+    Returns:
+        The listener.
+    """
+    waited_s = 0.0
+
+    def announce(event: str, duration_secs: float, **_: Any) -> None:
+        nonlocal waited_s
+        before_s, waited_s = waited_s, waited_s + _SHARES.get(event, 0.0) * duration_secs
+        if before_s <= _SILENT_S < waited_s:
+            waited_s = math.inf
+            _log.warning("compiling, for 10 to 60 s in all, once; %s", later)
+
+    return announce
 
 
 def cpu_model() -> str:

@@ -121,13 +121,13 @@ class ScanSequence:
     """
 
     name: str
-    points: NDArray[np.float32]
-    mask: BoolArray
+    points: NDArray[np.float32] = field(repr=False)
+    mask: BoolArray = field(repr=False)
     unit: Unit
-    reference_poses: FloatArray | None = None
-    odometry_poses: FloatArray | None = None
-    times: FloatArray | None = None
-    notes: tuple[Note, ...] = ()
+    reference_poses: FloatArray | None = field(default=None, repr=False)
+    odometry_poses: FloatArray | None = field(default=None, repr=False)
+    times: FloatArray | None = field(default=None, repr=False)
+    notes: tuple[Note, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         if self.unit not in ("px", "m"):
@@ -150,6 +150,13 @@ class ScanSequence:
         """Selects scans with their poses and times; arrays are views where `selection` is a slice."""
         names = ("points", "mask", "reference_poses", "odometry_poses", "times")
         return replace(self, **_select(self, names, selection))
+
+
+@dataclass(frozen=True)
+class SimulatedScans(ScanSequence):
+    """A simulated sequence of planar scans, whose poses are known."""
+
+    reference_poses: FloatArray = field(repr=False)
 
 
 class Relations(NamedTuple):
@@ -309,10 +316,10 @@ class DepthSequence:
     """
 
     name: str
-    points: NDArray[np.float32]
-    mask: BoolArray
+    points: NDArray[np.float32] = field(repr=False)
+    mask: BoolArray = field(repr=False)
     is_planar: bool
-    T_world_camera: FloatArray | None = None
+    T_world_camera: FloatArray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.points.ndim != 4 or self.points.shape[3] != 3:
@@ -395,3 +402,10 @@ class LidarSequence:
             read_times=None if read_times is None else lambda index: read_times(numbers[index]),
             **chosen,
         )
+
+
+@dataclass(frozen=True)
+class SimulatedDrive(LidarSequence):
+    """A simulated drive, whose poses are known."""
+
+    T_world_lidar: FloatArray = field(repr=False)

@@ -6,13 +6,48 @@ valid entries. Masked entries may hold anything, NaN too, and never take part in
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import flax.struct
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+Record = TypeVar("Record")
+# Longest text of a value on the line of its record.
+_MAX_TEXT = 40
+
+
+def with_short_repr(record: type[Record]) -> type[Record]:
+    """Prints a class of records on one line: shapes of arrays, lengths of sequences, and short values.
+
+    Args:
+        record: a NamedTuple or a dataclass.
+
+    Returns:
+        The class.
+    """
+    record.__repr__ = _short_repr  # type: ignore[method-assign]
+    return record
+
+
+def _short_repr(record: Any) -> str:
+    names = getattr(record, "_fields", None) or [field.name for field in dataclasses.fields(record)]
+    return f"{type(record).__name__}({', '.join(f'{name}={_short(getattr(record, name))}' for name in names)})"
+
+
+def _short(value: Any) -> str:
+    if getattr(value, "shape", ()):
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, dict | list | tuple) and not hasattr(value, "_fields"):
+        return f"{len(value)} items"
+    is_number = isinstance(value, jax.Array | float) and not isinstance(value, jax.core.Tracer)
+    text = f"{float(value):.4g}" if is_number else repr(value)
+    return text if len(text) <= _MAX_TEXT else f"{type(value).__name__}(...)"
+
 
 # Input of public functions: an array of JAX or of NumPy. They return arrays of JAX.
 AnyArray = jax.Array | np.ndarray
@@ -25,6 +60,7 @@ Poses = Float[np.ndarray, "_n 4 4"]
 Information = Float[np.ndarray, "6 6"]
 
 
+@with_short_repr
 @flax.struct.dataclass
 class ScanSet:
     """A set of scans of equal capacity, each in its own sensor frame.
@@ -38,6 +74,7 @@ class ScanSet:
     mask: Bool[Array, "n b"]
 
 
+@with_short_repr
 @flax.struct.dataclass
 class PointCloud:
     """A scan as a cloud of fixed capacity, in the frame of the lidar that took it.
@@ -51,8 +88,8 @@ class PointCloud:
     mask: Bool[AnyArray, " n"]
 
 
-# A raw scan: points in metres, in the frame of the lidar.
-RawScan = PointCloud | Float[AnyArray, "_n 3"]
+# A raw scan: points in metres, in the frame of the lidar, or their file.
+RawScan = PointCloud | Float[AnyArray, "_n 3"] | str | Path
 
 
 class Neighbours(NamedTuple):
@@ -160,6 +197,7 @@ class Verification(NamedTuple):
     lookalike_gap: float = math.inf
 
 
+@with_short_repr
 @flax.struct.dataclass
 class Registration:
     """The motion between two descriptor clouds, and its confidence; failure is data.

@@ -112,6 +112,7 @@ def test_finished_run_exits_with_zero(toy, tmp_path):
         "metrics.csv",
         "metrics.json",
         "log.txt",
+        "report.html",
     }
 
 

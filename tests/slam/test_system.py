@@ -421,9 +421,9 @@ def test_only_a_sure_decoder_places_scans_that_meet_no_plane(probability, is_cal
         ),
         (lambda methods, _: run_slam("dpm_small", []), "model: expected one from load_model, got str"),
         (lambda methods, _: encode("dpm_small", EMPTY), "model: expected one from load_model, got str"),
-        (lambda methods, _: run_slam(methods, [], slam_map="map.npz"), "slam_map: expected one from load_map, got str"),
-        (lambda methods, _: localize(methods, "map.npz", EMPTY), "slam_map: expected one from load_map, got str"),
-        (lambda methods, _: merge_maps(methods, "a.npz", "b.npz"), "maps: expected one from load_map, got str"),
+        (lambda methods, _: run_slam(methods, [], slam_map="map.npz"), "map.npz: no such file; check the path."),
+        (lambda methods, _: localize(methods, "map.npz", EMPTY), "map.npz: no such file; check the path."),
+        (lambda methods, _: merge_maps(methods, "a.npz", "b.npz"), "a.npz: no such file; check the path."),
         (lambda *_: slam_preset("fast"), "name: expected one of"),
     ],
 )

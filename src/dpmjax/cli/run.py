@@ -42,6 +42,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from dpmjax import io
 from dpmjax.cli import program
 from dpmjax.cli.machine import environment, select_device
+from dpmjax.cli.report import write_report
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError, Note
 
@@ -330,6 +331,7 @@ def _finish(run: Run, numbers: Numbers) -> int:
     if "verdict" in numbers and not has_failed:
         run.say(numbers["verdict"])
     if run.is_open:
+        write_report(run.path, run.read_table)
         print(f"results in {run.path}", flush=True)
     run.check_stop()
     return _say(f"error: {numbers['verdict']}; results are in {run.path}", EXIT_FAILED) if has_failed else EXIT_OK

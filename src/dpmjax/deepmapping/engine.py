@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 from dpmjax.checks import as_key, require_count
 from dpmjax.deepmapping.problem import Problem
 from dpmjax.kept_programs import kept_jit, prepare_program
+from dpmjax.types import with_short_repr
 
 
 @flax.struct.dataclass
@@ -47,6 +48,7 @@ class FitState:
     step: Int[Array, "*starts"]
 
 
+@with_short_repr
 class Report(NamedTuple):
     """Result of one call of the step; for several starts every leaf has a leading axis.
 
@@ -86,6 +88,7 @@ class Progress(NamedTuple):
     compile_s: float
 
 
+@with_short_repr
 class Fit(NamedTuple):
     """Result of `fit`.
 

@@ -7,23 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple, cast
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require_type, runs_on_host
+from dpmjax.checks import Beams, require_type, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Report, fit
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
 from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
+from dpmjax.reading import read_path
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
 from dpmjax.registration_rgbd.projective_consistency import projective_consistency
 from dpmjax.registration_rgbd.trajectory_search import PlacedImages, initialize_depth
-from dpmjax.types import ScanSet
+from dpmjax.sequences import DepthSequence
+from dpmjax.types import ScanSet, with_short_repr
 
 _SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH}
 # A given unit of length is between the first of these shares and the second of the typical range.
@@ -34,6 +37,7 @@ _SAMPLES = 64
 Scans = ScanSet | DepthScans
 
 
+@with_short_repr
 class Fitted(NamedTuple):
     """Result of `fit_deepmapping`.
 
@@ -59,6 +63,7 @@ class Fitted(NamedTuple):
         return self.poses if self.poses.ndim == 3 else se2.to_matrix(self.poses)
 
 
+@with_short_repr
 class Registered(NamedTuple):
     """Result of `register_depth`.
 
@@ -86,7 +91,7 @@ class Registered(NamedTuple):
 
 
 def mapping_data(
-    scans: Scans | ArrayLike, start: ArrayLike | None = None, *, unit: float | None = None
+    scans: DepthScans | Beams, start: ArrayLike | None = None, *, unit: float | None = None
 ) -> tuple[MappingData, float]:
     """Checks scans and poses, and scales both to the unit of length of the fit.
 
@@ -135,7 +140,7 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
 
 @runs_on_host("call deepmapping.solve there")
 def fit_deepmapping(
-    scans: Scans | ArrayLike,
+    scans: DepthScans | Beams,
     config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
@@ -146,7 +151,7 @@ def fit_deepmapping(
 
     Args:
         scans: planar scans (n, b, 2) in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
-            ScanSet or DepthScans (section 4.2).
+            ScanSet, a ScanSequence or its file, or DepthScans (section 4.2).
         config: settings; None: the fast preset of planar scans; `preset` has those of other sensors.
         key: key of the whole run.
         start: initial poses, as `mapping_data` takes them; None: cold start, of all poses at zero, or free poses at the
@@ -170,7 +175,7 @@ def fit_deepmapping(
 
 @runs_on_host("call deepmapping.solve there")
 def register_depth(
-    images: DepthScans | ArrayLike,
+    images: DepthScans | DepthSequence | ArrayLike | Path,
     config: DeepMappingConfig | None = None,
     *,
     key: jax.Array,
@@ -184,8 +189,8 @@ def register_depth(
     Initial poses and fit are compared by `projective_consistency`, without ground truth.
 
     Args:
-        images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), or DepthScans; metres, or any
-            unit where a start is given.
+        images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), DepthScans, or a
+            DepthSequence or its folder; metres, or any unit where a start is given.
         config: settings of the fit, and `motion` of the search; None: `preset("fast", "depth")`.
         key: key of the search and of the fit.
         start: (n, 4, 4) initial T_world_camera, or the result of `initialize_depth`, which is called for None.
@@ -198,6 +203,9 @@ def register_depth(
         ValueError: as `as_depth_scans`, or `start` has a wrong shape or is not finite.
     """
     config = config or preset("fast", "depth")
+    images = cast(DepthScans | DepthSequence | ArrayLike, read_path(images, "io.read_pose_folder"))
+    if isinstance(images, DepthSequence):
+        images = as_depth_scans(images.points, images.mask)
     scans = images if isinstance(images, DepthScans) else as_depth_scans(images)
     placed = start if isinstance(start, PlacedImages) else None
     if start is None:

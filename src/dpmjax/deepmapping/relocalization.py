@@ -32,7 +32,7 @@ from dpmjax.deepmapping.mapping import Fitted
 from dpmjax.deepmapping.problem import MapFrame
 from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
-from dpmjax.types import ScanSet
+from dpmjax.types import ScanSet, with_short_repr
 
 # Step of the coarsest grid of poses, along x and y in units of the fit, and in radians; each level halves it.
 _FIRST_STEP, _NUM_LEVELS = 0.08, 5
@@ -130,6 +130,7 @@ def _search_one(scan: ScanSet, proposals: Float[Array, "p 3"], fields: MapFields
     return poses[0]
 
 
+@with_short_repr
 class Relocalized(NamedTuple):
     """Poses of scans in the world of a fit.
 

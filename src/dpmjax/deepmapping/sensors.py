@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import as_beams
+from dpmjax.checks import Beams, as_beams
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import (
     Terms,
@@ -45,7 +45,7 @@ _PLANAR_MARGIN, _DEPTH_MARGIN = 1.15, 1.2
 _MAX_COORDINATE = 1e4
 
 
-def as_scan_set(scans: ScanSet | ArrayLike, *, min_scans: int = 2, may_be_blind: bool = False) -> ScanSet:
+def as_scan_set(scans: Beams, *, min_scans: int = 2, may_be_blind: bool = False) -> ScanSet:
     """Checks scans; beams with coordinates that are not finite, or both zero, are invalid.
 
     Args:

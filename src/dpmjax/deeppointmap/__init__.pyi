@@ -27,6 +27,7 @@ from .encoding import encode as encode
 from .encoding import encode_scans as encode_scans
 from .encoding import pooled_vector as pooled_vector
 from .encoding import pyramid_of_cloud as pyramid_of_cloud
+from .encoding import pyramid_of_scan as pyramid_of_scan
 from .evaluation_pairs import DISTANCE_BANDS_M as DISTANCE_BANDS_M
 from .evaluation_pairs import PlaceSplit as PlaceSplit
 from .evaluation_pairs import ScanPair as ScanPair
@@ -73,6 +74,7 @@ from .scan_registration import register_pairs as register_pairs
 from .surface_registration import register_surfaces as register_surfaces
 from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import OverlapConfig as OverlapConfig
+from .training.curriculum import SamplingConfig as SamplingConfig
 from .training.curriculum import TrainingConfig as TrainingConfig
 from .training.curriculum import training_preset as training_preset
 from .training.curriculum import without as without
@@ -107,7 +109,6 @@ from .training.preparation import prepared_path as prepared_path
 from .training.preparation import stored_bytes as stored_bytes
 from .training.preparation import why_useless as why_useless
 from .training.processes import join_processes as join_processes
-from .training.sampling import SamplingConfig as SamplingConfig
 from .training.sampling import ScanTable as ScanTable
 from .training.scan_store import SampleMaker as SampleMaker
 from .training.scan_store import ScanStore as ScanStore

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.geometry.shells import without_shell
 from dpmjax.kept_programs import kept_jit
+from dpmjax.reading import read_path
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
@@ -34,7 +36,7 @@ def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: i
 
     Args:
         model: its configuration includes the preprocessing.
-        points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        points: (n, 3), metres, in the frame of the lidar, or their file; points that are not finite are dropped.
         scale: factor by which the points are enlarged first, for rooms. All scans that are compared
             or merged must share it; positions, and poses for `merge_clouds`, are then in metres times this factor.
         num_elements: number of surface elements, from that of the descriptors to that of the points of the first stage
@@ -52,7 +54,7 @@ def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: i
 
 @runs_on_host("call encode_pyramid on geometry.build_pyramid there")
 def encode_scans(
-    model: Model, scans: Sequence[RawScan], *, scale: float = 1.0, num_elements: int | None = None
+    model: Model, scans: Sequence[RawScan] | Path, *, scale: float = 1.0, num_elements: int | None = None
 ) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
@@ -60,7 +62,7 @@ def encode_scans(
 
     Args:
         model: encoder and configuration.
-        scans: points in metres, each in the frame of its lidar.
+        scans: points in metres, each in the frame of its lidar, or their files; or a folder of scans.
         scale: see `encode`.
         num_elements: see `encode`.
 
@@ -68,8 +70,9 @@ def encode_scans(
         Stacked clouds, as `merge_clouds` takes them: positions (s, n, 3), features (s, m, c), mask (s, n).
     """
     require_type("model", model, Model, "load_model")
-    require_some("scans", scans)
-    pyramids = (pyramid_of_scan(points, model.config, scale=scale) for points in scans)
+    drive: Sequence[RawScan] = read_path(scans, "io.open_lidar_sequence")
+    require_some("scans", drive)
+    pyramids = (pyramid_of_scan(points, model.config, scale=scale) for points in drive)
     return jax.tree.map(jnp.asarray, encode_pyramids(model, pyramids, num_elements=num_elements))
 
 
@@ -95,7 +98,9 @@ def encode_pyramids(
 
 def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
     """Returns the points of a scan that its mask allows, as an array of NumPy."""
-    return np.asarray(points.points)[np.asarray(points.mask)] if isinstance(points, PointCloud) else np.asarray(points)
+    if isinstance(points, PointCloud):
+        return np.asarray(points.points)[np.asarray(points.mask)]
+    return as_host_points("points", points)
 
 
 def pyramid_of_scan(points: RawScan, config: ModelConfig, *, scale: float = 1.0) -> PointPyramid:

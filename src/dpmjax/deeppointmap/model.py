@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import flax.struct
 import jax
@@ -38,6 +38,10 @@ class Model:
 
     params: dict[str, Any]
     config: ModelConfig = flax.struct.field(pytree_node=False)
+
+    if TYPE_CHECKING:  # flax makes it, and has no type for it
+
+        def replace(self, **updates: Any) -> Model: ...  # noqa: D102
 
     def __repr__(self) -> str:
         num = sum(np.size(leaf) for leaf in jax.tree.leaves(self.params))

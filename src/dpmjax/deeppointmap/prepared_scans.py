@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Int16, UInt8
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int8, Int16, UInt8
 from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan, valid_points
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.verification import NUM_THREADS
+from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan, measure_scan
 from dpmjax.scans.surfaces import RangeImage, surface_of_elements
 from dpmjax.types import DescriptorCloud, RawScan, SurfaceElements
@@ -42,7 +43,7 @@ def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Scan:
 
     Args:
         model: encoder and configuration.
-        points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
+        points: (n, 3), metres, in the frame of the lidar, or their file; points that are not finite are dropped.
         scale: see `encode`.
 
     Returns:
@@ -67,7 +68,8 @@ def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0)
     # Threads run NumPy only: compiled programs need threads of JAX, and several may wait for each other.
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         clouds, measured = [], []
-        for points in scans:
+        for scan in scans:
+            points = cast(RawScan, read_path(scan, "io.read_lidar_file"))
             pyramid = pyramid_of_scan(points, model.config, scale=scale)
             measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification.surface))
             clouds.append(encode_pyramid(model, pyramid))

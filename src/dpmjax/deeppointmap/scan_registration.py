@@ -64,7 +64,7 @@ def register(
 
     Args:
         model: encoder and decoder.
-        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
+        source: a raw scan (n, 3) in metres or its file, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; a scan can be registered with a map.
         config: choice of pairs and inliers; None takes that of the model.
         refine: True ends with a fine point-to-plane alignment, of two scans or else of the surface elements of both

@@ -15,12 +15,13 @@ from dpmjax.checks import as_mask, as_points, require_count, require_positive
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.planes import fit_planes
 from dpmjax.geometry.traced import is_usable
-from dpmjax.types import AnyArray, Neighbours, PointPyramid, SurfaceElements
+from dpmjax.types import AnyArray, Neighbours, PointPyramid, SurfaceElements, with_short_repr
 
 # Neighbouring pixels whose depths differ by more than this share lie on different surfaces.
 _SAME_SURFACE = 0.3
 
 
+@with_short_repr
 class Normals(NamedTuple):
     """Normals of a cloud.
 

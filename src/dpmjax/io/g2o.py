@@ -206,19 +206,22 @@ def _information(lines: list[_Line], size: int, nearest_psd: bool) -> FloatArray
     return matrices
 
 
-def write_g2o(path: str | Path, graph: PoseGraph) -> Path:
+def write_g2o(path: str | Path, graph: PoseGraph | None) -> Path:
     """Writes a pose graph with all digits, so that reading it gives the same graph.
 
     Args:
         path: file to write, atomically; missing folders are made.
-        graph: the graph.
+        graph: the graph; the None of a run without keyframes is refused.
 
     Returns:
         The path.
 
     Raises:
+        ValueError: there is no graph.
         OSError: the folder cannot be written.
     """
+    if graph is None:
+        raise ValueError("graph: expected a pose graph, got None: the run has no keyframe")
     kind = "SE2" if graph.poses.ndim == 2 else "SE3:QUAT"
     rows, columns = np.triu_indices(graph.tangent_size)
     edges = graph.edges

@@ -19,9 +19,10 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import best_motion
 from dpmjax.geometry.rigid import matmul, namespace_of, safe_sqrt
 from dpmjax.geometry.traced import is_usable
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, with_short_repr
 
 
+@with_short_repr
 class RelativePoseError(NamedTuple):
     """Errors of the motion between pairs of poses.
 
@@ -36,6 +37,7 @@ class RelativePoseError(NamedTuple):
     num_pairs: int
 
 
+@with_short_repr
 class RegistrationRecall(NamedTuple):
     """Errors of registrations of pairs of scans.
 

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import runs_on_host
+from dpmjax.types import with_short_repr
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -23,6 +24,7 @@ TANGENT_SIZE = {(3,): 3, (4, 4): 6}
 _ROUNDING = 1e-5
 
 
+@with_short_repr
 class Edges(NamedTuple):
     """Measured relative poses (e edges).
 
@@ -80,6 +82,7 @@ def label_parts(size: int, source: NDArray[np.integer], target: NDArray[np.integ
     return np.asarray(sp.csgraph.connected_components(joined, directed=False)[1], np.int64)
 
 
+@with_short_repr
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses (n nodes) and the relative poses measured between them. `PoseGraph.create` makes and checks one.

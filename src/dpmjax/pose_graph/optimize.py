@@ -23,6 +23,7 @@ from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
 from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph
 from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
+from dpmjax.types import with_short_repr
 
 LOGGER = logging.getLogger(__name__)
 
@@ -64,6 +65,7 @@ class PoseGraphConfig:
 ROBUST = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-8, is_chordal_start=False)
 
 
+@with_short_repr
 class OptimizedPoseGraph(NamedTuple):
     """An optimised graph.
 

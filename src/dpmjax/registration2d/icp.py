@@ -18,7 +18,7 @@ from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.geometry.traced import is_usable, with_axes_of
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, with_short_repr
 
 _NORMAL_NEIGHBOURS = 6
 """Points that a normal is fitted to, as in the published DeepMapping program."""
@@ -31,6 +31,7 @@ _OPEN_SHARE = 1e-5
 """Share of the largest singular value of the balance's derivative below which a direction counts as unconstrained."""
 
 
+@with_short_repr
 class IcpResult(NamedTuple):
     """Result of `icp`.
 

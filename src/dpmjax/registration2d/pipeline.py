@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dpmjax.checks import as_key, require_one_of, require_positive, require_type, runs_on_host
+from dpmjax.checks import Beams, as_key, require_one_of, require_positive, require_type, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.engine import Fit, Progress, fit
 from dpmjax.deepmapping.mapping import Fitted, fit_deepmapping
@@ -29,7 +29,7 @@ from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, 
 from dpmjax.registration2d.recordings import Recording, choose_scans, interpolate, take_scans
 from dpmjax.registration2d.refinement import put_back_slid, refine
 from dpmjax.registration2d.steps import StepPrior
-from dpmjax.types import ScanSet
+from dpmjax.types import ScanSet, with_short_repr
 
 StartName = Literal["auto", "odometry", "icp-plane", "icp-point", "global", "zero"]
 """Name of the initial poses; "auto": see `register_scans`."""
@@ -134,6 +134,7 @@ class Candidate(NamedTuple):
     score: Score
 
 
+@with_short_repr
 class RegisteredScans(NamedTuple):
     """Result of `register_scans`.
 
@@ -164,7 +165,7 @@ class RegisteredScans(NamedTuple):
 @jax.enable_x64(False)  # float32, also where JAX has 64 bits
 @runs_on_host("call icp, or deepmapping.solve, there")
 def register_scans(
-    scans: ScanSet | ArrayLike,
+    scans: Beams,
     config: RegistrationConfig | None = None,
     *,
     key: jax.Array,
@@ -179,7 +180,8 @@ def register_scans(
 
     Args:
         scans: (n, b, 2) beam end points in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
-            ScanSet. An ordered scan without any beam is put between its neighbours.
+            ScanSet, a ScanSequence or its file; their odometry is an argument of its own. An ordered scan without any
+            beam is put between its neighbours.
         config: settings.
         key: of the fit.
         start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The name "odometry" is the given

@@ -24,7 +24,7 @@ from dpmjax.registration2d.quality import choose_trajectory, map_code_length
 from dpmjax.registration2d.range_profiles import pair_scores
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.steps import StepPrior, matched_steps, settle_steps, slid_steps
-from dpmjax.types import ScanSet
+from dpmjax.types import ScanSet, with_short_repr
 
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
 # as a share of the beams, above the second one.
@@ -52,6 +52,7 @@ class RefinementConfig:
     loops: LoopConfig | None = field(default_factory=LoopConfig)
 
 
+@with_short_repr
 class Refined(NamedTuple):
     """Result of `refine`.
 

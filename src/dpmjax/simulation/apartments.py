@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dpmjax.checks import require_fields
+from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray, homogeneous
 from dpmjax.types import AnyArray
 
@@ -241,6 +241,7 @@ class DepthWalkConfig:
 HARD_WALK = DepthWalkConfig(depth_noise_m=0.0015, dropout_share=0.1, steps="both", min_spread_m=0.45)
 
 
+@runs_on_host("call it outside, and pass its arrays in")
 def simulate_depth_sequence(
     apartment: int | Apartment = 0, num_views: int = 16, *, seed: int = 0, config: DepthWalkConfig | None = None
 ) -> DepthSequence:

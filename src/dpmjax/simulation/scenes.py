@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require_one_of, require_positive_fields
-from dpmjax.sequences import LidarSequence
+from dpmjax.checks import require_one_of, require_positive_fields, runs_on_host
+from dpmjax.sequences import SimulatedDrive
 from dpmjax.simulation.building import KINDS as INDOOR_KINDS
 from dpmjax.simulation.building import Building, BuildingConfig, make_building
 from dpmjax.simulation.motion import DriveConfig, WalkConfig, drive, turn_motions, walk
@@ -158,7 +158,8 @@ def _choice(rng: np.random.Generator, entries: tuple[tuple[_Entry, float], ...])
     return entries[rng.choice(len(entries), p=weights / weights.sum())][0]
 
 
-def simulate_scene(scene: Scene, *, trajectory: ArrayLike | None = None) -> LidarSequence:
+@runs_on_host("call it outside, and pass its arrays in")
+def simulate_scene(scene: Scene, *, trajectory: ArrayLike | None = None) -> SimulatedDrive:
     """Builds a scene; a scan is simulated when it is read.
 
     Args:
@@ -188,10 +189,10 @@ def simulate_scene(scene: Scene, *, trajectory: ArrayLike | None = None) -> Lida
     poses = way.T_world_lidar.copy()
     poses[:, :3, 3] *= scene.scale
     sources = tuple(f"{name}, scan {index}" for index in range(len(poses)))
-    return LidarSequence(name, sources, read_scan, poses, way.times)
+    return SimulatedDrive(name, sources, read_scan, poses, way.times)
 
 
-def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[LidarSequence]:
+def simulate_scenes(seeds: Sequence[int], mixture: SceneMixture = SceneMixture()) -> list[SimulatedDrive]:
     """Draws and builds scenes.
 
     Args:
@@ -211,7 +212,7 @@ def simulate_drive(
     kind: str | None = None,
     sensor: LidarSensor | None = None,
     mixture: SceneMixture = SceneMixture(),
-) -> LidarSequence:
+) -> SimulatedDrive:
     """Draws and builds one scene of the mixture, of a given kind of place or with a given lidar.
 
     Args:

@@ -11,8 +11,9 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import runs_on_host
 from dpmjax.geometry import se2
-from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, World, largest_region
+from dpmjax.sequences import BoolArray, FloatArray, SimulatedScans, World, largest_region
 from dpmjax.simulation.world2d import beam_angles, cast_scans, make_world
 
 # Section 4.1: headings of consecutive scans differ by a uniform angle within plus or minus this, and translations have
@@ -273,6 +274,7 @@ def _measured_points(ranges: FloatArray, range_noise_px: float, rng: np.random.G
     return np.asarray(points, np.float32)
 
 
+@runs_on_host("call it outside, and pass its arrays in")
 def simulate_sequence(
     world: int | str | World = 0,
     num_scans: int = 256,
@@ -281,7 +283,7 @@ def simulate_sequence(
     range_noise_px: float = 0.0,
     seed: int = 0,
     with_odometry: bool = False,
-) -> ScanSequence:
+) -> SimulatedScans:
     """Simulates a drive through a planar world (DeepMapping section 4.1).
 
     Walk, noise, odometry and people have separate random streams: a seed gives the same walk with and without noise.
@@ -312,4 +314,4 @@ def simulate_sequence(
     ranges = stop_at_people(ranges, poses, beam_angles(num_beams), people)
     points, mask = _measured_points(ranges, range_noise_px, noise_rng), np.ones(ranges.shape, bool)
     odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
-    return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
+    return SimulatedScans(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)

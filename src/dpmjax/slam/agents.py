@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Int
 from dpmjax.checks import require_type, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
+from dpmjax.reading import read_path
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.interfaces import AnyScan, SlamMethods
 from dpmjax.slam.keyframe_map import (
@@ -32,7 +34,7 @@ from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods, methods_for
 from dpmjax.slam.procedure import procedure_of
 from dpmjax.slam.system import SlamResult, place_scans, run_slam
-from dpmjax.types import Pose, Poses
+from dpmjax.types import Pose, Poses, with_short_repr
 
 # Three float32 numbers.
 BYTES_A_POINT = 12
@@ -45,6 +47,7 @@ def _ignore(_: int, __: int) -> None:
     """Shows no progress."""
 
 
+@with_short_repr
 class JoinedMaps(NamedTuple):
     """Several maps in one record; those that meet have one frame.
 
@@ -78,6 +81,7 @@ class SentBytes(NamedTuple):
     scan_bytes: int
 
 
+@with_short_repr
 class AgentsResult(NamedTuple):
     """Trajectories and maps of several agents.
 
@@ -98,6 +102,7 @@ class AgentsResult(NamedTuple):
     traffic: tuple[SentBytes, ...]
 
 
+@with_short_repr
 class MergedMaps(NamedTuple):
     """Merged maps, and the maps that have met.
 
@@ -127,7 +132,7 @@ class MergedMaps(NamedTuple):
 
 @runs_on_host("call it outside, and pass its result in")
 def run_agents(
-    model: Model | SlamMethods, sequences: Sequence[Iterable[AnyScan]], config: SlamConfig | None = None
+    model: Model | SlamMethods, sequences: Sequence[Iterable[AnyScan] | Path], config: SlamConfig | None = None
 ) -> AgentsResult:
     """Maps with several agents: each runs alone, and loops between their maps join them.
 
@@ -175,12 +180,14 @@ def join_agents(
 
 
 @runs_on_host("call it outside, and pass its result in")
-def merge_maps(model: Model | SlamMethods, *maps: KeyframeMap, on_keyframe: OnKeyframe = _ignore) -> MergedMaps:
+def merge_maps(
+    model: Model | SlamMethods, *maps: KeyframeMap | str | Path, on_keyframe: OnKeyframe = _ignore
+) -> MergedMaps:
     """Joins maps of different days or of different robots where they show the same places.
 
     Args:
         model: the model that made the maps, which takes the settings of the first one; or methods of your own.
-        *maps: two or more. The frame of the first map of each component is kept.
+        *maps: two or more, or their files. The frame of the first map of each component is kept.
         on_keyframe: called while keyframes are compared, for progress.
 
     Returns:
@@ -191,12 +198,13 @@ def merge_maps(model: Model | SlamMethods, *maps: KeyframeMap, on_keyframe: OnKe
     """
     if len(maps) < 2:
         raise ValueError(f"maps: expected at least two, got {len(maps)}")
-    for slam_map in maps:
+    loaded: list[KeyframeMap] = [read_path(slam_map, "saved_maps.load_map") for slam_map in maps]
+    for slam_map in loaded:
         require_type("maps", slam_map, KeyframeMap, "load_map")
-    joined = join_maps(methods_for(model, maps[0]), maps, on_keyframe=on_keyframe)
+    joined = join_maps(methods_for(model, loaded[0]), loaded, on_keyframe=on_keyframe)
     numbers = joined.component_of_map
     merged = [
-        take_component(joined, component) if numbers.count(component) > 1 else maps[numbers.index(component)]
+        take_component(joined, component) if numbers.count(component) > 1 else loaded[numbers.index(component)]
         for component in range(max(numbers) + 1)
     ]
     return MergedMaps(tuple(merged), joined)

@@ -7,6 +7,7 @@ recognises places.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -231,7 +232,8 @@ class TimedScan(NamedTuple):
     offsets: Float[AnyArray, " n"]
 
 
-AnyScan = Float[AnyArray, "_n 3"] | TimedScan
+# A raw scan or its file, or a scan with times.
+AnyScan = Float[AnyArray, "_n 3"] | str | Path | TimedScan
 
 
 class PreparedInput(NamedTuple):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -17,12 +18,13 @@ from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
+from dpmjax.reading import read_path
 from dpmjax.slam.interfaces import Match, SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, Submap, measured_parts, submap_around, with_origin
 from dpmjax.slam.loop_closure import most_similar
 from dpmjax.slam.model_methods import methods_for
 from dpmjax.slam.system import corrected_points
-from dpmjax.types import AnyArray, Pose
+from dpmjax.types import AnyArray, Pose, with_short_repr
 
 # Largest sum of probabilities of a second place, as a share of the sum of the best place.
 MAX_RIVAL_SHARE = 0.5
@@ -90,6 +92,7 @@ class KeyframeMatch(NamedTuple):
     do_scans_agree: bool
 
 
+@with_short_repr
 class Localization(NamedTuple):
     """Result of `localize`.
 
@@ -121,16 +124,16 @@ class Localization(NamedTuple):
 @runs_on_host("call encode_pyramid, correlate and icp there")
 def localize(
     model: Model | SlamMethods,
-    slam_map: KeyframeMap,
-    scan: Float[AnyArray, "n 3"],
+    slam_map: KeyframeMap | str | Path,
+    scan: Float[AnyArray, "n 3"] | str | Path,
     config: LocalizationConfig | None = None,
 ) -> Localization:
     """Finds a scan in a map without a first guess.
 
     Args:
         model: the model that made the map; or methods of your own.
-        slam_map: map from `load_map` or of a run.
-        scan: points in metres, in the frame of the lidar; points that are not finite are dropped.
+        slam_map: map from `load_map` or of a run, or its file.
+        scan: points in metres, in the frame of the lidar, or their file; points that are not finite are dropped.
         config: number of registrations and limits of acceptance; None takes the defaults.
 
     Returns:
@@ -139,14 +142,14 @@ def localize(
     Raises:
         ValueError: if the shape is not (n, 3), the map is empty, or it was made with other weights.
     """
-    (found,) = localize_each(model, slam_map, [scan], config)
+    (found,) = localize_each(model, read_path(slam_map, "saved_maps.load_map"), [scan], config)
     return found
 
 
 def localize_each(
     model: Model | SlamMethods,
     slam_map: KeyframeMap,
-    scans: Iterable[Float[AnyArray, "_n 3"]],
+    scans: Iterable[Float[AnyArray, "_n 3"] | str | Path],
     config: LocalizationConfig | None = None,
 ) -> Iterator[Localization]:
     """Finds scans in a map, each by itself.
@@ -182,7 +185,7 @@ class _Search(NamedTuple):
     config: LocalizationConfig
     parts: Int[np.ndarray, " k"]
 
-    def localized(self, scan: Float[AnyArray, "_n 3"]) -> Localization:
+    def localized(self, scan: Float[AnyArray, "_n 3"] | str | Path) -> Localization:
         """Registers the scan with keyframes until the place is clear, or none is left."""
         thinned = self.methods.geometry.thin(corrected_points(scan, None))
         if thinned is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from dpmjax.checks import as_host_points, require_shape, require_type, runs_on_h
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.reading import read_path
 from dpmjax.scans.corrections import deskew
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
@@ -26,12 +28,13 @@ from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods
 from dpmjax.slam.procedure import procedure_of
-from dpmjax.types import Pose, Poses
+from dpmjax.types import Pose, Poses, with_short_repr
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+@with_short_repr
 class SlamState(NamedTuple):
     """State of SLAM between two scans.
 
@@ -171,10 +174,10 @@ def place_scans(T_world_keyframe: Poses, reports: Sequence[ScanReport]) -> Poses
 @runs_on_host("call encode_pyramid, correlate and icp there")
 def run_slam(
     model: Model | SlamMethods,
-    scans: Iterable[AnyScan],
+    scans: Iterable[AnyScan] | str | Path,
     config: SlamConfig | None = None,
     *,
-    slam_map: KeyframeMap | None = None,
+    slam_map: KeyframeMap | str | Path | None = None,
 ) -> SlamResult:
     """Makes one map of a drive by odometry, loop closure and optimisation of the pose graph (DeepPointMap section 4).
 
@@ -182,10 +185,10 @@ def run_slam(
 
     Args:
         model: a trained model; or methods of your own.
-        scans: points in metres, each in the frame of the lidar, in the order of time; any iterable. `TimedScan`s are
-            deskewed.
+        scans: points in metres, each in the frame of the lidar, in the order of time; any iterable of arrays or
+            files, or the folder or bag of a drive (`io.open_lidar_sequence`). `TimedScan`s are deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
-        slam_map: map from `load_map`, to be extended; None begins an empty one.
+        slam_map: map from `load_map`, or its file, to be extended; None begins an empty one.
 
     Returns:
         `T_world_scan` of every scan, keyframes, loops, graph, map and reports.
@@ -194,8 +197,10 @@ def run_slam(
         ValueError: if a scan is not (n, 3), if an argument is of another type, if methods come with a configuration, or
             if the map was made with other weights.
     """
-    methods, state, reports = as_methods(model, config), init_slam(slam_map), []
-    for scan in in_advance(partial(prepare_ahead, methods), scans):
+    methods, reports = as_methods(model, config), []
+    state = init_slam(read_path(slam_map, "saved_maps.load_map"))
+    drive: Iterable[AnyScan] = read_path(scans, "io.open_lidar_sequence")
+    for scan in in_advance(partial(prepare_ahead, methods), drive):
         state, report = step_slam(methods, state, scan)
         reports.append(report)
     return finish_slam(state, reports, methods.config)
@@ -215,6 +220,7 @@ def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = Non
     Raises:
         ValueError: if the shape is not (n, 3).
     """
+    scan = scan if isinstance(scan, TimedScan) else as_host_points("scan", scan)
     thinned, compact = methods.geometry.thin(corrected_points(scan, T_turn)), None
     if thinned is not None and methods.config.encodes_each_scan:
         compact = methods.matcher.encode(thinned)

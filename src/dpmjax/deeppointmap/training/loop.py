@@ -37,7 +37,7 @@ from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_f
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import AnyArray
+from dpmjax.types import AnyArray, with_short_repr
 
 
 class TrainingLostError(ArithmeticError):
@@ -124,6 +124,7 @@ class TrainingHooks:
         require_fields(self, "evaluate_every", low=1)
 
 
+@with_short_repr
 class Trained(NamedTuple):
     """Result of training.
 

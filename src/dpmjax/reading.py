@@ -1,0 +1,33 @@
+"""Files and folders in place of arrays: a pipeline reads the path that it gets, and no algorithm imports a reader."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Literal, TypeVar, cast
+
+Given = TypeVar("Given")
+Reader = Literal[
+    "io.read_lidar_file", "io.open_lidar_sequence", "io.read_sequence", "io.read_pose_folder", "saved_maps.load_map"
+]
+
+
+def read_path(value: Given | str | Path, reader: Reader) -> Given:
+    """Returns what a reader makes of a path; anything else is returned as it is.
+
+    The reader is imported by name when a path is given, because algorithms do not depend on files.
+
+    Args:
+        value: the argument of a pipeline.
+        reader: package and name of the reader.
+
+    Returns:
+        The argument that the pipeline works with.
+
+    Raises:
+        InputError: one line with the file, the finding and the advice.
+    """
+    if not isinstance(value, str | Path):
+        return value
+    room, _, name = reader.partition(".")
+    return cast(Given, getattr(importlib.import_module(f"dpmjax.{room}"), name)(value))
