@@ -263,7 +263,7 @@ class ScanReader:
         return slam.TimedScan(points, offsets)
 
     def _interval_s(self, index: int) -> float | None:
-        """Returns the time of the motion that predicts a scan, None where it is unknown; the first one predicts both."""
+        """Returns the time of the motion by which a scan is deskewed; None where it is unknown."""
         times, last = self.sequence.times, max(index - 1, 1)
         if times is None or len(times) < 2:
             return None
