@@ -40,7 +40,7 @@ from .deeppointmap.model_config import ModelConfig as ModelConfig
 from .deeppointmap.model_config import model_preset as model_preset
 from .deeppointmap.overlap_prediction import overlap as overlap
 from .deeppointmap.overlap_prediction import overlap_pairs as overlap_pairs
-from .deeppointmap.scan_registration import register_pairs as register_pairs
+from .deeppointmap.registration import register_pairs as register_pairs
 from .deeppointmap.training.curriculum import TrainingConfig as TrainingConfig
 from .deeppointmap.training.curriculum import training_preset as training_preset
 from .deeppointmap.training.loop import Trained as Trained

@@ -220,6 +220,8 @@ class Registration:
             target frame; in a corridor its axis. None where only descriptors were registered.
         weak_sigma_m: standard deviation of the translation along it, metres, by the planes that meet and how far parts
             of the scans disagree. It does not cover other places that look alike. None in the same case.
+        relative_size: size of the source over that of the target by their surfaces, if it is not 1: one of the two
+            has other units or a wrong calibration. None in the same case.
     """
 
     T_target_source: Float[Array, "4 4"]
@@ -235,6 +237,7 @@ class Registration:
     verification: Verification | None = None
     weak_direction: Float[Array, "3"] | None = None
     weak_sigma_m: Float[Array, ""] | None = None
+    relative_size: Float[Array, ""] | None = None
 
 
 @flax.struct.dataclass

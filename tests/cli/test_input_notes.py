@@ -63,17 +63,18 @@ def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found:
 
 
 @pytest.mark.parametrize(
-    ("statuses", "num_unknown_along", "status"),
+    ("statuses", "status"),
     [
-        ({"first": 1, "tracked": 9}, 0, "done"),
-        ({"first": 1, "tracked": 9}, 4, "done"),
-        ({"first": 1, "tracked": 9}, 6, "uncertain"),
-        ({"first": 1, "tracked": 1, "predicted": 9}, 0, "uncertain"),
-        ({"empty": 3}, 0, "failed"),
+        ({"first": 1, "tracked": 9}, "done"),
+        ({"first": 1, "tracked": 8, "coasting": 1}, "done"),
+        ({"first": 1, "tracked": 66, "coasting": 53}, "uncertain"),
+        ({"first": 1, "tracked": 7, "predicted": 2}, "uncertain"),
+        ({"first": 1, "network": 108, "predicted": 12}, "done"),
+        ({"empty": 3}, "failed"),
     ],
 )
-def test_the_status_follows_from_the_scans(statuses: dict[str, int], num_unknown_along: int, status: str) -> None:
-    numbers = {"scan_statuses": statuses, "num_unknown_along": num_unknown_along}
+def test_the_status_follows_from_the_scans(statuses: dict[str, int], status: str) -> None:
+    numbers = {"scan_statuses": statuses}
     assert status_of({**numbers, "num_parts": 1}) == status
     assert status_of({**numbers, "num_parts": 2}) == ("uncertain" if status == "done" else status)
 

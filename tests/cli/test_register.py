@@ -113,7 +113,7 @@ def test_a_folder_is_no_scan(files, tmp_path, capsys) -> None:
     [(9, 0.95, True, "done"), (9, 0.5, True, "uncertain"), (9, 0.5, False, "done"), (0, 0.95, True, "failed")],
 )
 def test_status_and_verdict_follow_from_the_confidence(num_inliers, confidence, is_calibrated, status) -> None:
-    found = Mock(spec=Registration, verification=None, num_inliers=num_inliers, confidence=confidence)
+    found = Mock(Registration, verification=None, num_inliers=num_inliers, confidence=confidence, relative_size=None)
     numbers = verdict_numbers(found, is_calibrated)
     assert numbers["status"] == status
     assert ("NOT SURE" in numbers["verdict"]) == (status == "uncertain")

@@ -15,6 +15,7 @@ from dpmjax.deeppointmap.confidence import (
     CORRIDOR_CONFIDENCE,
     ELEMENT_FEATURES,
     SCAN_FEATURES,
+    WEAK_FEATURES,
     Calibration,
     LogisticModel,
     MatchEvidence,
@@ -106,6 +107,21 @@ def test_elements_tell_the_motion_from_shifts_but_are_never_sure(with_pillars) -
     few = evidence_of(right, num_elements=256)
     assert few.of_elements is None
     assert calibrated_probability(calibration, few) == pytest.approx(CORRIDOR_CONFIDENCE / 2)
+
+
+def test_a_lead_that_other_niches_have_too_is_not_sure() -> None:
+    sure = LogisticModel(WEAK_FEATURES, (0.0, 0.0), 20.0)
+    calibration = Calibration(
+        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, 0.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 0.0), sure
+    )
+    for lead, expected in ((39.0, CORRIDOR_CONFIDENCE), (41.0, 1.0)):
+        scans = Verification(0.9, 0.6, 0.0, 5.0, num_slid=146, facing_gap=lead)
+        one = np.ones(1)
+        hypotheses = Registration(
+            np.eye(4)[None], one, one, one, one, one, *(np.zeros((1, 0), dtype) for dtype in (int, int, float, bool))
+        )
+        found = gather_evidence(hypotheses, 0, scans)
+        assert calibrated_probability(calibration, found) == pytest.approx(expected)
 
 
 def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None:

@@ -10,7 +10,9 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap import VerificationConfig, prepare_scan
+from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, LogisticModel
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
+from dpmjax.deeppointmap.scan_registration import register_each
 from dpmjax.geometry import PyramidConfig, PyramidStage
 from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.scans import ViewCorrelationConfig
@@ -144,6 +146,21 @@ def test_a_batch_with_an_empty_scan_equals_single_calls(model, scans) -> None:
         assert together.confidence[row] == one.confidence
         assert together.weak_sigma_m[row] == one.weak_sigma_m
     np.testing.assert_array_equal(np.asarray(together.confidence)[1:], 0)
+
+
+@pytest.mark.parametrize("bias", [-1.0, 9.0])
+def test_exchanged_scans_have_the_inverse_motion_as_probable(model, scans, bias: float) -> None:
+    # The motion of the more probable way is taken, or that of the first one, if it is sure.
+    of_scans = LogisticModel(SCAN_FEATURES, (0.3, *(0.0,) * 8), bias)
+    calibration = Calibration(LogisticModel(CLOUD_FEATURES, (0.1, 0.0, 0.0, 0.0), bias), of_scans)
+    calibrated = replace(model, config=replace(model.config, calibration=calibration))
+    for pair in (tuple(scans[:2]), tuple(dpmjax.encode(model, scan) for scan in scans[:2])):
+        one, other = (dpmjax.register(calibrated, *ends) for ends in (pair, pair[::-1]))
+        assert one.confidence == other.confidence
+        np.testing.assert_allclose(one.T_target_source @ other.T_target_source, np.eye(4), atol=1e-4)
+        np.testing.assert_array_equal(one.source_indices, other.target_indices)
+        ways = [float(found.confidence) for found in register_each(calibrated, [pair, pair[::-1]])]
+        assert float(one.confidence) == pytest.approx(max(ways) if bias < 0 else 1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(

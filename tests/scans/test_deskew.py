@@ -60,7 +60,7 @@ def test_times_are_understood_in_any_unit_from_any_start(unit: float, start: flo
     np.testing.assert_allclose(offsets_by_times(times), [-0.5, -0.25, 0.0, 0.5], atol=1e-6)
 
 
-@pytest.mark.parametrize("times", [[], [3.0, 3.0], [0.0, 7.0], [0.0, np.nan, 0.1]])
+@pytest.mark.parametrize("times", [[], [3.0, 3.0], [0.0, 7.0], [0.0, np.nan, 0.1], 500 * [1.7e9, 1.7e9 + 128]])
 def test_what_are_no_times_of_a_turn_is_not_used(times: list[float]) -> None:
     assert offsets_by_times(np.array(times), 0.1) is None
 

@@ -202,12 +202,21 @@ class CorridorGeometry(TruthGeometry):
         return found._replace(T_map_scan=found.T_map_scan @ pose(0.3, 0, 0), information=information)
 
 
+def test_behind_a_corridor_the_speed_is_the_mean_since_the_way_was_known() -> None:
+    # Twice as fast in the corridor, which ends before the next keyframe.
+    x = np.concatenate([0.1 * np.arange(20), 1.9 + 0.2 * np.arange(1, 10)])
+    truth = np.array([pose(place, 0.0, 0.0) for place in x])
+    result = run(truth, geometry=CorridorGeometry(truth, sigma_m=1e-4, sigma_rad=1e-5, corridor=range(20, 28)))
+    np.testing.assert_allclose(result.T_world_scan[-1][:3, 3], truth[-1][:3, 3], atol=0.01)
+    np.testing.assert_allclose(result.state.front_end.T_before_last[:3, 3], [0.2, 0, 0], atol=0.01)
+
+
 def test_in_a_corridor_without_an_end_the_last_speed_goes_on() -> None:
     truth = np.array([pose(float(x), 0.0, 0.0) for x in range(60)])
     corridor = range(20, 40)
     result = run(truth, geometry=CorridorGeometry(truth, sigma_m=1e-4, sigma_rad=1e-5, corridor=corridor))
     np.testing.assert_allclose(result.T_world_scan[:, :3, 3], truth[:, :3, 3], atol=0.1)
-    assert [report.scan for report in result.reports if report.is_unknown_along] == list(corridor)
+    assert [report.scan for report in result.reports if report.status == "coasting"] == list(corridor)
     assert all((report.weak_sigma_m is None) == (report.scan not in corridor) for report in result.reports)
     # A loop may stretch such edges.
     sigmas_m = [np.linalg.inv(edge.information)[0, 0] ** 0.5 for edge in result.map.edges]

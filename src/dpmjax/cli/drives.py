@@ -241,6 +241,7 @@ class ScanReader:
 
     def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
         self.sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
+        self._warned: list[int] = []  # the first scan without usable times
 
     def __call__(self, index: int) -> slam.TimedScan | np.ndarray:
         """Reads a scan."""
@@ -250,6 +251,10 @@ class ScanReader:
         interval_s = self._interval_s(index)
         times = None if self.sequence.read_times is None else self.sequence.read_times(index)
         offsets = None if times is None else scans.offsets_by_times(times, interval_s)
+        if times is not None and offsets is None and not self._warned:
+            self._warned.append(index)
+            text = "its times of points span no turn of a lidar: the azimuth of the points gives them, in such scans"
+            LOGGER.warning("%s: %s", self.sequence.sources[index], text)
         if offsets is None:  # by the time of a turn, as a share of the time between scans
             turn_share = 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
             offsets = scans.offsets_by_azimuth(points, turn_share)
@@ -258,9 +263,9 @@ class ScanReader:
         return slam.TimedScan(points, offsets)
 
     def _interval_s(self, index: int) -> float | None:
-        """Returns the time between the two scans before, whose motion predicts this one; None where it is unknown."""
-        times = self.sequence.times
-        if times is None or index < 2:
+        """Returns the time of the motion by which a scan is deskewed; None where it is unknown."""
+        times, last = self.sequence.times, max(index - 1, 1)
+        if times is None or len(times) < 2:
             return None
-        interval_s = float(times[index - 1] - times[index - 2])
+        interval_s = float(times[last] - times[last - 1])
         return interval_s if interval_s > 0 else None

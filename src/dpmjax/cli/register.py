@@ -86,6 +86,9 @@ def verdict_numbers(found: Registration, is_calibrated: bool) -> Numbers:
     else:
         verdict = f"right within 2 m and 5 degrees with probability {confidence:.2f}"
         verdict += "" if confidence >= SURE else ": NOT SURE, look at registration.png"
+    size = None if found.relative_size is None else float(found.relative_size)
+    if size not in (None, 1.0):
+        verdict += f"; the surfaces fit if the source is {size:.3f} times as large as the target: are both in metres?"
     if num_inliers == 0 and not shares.get("matched_share"):
         status = "failed"
         verdict = "no motion was found, the identity was written: give scans with walls and other things at 20 places"
@@ -95,6 +98,7 @@ def verdict_numbers(found: Registration, is_calibrated: bool) -> Numbers:
         "verdict": verdict,
         "confidence": confidence,
         "num_inliers": num_inliers,
+        "relative_size": size,
         **shares,
         "is_calibrated": is_calibrated,
     }

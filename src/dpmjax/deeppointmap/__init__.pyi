@@ -59,6 +59,8 @@ from .overlap_prediction import overlap as overlap
 from .overlap_prediction import overlap_pairs as overlap_pairs
 from .overlap_prediction import require_overlap as require_overlap
 from .prepared_scans import prepare_scan as prepare_scan
+from .registration import register as register
+from .registration import register_pairs as register_pairs
 from .scan_evaluation import NO_OVERLAP_M as NO_OVERLAP_M
 from .scan_evaluation import OverlapEvaluation as OverlapEvaluation
 from .scan_evaluation import StagedRegistration as StagedRegistration
@@ -68,9 +70,7 @@ from .scan_evaluation import overlap_candidates as overlap_candidates
 from .scan_evaluation import register_in_stages as register_in_stages
 from .scan_registration import distinct_motions as distinct_motions
 from .scan_registration import match_clouds as match_clouds
-from .scan_registration import register as register
 from .scan_registration import register_clouds as register_clouds
-from .scan_registration import register_pairs as register_pairs
 from .surface_registration import register_surfaces as register_surfaces
 from .training.curriculum import CurriculumStage as CurriculumStage
 from .training.curriculum import OverlapConfig as OverlapConfig

@@ -6,6 +6,7 @@ fitted by `python -m experiments.dpm_calibrate` and stored in the configuration 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -30,6 +31,9 @@ MAX_SCORE = 3.0
 # The two ends of a corridor may look alike in all elements of a cloud, so that no evidence is sure. The share has the
 # best likelihood on places left out of the fit (by a script, on the pairs of `experiments.dpm_calibrate`).
 CORRIDOR_CONFIDENCE = 0.88
+# Niches and pillars at equal steps repeat at other places, which lead by up to 39 elements (simulated tunnels, 56 to
+# 157 m off). Two scans a few metres apart have a lead of 38 to 146.
+CLEAR_FACING_GAP = 40.0
 # Fewer elements see and meet less of each other than those of the fit.
 MIN_NUM_ELEMENTS = 512
 # Few elements of a cloud face an axis; more of them say no more.
@@ -204,7 +208,9 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
         In [0, 1].
     """
     if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
-        return float(logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans))
+        probability = logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans)
+        is_clear = evidence.of_weak_scans[WEAK_FEATURES.index("facing_gap_root")] >= math.sqrt(CLEAR_FACING_GAP)
+        return float(probability if is_clear else np.minimum(probability, CORRIDOR_CONFIDENCE))
     if evidence.of_scans is not None:
         probability = logistic_probability(calibration.of_scans, evidence.of_scans)
     elif evidence.of_elements is not None and calibration.of_elements is not None:

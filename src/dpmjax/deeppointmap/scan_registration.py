@@ -1,4 +1,4 @@
-"""Registration of scans and maps: hypotheses from descriptors, verified by the scans."""
+"""Registration of scans and maps one way: hypotheses from descriptors, verified by the scans."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dpmjax.checks import require_pairs, require_type, runs_on_host
+from dpmjax.checks import require_type
 from dpmjax.deeppointmap.confidence import MatchEvidence, gather_evidence, with_confidence
 from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
@@ -28,6 +28,7 @@ from dpmjax.geometry.bearing import directions_of
 from dpmjax.kept_programs import kept_jit
 from dpmjax.scans.align import LEVELS, align_on_host
 from dpmjax.scans.lidar import Scan, measured_elements
+from dpmjax.scans.sizes import relative_size
 from dpmjax.scans.weak_directions import WeakDirection, weakest_direction
 from dpmjax.types import DescriptorCloud, Pose, Poses, Registration, Verification
 
@@ -37,58 +38,14 @@ NUM_ELEMENTS = 1024
 # Fewer descriptors fit each other by chance: any two sets of three points have a motion.
 MIN_DESCRIPTORS = 20
 
+# Largest confidence of a motion between scans of another size: 4 % of a street are half a metre.
+OTHER_SIZE_CONFIDENCE = np.float32(0.8)
+
 # Agreement of two scans of which one has too few descriptors.
 NOT_COMPARED = Verification(0.0, 0.0, 0.0, 0.0)
 
 # Fields of `Registration` that are 0 for a motion that no pairs of descriptors support.
 OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
-
-
-@runs_on_host("call correlate and weighted_svd there")
-def register(
-    model: Model,
-    source: ScanOrCloud,
-    target: ScanOrCloud,
-    *,
-    config: MatchConfig | None = None,
-    refine: bool | None = None,
-    scale: float = 1.0,
-) -> Registration:
-    """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
-
-    For two scans, the scans themselves verify the best distinct motions of their descriptors: points must meet surfaces
-    and must not lie in free space. If none of these motions is clearly right, motions under which the scans look alike
-    from above are tried too. In corridors, motions along the axis and half-turns are added. The motion under which the
-    scans agree best is taken. Descriptor clouds have no points: the best motion of the descriptors is taken, and
-    refined by their surface elements.
-
-    Args:
-        model: encoder and decoder.
-        source: a raw scan (n, 3) in metres or its file, a scan from `prepare_scan`, or a descriptor cloud.
-        target: the same; a scan can be registered with a map.
-        config: choice of pairs and inliers; None takes that of the model.
-        refine: True ends with a fine point-to-plane alignment, of two scans or else of the surface elements of both
-            clouds, if they have some. False returns the motion of the short alignment that verified it for two
-            scans, else that of the descriptors. None is True with a calibrated model; published weights give the
-            published motion.
-        scale: factor by which raw scans are enlarged for the encoder, or by which the scans of descriptors were.
-            Prepared scans have their own. The result is in metres.
-
-    Returns:
-        `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
-        (`model.config.calibration`) is the probability that the motion is right within 2 m and 5 degrees. Without
-        calibration it is the mean score of the pairs, which is no probability. Two clouds of single scans that are
-        refined, of 512 elements or more, have the agreement of their elements as evidence, too; in corridors, whose
-        ends may look alike in all elements, the confidence of clouds is at most 0.88. A motion that only the views from
-        above suggested has no inliers, and without calibration the confidence 0. Failure is data: without any pair and
-        without a view, or with fewer than 20 descriptors on either side, the motion is the identity and the confidence
-        0; with fewer than three distinct pairs `rmse` is infinite.
-
-    Raises:
-        ValueError: if the model is none, the points are no real numbers (n, 3), features have another width than the
-            model, the scale is not positive, or both have another scale.
-    """
-    return register_each(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
 
 
 def register_each(
@@ -99,7 +56,7 @@ def register_each(
     refine: bool | None = None,
     scale: float = 1.0,
 ) -> list[Registration]:
-    """Registers pairs as `register` does; threads verify one pair while JAX matches the next.
+    """Registers pairs from source to target alone; threads verify one pair while JAX matches the next.
 
     Args:
         model: encoder and decoder.
@@ -115,8 +72,8 @@ def register_each(
         ValueError: see `register`.
     """
     require_type("model", model, Model, "load_model")
-    refine = model.config.calibration is not None if refine is None else refine
-    num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
+    num_elements = num_elements_of(model, refine=refine)
+    refine = num_elements is not None
     prepared = prepare_each(model, pairs, scale, num_elements=num_elements)
     matching, verification = config or model.config.matching, model.config.verification
     with ThreadPoolExecutor(NUM_THREADS) as pool:
@@ -139,39 +96,18 @@ def register_each(
         return [_as_registration(model, hypotheses, motion.result()) for hypotheses, motion in started]
 
 
-@runs_on_host("call correlate and weighted_svd there")
-def register_pairs(
-    model: Model,
-    sources: Sequence[ScanOrCloud],
-    targets: Sequence[ScanOrCloud],
-    *,
-    config: MatchConfig | None = None,
-    refine: bool | None = None,
-    scale: float = 1.0,
-) -> Registration:
-    """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
+def num_elements_of(model: Model, *, refine: bool | None) -> int | None:
+    """Returns the number of surface elements of a scan that is registered with a cloud.
 
     Args:
-        model: encoder and decoder.
-        sources: raw scans, prepared scans or descriptor clouds; clouds must have one capacity.
-        targets: the same, one for each source.
-        config: see `register`.
+        model: encoder and calibration.
         refine: see `register`.
-        scale: see `register`; all raw scans share one.
 
     Returns:
-        All fields with a leading axis, in the order of the pairs.
-
-    Raises:
-        ValueError: if the lengths differ or are 0, if some pairs are scans and others have a descriptor cloud, or where
-            `register` raises one for a pair.
+        The number; None without refinement.
     """
-    require_pairs(sources, targets)
-    pairs = list(zip(sources, targets, strict=True))
-    if len({any(isinstance(scan, DescriptorCloud) for scan in pair) for pair in pairs}) > 1:
-        raise ValueError("sources, targets: expected scans in all pairs, or a descriptor cloud in each, got both")
-    found = register_each(model, pairs, config=config, refine=refine, scale=scale)
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
+    refine = model.config.calibration is not None if refine is None else refine
+    return min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
 
 
 def match_clouds(
@@ -228,6 +164,7 @@ class _RegisteredMotion(NamedTuple):
     evidence: Verification | None = None
     verification: Verification | None = None
     weak: WeakDirection | None = None
+    size: float = 1.0
     elements: Verification | None = None
     num_elements: int = 0
 
@@ -262,7 +199,8 @@ def _verified(
     final = refine_motion(source, target, chosen, config) if refine else chosen
     T = final.T_target_source
     weak = weakest_direction(source.surface, target.surface, T, config.plane_radius_m)
-    return _RegisteredMotion(chosen.row, T, chosen.verification, final.verification, weak)
+    size = relative_size(source.surface, target.surface, T)
+    return _RegisteredMotion(chosen.row, T, chosen.verification, final.verification, weak, size)
 
 
 def _refined(
@@ -297,9 +235,12 @@ def _as_registration(model: Model, hypotheses: Registration, motion: _Registered
     T = jnp.asarray(motion.T_target_source, match.T_target_source.dtype)
     match = replace(match, T_target_source=T, verification=motion.verification)
     if motion.weak is not None:
-        direction, sigma_m = (jnp.asarray(value, T.dtype) for value in motion.weak)
-        match = replace(match, weak_direction=direction, weak_sigma_m=sigma_m)
-    return with_confidence(match, evidence, model.config.calibration)
+        direction, sigma_m, size = (jnp.asarray(value, T.dtype) for value in (*motion.weak, motion.size))
+        match = replace(match, weak_direction=direction, weak_sigma_m=sigma_m, relative_size=size)
+    match = with_confidence(match, evidence, model.config.calibration)
+    # A motion cannot be right if the scans are of another size.
+    is_limited = motion.size != 1 and model.config.calibration is not None
+    return replace(match, confidence=jnp.minimum(match.confidence, OTHER_SIZE_CONFIDENCE)) if is_limited else match
 
 
 @kept_jit("config")

@@ -198,7 +198,7 @@ def save_state(path: str | Path, state: SlamState, reports: Sequence[ScanReport]
     Raises:
         ValueError: if the map is empty, or the last scan is not the one of a keyframe.
     """
-    front_end, slam_map, loops = state
+    front_end, slam_map, loops, _ = state
     if front_end.local_map is not None or front_end.dropped:
         raise ValueError("state: expected the state after a keyframe, got scans since the last one")
     arrays = {f"{MAP}{name}": array for name, array in map_arrays(slam_map, "float32").items()}

@@ -14,6 +14,7 @@ KITTI_ELEVATION_DEG = 0.205
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 # Shortest and longest turn of a lidar.
 _TURN_S = (0.02, 0.5)
+_MIN_TIMES = 4
 
 
 def deskew(
@@ -80,10 +81,11 @@ def offsets_by_times(times: Float[AnyArray, " n"], interval_s: float | None = No
         interval_s: time between two scans, s; None takes the time of this one.
 
     Returns:
-        Offsets for `deskew`: 0 in the middle of the scan. None where no unit fits, as where all times are equal.
+        Offsets for `deskew`: 0 in the middle of the scan. None where no unit fits, and where there are fewer than four
+        times, as those of a clock in float32.
     """
     times = np.asarray(times, np.float64)
-    if not len(times) or not np.isfinite(times).all():
+    if not np.isfinite(times).all() or len(np.unique(times)) < _MIN_TIMES:
         return None
     first, last = times.min(), times.max()
     unit = next((unit for unit in _UNITS_S if _TURN_S[0] <= unit * (last - first) <= _TURN_S[1]), None)

@@ -17,12 +17,14 @@ from dpmjax.scans.surfaces import (
     RangeImage,
     Surface,
     SurfaceConfig,
+    chosen_elements,
+    firm_surface,
     range_image,
     scan_surface,
     surface_at,
     surface_of_elements,
 )
-from dpmjax.scans.weak_directions import surface_in_corridor
+from dpmjax.scans.weak_directions import FIRM_FLATNESS, corridor_axis, has_facing
 from dpmjax.types import DescriptorCloud, PointCloud, SurfaceElements
 
 # A scan with fewer flat surface elements counts as empty.
@@ -33,6 +35,10 @@ MAX_ELEMENTS = 3000
 
 # Neighbourhoods of all points of a scan, and of spread ones: in scans of 1,000 points neighbours are farther away.
 DENSE, NEIGHBOURHOODS = SurfaceConfig(), SurfaceConfig(sparse_radius_share=1.5)
+
+# Voxels and the largest number of elements in a corridor that hardly any element faces: there a relief of centimetres
+# may hold the way along it. Its corners need flatter elements.
+FINE_VOXEL_M, MAX_FINE_ELEMENTS, FINE_FLATNESS = 0.08, 6000, 0.5
 
 # One element of each voxel of this size is chosen first, because ground near the lidar is dense.
 SPREAD_M = 1.5
@@ -72,18 +78,31 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
     """
     if len(points) < MIN_NUM_POINTS:
         return None
-    tree, rows = filter_points(without_shell(points), None, config)
+    points = without_shell(points)
+    tree, rows = filter_points(points, None, config)
     thinned = tree.points.take(rows, axis=0)
     is_inlier = np.zeros(len(tree.points), bool)
     is_inlier[rows] = True
     surface = surface_at(tree, rows[_spread_rows(thinned)], NEIGHBOURHOODS, is_counted=is_inlier)
     if np.count_nonzero(surface.flatness) < MIN_NUM_POINTS:
         return None
-    surface, weak_axis = surface_in_corridor(surface)
+    weak_axis = corridor_axis(surface)
+    if weak_axis is not None:
+        surface = firm_surface(surface, FIRM_FLATNESS)
+        if not has_facing(surface, weak_axis):
+            surface = _fine_surface(points, config)
     thinned = thinned.astype(np.float32)
     extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
     cloud = as_cloud(thinned, config)
     return Scan(surface, range_image(thinned), cloud=cloud, extent_m=extent_m, weak_axis=weak_axis)
+
+
+def _fine_surface(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Surface:
+    """Measures the surface of a scan at points that are near each other; only flat elements are kept."""
+    surface = scan_surface(points, SurfaceConfig(config.min_range_m, config.max_range_m, voxel_size_m=FINE_VOXEL_M))
+    rows = np.flatnonzero(surface.flatness > FINE_FLATNESS)
+    rows = rows[_spread_rows(surface.points[rows])][:MAX_FINE_ELEMENTS]
+    return chosen_elements(surface, rows)
 
 
 def measure_scan(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = DENSE) -> Scan:

@@ -147,6 +147,20 @@ def firm_surface(surface: Surface, min_flatness: float) -> Surface:
     return surface._replace(normals=normals, flatness=flatness, samples=samples)
 
 
+def chosen_elements(surface: Surface, rows: Int[np.ndarray, " e"]) -> Surface:
+    """Returns a surface of some elements.
+
+    Args:
+        surface: surface of a scan.
+        rows: rows of the elements.
+
+    Returns:
+        The surface; its samples are those of the elements that are flat.
+    """
+    points, normals, flatness = (values.take(rows, axis=0) for values in surface[:3])
+    return Surface(points, normals, flatness, _samples(normals, flatness), HostTree(points))
+
+
 def surface_of_elements(elements: SurfaceElements) -> Surface:
     """Makes a surface of elements whose normals are known.
 

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from dpmjax.geometry import rigid
 from dpmjax.scans.pairs import PLANE_DISTANCE_M, Pairs, nearest_planes
 from dpmjax.scans.preprocess import first_of_each_voxel
-from dpmjax.scans.surfaces import MIN_FLATNESS, Surface, firm_surface
+from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.types import Information, Pose, Poses
 
@@ -46,8 +46,13 @@ CORRIDOR_SHARE = 0.1
 # corridor. The corners of a slice seem to face the axis, and they move with the lidar.
 FIRM_FLATNESS = 0.3
 
-# A smaller share of elements may face an axis by chance.
-MIN_FACING_SHARE = 0.01
+# A smaller share of the first elements may face an axis by chance.
+NUM_FACED, MIN_FACING_SHARE = 1000, 0.01
+
+# Normals of both scans face the axis of a corridor alike if the sum of the products of their components along it is
+# so many times its standard deviation by chance (bare walls up to 5, a relief of 3 cm above 10), and if their mean is
+# larger (bare walls up to 0.0002, a relief of 3 cm 0.0015).
+MIN_SIGNIFICANCE, MIN_ALIKE = 6.0, 0.0005
 
 BIN_M, NUM_BINS, MAX_COUNT = 0.2, 301, 20.0
 # Elements nearer to each other along the axis have one position.
@@ -169,26 +174,49 @@ def weakest_direction(source: Surface, target: Surface, T_target_source: Pose, r
     covariance = R @ np.linalg.inv(plane_information(pairs, T_target_source))[:3, :3] @ R.T
     horizontal = np.linalg.svd(T_level_lidar(target)[2:3, :3])[2][1:]
     direction = np.linalg.eigh(horizontal @ covariance @ horizontal.T)[1][:, 1] @ horizontal
-    held = without_noise_along(pairs, direction, np.ones(len(pairs.residuals), bool))
+    along = pairs.normals @ direction
+    held = _with_kept(pairs, direction, along * _faces(along, np.ones(len(along), bool)))
     return WeakDirection(direction, sigma_along(scattered_information(held, T_target_source), R.T @ direction))
 
 
-def without_noise_along(pairs: Pairs, direction: Float[np.ndarray, "3"], is_firm: Bool[np.ndarray, " p"]) -> Pairs:
-    """Removes from normals the component along a direction that they do not face: it is noise.
+def _faces(along: Float[np.ndarray, " p"], is_firm: Bool[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
+    """Returns True for firm elements whose normals face an axis; for none where chance explains their number."""
+    is_facing = is_firm & (np.abs(along) > FACING_COSINE)
+    return is_facing & (is_facing.sum() > MIN_FACING_SHARE * is_firm.sum())
+
+
+def _with_kept(pairs: Pairs, direction: Float[np.ndarray, "3"], kept: Float[np.ndarray, " p"]) -> Pairs:
+    """Returns pairs whose normals have other components along a direction."""
+    return pairs._replace(normals=pairs.normals + (kept - pairs.normals @ direction)[:, None] * direction)
+
+
+def without_noise_along(pairs: Pairs, source: Surface, T_target_source: Pose, axis: Float[np.ndarray, "3"]) -> Pairs:
+    """Removes from normals the component along an axis that is noise.
+
+    Elements that face the axis count, if they are enough. If not, the components count as far as the normals of both
+    scans have them: their noise is independent, so that the products of both are zero in the mean, but a relief of
+    centimetres is the same in both.
 
     Args:
-        pairs: pairs under a motion.
-        direction: unit vector in the frame of the target.
-        is_firm: False for pairs whose planes may be wrong; these do not face the direction.
+        pairs: a pair for each of the first samples of the source.
+        source: surface of a scan.
+        T_target_source: the motion of the pairs.
+        axis: unit vector in the frame of the source.
 
     Returns:
-        The pairs with normals that are shorter where they are noisy.
+        The paired ones, with normals that are shorter where they are noisy.
     """
-    along = pairs.normals @ direction
-    is_facing = is_firm & (np.abs(along) > FACING_COSINE)
-    is_enough = is_facing.sum() > MIN_FACING_SHARE * is_firm.sum()
-    noise = np.where(is_facing & is_enough, 0, along)
-    return pairs._replace(normals=pairs.normals - noise[:, None] * direction)
+    rows, R = source.samples[: len(pairs.points)][pairs.is_paired], T_target_source[:3, :3]
+    pairs, own = pairs.take(pairs.is_paired), source.normals[rows] @ R.T
+    along, own_along = pairs.normals @ R @ axis, source.normals[rows] @ axis
+    is_firm = pairs.meets & (pairs.flatness > FIRM_FLATNESS) & (source.flatness[rows] > FIRM_FLATNESS)
+    if not _faces(along[:NUM_FACED], is_firm[:NUM_FACED]).any():
+        products = (np.sign((own * pairs.normals).sum(axis=1)) * own_along * along)[is_firm]
+        alike, chance = products.sum(), np.sqrt(np.square(products).sum())
+        is_known = alike > max(MIN_SIGNIFICANCE * chance, MIN_ALIKE * len(products))
+        share = np.sqrt(min(alike / np.square(along[is_firm]).sum(), 1.0)) if is_known else 0.0
+        return _with_kept(pairs, R @ axis, share * is_firm * along)
+    return _with_kept(pairs, R @ axis, along * (is_firm & (np.abs(along) > FACING_COSINE)))
 
 
 def with_least_covariance(information: Information, sigma_m: float, sigma_rad: float) -> Information:
@@ -289,20 +317,33 @@ def weak_share(source: WallAxis, target: WallAxis) -> float:
     return float(along / (along + across))
 
 
-def surface_in_corridor(surface: Surface) -> tuple[Surface, Float[np.ndarray, "3"] | None]:
-    """Leaves normals only to firm elements where a scan was measured in a corridor.
+def corridor_axis(surface: Surface) -> Float[np.ndarray, "3"] | None:
+    """Finds the axis of a corridor: few walls of the scan face it.
 
     Args:
         surface: surface of a scan.
 
     Returns:
-        The surface, and the axis of the corridor as a unit vector; elsewhere the given surface, and None.
+        The axis as a unit vector in the frame of the lidar; None elsewhere.
     """
     T, _, normals = _walls(surface, FIRM_FLATNESS)
     information, axes = np.linalg.eigh(normals.T @ normals)
     if not len(normals) or information[0] >= CORRIDOR_SHARE * information.sum():
-        return surface, None
-    return firm_surface(surface, FIRM_FLATNESS), np.append(axes[:, 0], 0.0) @ T[:3, :3]
+        return None
+    return np.append(axes[:, 0], 0.0) @ T[:3, :3]
+
+
+def has_facing(surface: Surface, axis: Float[np.ndarray, "3"]) -> bool:
+    """Returns True where more elements with a normal face an axis than may by chance.
+
+    Args:
+        surface: surface of a scan.
+        axis: unit vector in the frame of the lidar.
+
+    Returns:
+        True for an end wall, pillars, door frames.
+    """
+    return bool(_faces(surface.normals @ axis, surface.flatness > 0).any())
 
 
 def sliding_motions(source: WallAxis, target: WallAxis, step_m: float) -> Poses:

@@ -65,9 +65,10 @@ UNKNOWN_M = 1000.0
 
 # Source of a pose. "first": first scan of the map, or of a new part of a loaded one. "tracked": aligned from the
 # predicted pose, or registered by the decoder where the method is "descriptors". "network": aligned from the decoder's
-# pose, or confirmed by it at a low score. "predicted": no alignment was accepted; the pose is a guess. "empty": too few
+# pose, or confirmed by it at a low score. "coasting": aligned in a corridor whose walls leave the way along it open;
+# along it, the last motion goes on. "predicted": no alignment was accepted; the pose is a guess. "empty": too few
 # points. "restarted": first scan of a new part at a guessed pose, after several rejected scans; loops may join it.
-ScanStatus = Literal["first", "tracked", "network", "predicted", "empty", "restarted"]
+ScanStatus = Literal["first", "tracked", "network", "coasting", "predicted", "empty", "restarted"]
 
 
 class ScanReport(NamedTuple):
@@ -101,11 +102,6 @@ class ScanReport(NamedTuple):
     T_turn: Pose | None = None
     weak_sigma_m: float | None = None
 
-    @property
-    def is_unknown_along(self) -> bool:
-        """True where nothing faces the axis of a corridor: along it, the last motion goes on."""
-        return self.weak_sigma_m is not None and self.weak_sigma_m > GUESS_M
-
 
 class RegisteredScan(NamedTuple):
     """A scan that the decoder has registered with a keyframe.
@@ -138,6 +134,7 @@ class FrontEndState(NamedTuple):
         lost: the scans since one was accepted, at their predicted poses.
         dropped: the same where the method is "descriptors", with their registrations; None for an empty scan.
         keyframe_ratio: factor of the distance of keyframes where the method is "descriptors"; None before the first.
+        num_coasting: number of scans since the way along a corridor was known.
     """
 
     num_scans: int = 0
@@ -149,6 +146,7 @@ class FrontEndState(NamedTuple):
     lost: tuple[PlacedElements, ...] = ()
     dropped: tuple[RegisteredScan | None, ...] = ()
     keyframe_ratio: float | None = None
+    num_coasting: int = 0
 
     @property
     def predicted(self) -> Pose:
@@ -246,13 +244,15 @@ class _Search(NamedTuple):
             status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
             information = diagonal_information(GUESS_M, GUESS_RAD)
         elif self.scan.weak_axis is not None:
-            report = report._replace(weak_sigma_m=sigma_along(information, self.scan.weak_axis))
-            if report.is_unknown_along:
-                T = _with_guess_along(T, state.predicted, self.scan.weak_axis)
+            sigma_m = sigma_along(information, self.scan.weak_axis)
+            report = report._replace(weak_sigma_m=sigma_m)
+            if sigma_m > GUESS_M:
+                # An alignment there is noise, which would change the speed.
+                status, T = "coasting", _with_guess_along(T, state.predicted, self.scan.weak_axis)
         reason = f"score {best.score:.2f} of usually {usual:.2f}"
         if probability is not None:
             reason += f", P {probability:.2f} by the network"
-        if report.is_unknown_along:
+        if status == "coasting":
             reason += ", nothing faces the axis of the corridor"
         # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
         report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
@@ -299,7 +299,7 @@ class _Search(NamedTuple):
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
-    """Returns the pose moved along an axis of the scan to where the guess is: noise alone would change the speed."""
+    """Returns the pose moved along an axis of the scan to where the guess is."""
     held, along = T_map_scan.copy(), T_map_scan[:3, :3] @ axis
     held[:3, 3] += along @ (guess - T_map_scan)[:3, 3] * along
     return held
@@ -377,12 +377,15 @@ def with_keyframe(methods: SlamMethods, slam_map: KeyframeMap, keyframe: Keyfram
 
 def _advanced(state: FrontEndState, report: ScanReport) -> FrontEndState:
     """Returns the state after a scan: only an accepted one changes the predicted motion."""
-    T = report.T_keyframe_scan
+    T, num_coasting = report.T_keyframe_scan, state.num_coasting
     after = state._replace(num_scans=state.num_scans + 1, T_keyframe_last=T)
     if report.status == "predicted":
         return after
-    after = after._replace(lost=())
+    after = after._replace(lost=(), num_coasting=num_coasting + 1 if report.status == "coasting" else 0)
     if report.status in ("first", "restarted"):
         return after._replace(scores=())
     T_before_last = rigid.inverse(state.T_keyframe_last) @ T
+    # The error along a corridor is that of all scans since it was known, and not of the last step.
+    before_m = state.T_before_last[:3, 3]
+    T_before_last[:3, 3] = before_m + (T_before_last[:3, 3] - before_m) / (num_coasting + 1)
     return after._replace(T_before_last=T_before_last, scores=(*state.scores, report.score)[-USUAL_WINDOW:])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
-from dpmjax.scans.align import AlignmentLevel, align_on_host
+from dpmjax.scans.align import ALL, AlignmentLevel, align_on_host
 from dpmjax.scans.lidar import Scan, lidar_scan
 from dpmjax.scans.pairs import Pairs, nearest_planes
 from dpmjax.scans.surfaces import Surface, view_points
@@ -146,7 +146,7 @@ class SurfaceGeometry:
 
     def _aligned(self, local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
         T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), self._narrow).T_target_source
-        planes = self._planes(local_map, scan, T, NUM_SAMPLES)
+        planes = self._planes(local_map, scan, T, ALL if scan.weak_axis is not None else NUM_SAMPLES)
         matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
         scores = matched - CONTRADICTION_WEIGHT * contradicted
         columns = (column.tolist() for column in (matched, contradicted, scores))
@@ -161,8 +161,7 @@ def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
     """Returns the information of a pose by the planes that elements meet; along a corridor, firm ones alone count."""
     pairs = planes.take(planes.is_paired)
     if scan.weak_axis is not None:
-        is_firm = pairs.meets & (scan.surface.flatness[scan.surface.samples[: len(planes.meets)]] > 0)[planes.is_paired]
-        pairs = without_noise_along(pairs, T_map_scan[:3, :3] @ scan.weak_axis, is_firm)
+        pairs = without_noise_along(planes, scan.surface, T_map_scan, scan.weak_axis)
     return with_least_covariance(plane_information(pairs, T_map_scan), FLOOR_M, FLOOR_RAD)
 
 

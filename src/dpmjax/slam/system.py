@@ -30,6 +30,9 @@ from dpmjax.slam.model_methods import as_methods
 from dpmjax.slam.procedure import procedure_of
 from dpmjax.types import Pose, Poses, with_short_repr
 
+# Number of times that the first two scans are deskewed: the motion between them changes little after the first.
+NUM_BEGINNINGS = 2
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -42,11 +45,13 @@ class SlamState(NamedTuple):
         front_end: state of odometry, with the local map.
         slam_map: keyframes and edges.
         loops: candidates of loops.
+        begun: the first scan, where it has times, and the state before it, until the second scan gives its motion.
     """
 
     front_end: FrontEndState
     slam_map: KeyframeMap
     loops: LoopState
+    begun: tuple[SlamState, TimedScan] | None = None
 
 
 class SlamResult(NamedTuple):
@@ -118,9 +123,27 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedIn
     Raises:
         ValueError: if the shape is not (n, 3).
     """
-    if not isinstance(scan, PreparedInput):
-        T_turn = state.front_end.T_before_last if isinstance(scan, TimedScan) else None
-        scan = prepare_input(methods, scan, T_turn)
+    if isinstance(scan, PreparedInput):
+        return _step(methods, state, scan)
+    if not isinstance(scan, TimedScan):
+        return _step(methods, state, prepare_input(methods, scan))
+    after, report = _step(methods, state, prepare_input(methods, scan, state.front_end.T_before_last))
+    if report.status == "first":
+        return after._replace(begun=(state, scan)), report
+    if state.begun is None or report.status not in ("tracked", "network"):
+        return after, report
+    # The first two scans are deskewed by the motion between them, and placed again.
+    before, first = state.begun
+    for _ in range(NUM_BEGINNINGS):
+        T_turn = after.front_end.T_before_last
+        after, _ = _step(methods, before, prepare_input(methods, first, T_turn))
+        after = after._replace(front_end=after.front_end._replace(T_before_last=T_turn))
+        after, report = _step(methods, after, prepare_input(methods, scan, T_turn))
+    return after, report
+
+
+def _step(methods: SlamMethods, state: SlamState, scan: PreparedInput) -> tuple[SlamState, ScanReport]:
+    """Places a prepared scan and searches loops of a new keyframe."""
     procedure, loops = procedure_of(methods.config), state.loops
     front, slam_map, report = procedure.place_scan(methods, state.front_end, state.slam_map, scan)
     if report.is_keyframe:
