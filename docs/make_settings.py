@@ -17,8 +17,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
+from dpmjax.cli.options import RunOptions
 from dpmjax.cli.program import COMMANDS
-from dpmjax.cli.run import RunOptions
 
 PAGE = Path(__file__).with_name("settings.md")
 

@@ -1,13 +1,11 @@
-"""Runs `dpmjax map2d` on the logs of some folders and on simulated corridors, and writes one table.
+"""Runs `dpmjax map2d` on the logs of some folders, and writes one table.
 
     python -m experiments.deepmapping_logs path/to/logs -o out
     python -m experiments.deepmapping_logs path/to/recordings --inits auto --corrected path/to/logs
-    python -m experiments.deepmapping_logs path/to/logs path/to/scans.npz --corridors 100 101 102 --inits auto icp-plane
 
 Each run keeps its own folder below OUT/drives, with its pictures; --resume makes the missing rows. A log that has
 hand-checked relations beside it (aces.clf.gz, aces.relations) is measured by them too, and a recording by the log of
-the same name in `--corrected`. A map is right where no scan is farther than half a metre from its reference pose. In a
-simulated corridor niches and rooms lie far apart, and the lidar sees a half-circle of short reach.
+the same name in `--corrected`. A map is right where no scan is farther than half a metre from its reference pose.
 """
 
 from __future__ import annotations
@@ -23,9 +21,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, metrics
-from dpmjax.geometry import se2
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES
-from dpmjax.simulation import scan_world, simulate_odometry
 
 EXPERIMENT = "deepmapping_logs"
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
@@ -37,24 +33,16 @@ NUMBERS = (
     "wall_s", "peak_rss_gb",
 )  # fmt: skip
 COLUMNS = (*NUMBERS[:11], "deepmapping_ate_m", "right", "trusted", "wall_s", "peak_rss_gb")
-# Simulated corridors: size of the world, reach of the lidar, noise of a range.
-METRES_A_PX = 0.05
-LENGTH_PX, HEIGHT_PX, WIDTH_PX = 1600, 600, 60
-REACH_PX, RANGE_NOISE_PX, NUM_BEAMS, NUM_SCANS = 160.0, 0.6, 360, 60
-# Share of the sections with a niche or a room, and the lengths of sections.
-ROOM_SHARE, SECTION_PX = 0.35, (60, 320)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogOptions(cli.RunOptions):
     """Options of the table."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"logs", "corridors", "inits"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"logs", "inits"})
 
     logs: Positional[tuple[Path, ...]] = ()
     """Folders of .log or .clf files, plain or .gz, or of .npz arrays; or single files."""
-    corridors: tuple[int, ...] = ()
-    """Seeds of simulated corridors."""
     inits: tuple[str, ...] = ("odometry", "icp-plane", "global")
     """Starts to try."""
     corrected: Annotated[Path | None, arg(metavar="FOLDER")] = None
@@ -66,12 +54,11 @@ class LogOptions(cli.RunOptions):
 def main(options: LogOptions, run: cli.Run) -> cli.Row:
     """Runs the missing rows and writes the table."""
     logs = [log for path in options.logs for log in ([path] if path.is_file() else list_logs(path))]
-    by_name: dict[str, Path | int] = {log.name.removesuffix(".gz"): log for log in logs}
+    by_name = {log.name.removesuffix(".gz"): log for log in logs}
     if len(by_name) < len(logs):
         raise ValueError(f"{len(logs)} logs have {len(by_name)} different names; a name has one row for each start")
-    by_name |= {f"corridor{seed}.npz": seed for seed in options.corridors}
     if not by_name:
-        raise ValueError("no log: name a folder of logs, a log, or --corridors")
+        raise ValueError("no log: name a folder of logs, or a log")
     cli.check_names("--inits", options.inits, ("auto", *START_NAMES))
     corrected = {} if options.corrected is None else {name_drive(log): log for log in list_logs(options.corrected)}
     run.open()
@@ -79,8 +66,6 @@ def main(options: LogOptions, run: cli.Run) -> cli.Row:
     def work(log: str, init: str) -> cli.Row | None:
         path, folder = by_name[log], run / "drives" / f"{log}_{init}"
         folder.mkdir(parents=True, exist_ok=True)
-        if isinstance(path, int):
-            path = write_corridor_log(run / log, path)
         code = map_log(path, folder, init, options)
         if run.is_stopped:
             return None
@@ -150,54 +135,6 @@ def row_of(numbers: cli.Row) -> cli.Row:
         "trusted_if_right": trusted if right else None,
         "uncertain_scans": " ".join(cli.spans_of(numbers.get("assessment", {}).get("uncertain_scans", ()))),
     }
-
-
-def write_corridor_log(path: Path, seed: int) -> Path:
-    """Simulates a drive along a corridor, 1 to 1.5 m a step.
-
-    Args:
-        path: `.npz` to write in a folder that exists: ranges, angles, poses, odometry, times.
-        seed: of the world, the drive, and all noise.
-
-    Returns:
-        The path.
-    """
-    rng = np.random.default_rng(seed)
-    solid, poses = _make_corridor(rng), _simulate_drive(rng)
-    points, mask = scan_world(
-        solid, poses, num_beams=NUM_BEAMS, max_range=REACH_PX, range_noise_px=RANGE_NOISE_PX, rng=rng
-    )
-    odometry = simulate_odometry(poses, rng=rng, translation_noise=0.05, rotation_noise_deg=0.6, bias=0.02)
-    angles = se2.wrap_angle(2 * np.pi * np.arange(NUM_BEAMS) / NUM_BEAMS)
-    ahead = np.flatnonzero(np.abs(angles) <= 0.5 * np.pi + 1e-9)
-    ahead = ahead[np.argsort(angles[ahead])]
-    ranges = np.where(mask, np.linalg.norm(points, axis=2), 0.0)[:, ahead] * METRES_A_PX
-    metres = np.array([METRES_A_PX, METRES_A_PX, 1.0])
-    arrays = {"ranges": ranges, "angles": angles[ahead], "poses": poses * metres, "odometry": odometry * metres}
-    np.savez(path, **arrays, times=np.arange(len(poses), dtype=np.float64))
-    return path
-
-
-def _make_corridor(rng: np.random.Generator) -> np.ndarray:
-    solid = np.ones((HEIGHT_PX, LENGTH_PX), bool)
-    low, high = HEIGHT_PX // 2, HEIGHT_PX // 2 + WIDTH_PX
-    solid[low:high, 20 : LENGTH_PX - 20] = False
-    x = 60
-    while x < LENGTH_PX - 120:
-        if rng.random() < ROOM_SHARE:
-            width, depth = int(rng.integers(20, 90)), int(rng.integers(10, 120))
-            rows = slice(high, high + depth) if rng.random() < 0.5 else slice(low - depth, low)
-            solid[rows, x : x + width] = False
-        x += int(rng.integers(*SECTION_PX))
-    return solid
-
-
-def _simulate_drive(rng: np.random.Generator) -> np.ndarray:
-    """Returns poses along the middle of the corridor, px and radians."""
-    x = np.linspace(60.0, LENGTH_PX - 80.0, NUM_SCANS) + rng.normal(0.0, 3.0, NUM_SCANS)
-    middle = HEIGHT_PX / 2 + WIDTH_PX / 2
-    y = middle + np.clip(np.cumsum(rng.normal(0.0, 1.0, NUM_SCANS)), -15.0, 15.0)
-    return np.column_stack([x, y, rng.normal(0.0, 0.08, NUM_SCANS)])
 
 
 if __name__ == "__main__":

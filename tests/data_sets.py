@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from dpmjax.cli.run import Run, RunOptions
+from dpmjax.cli.options import RunOptions
+from dpmjax.cli.run import Run
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError, LidarSequence, ScanSequence, write_kitti
 from dpmjax.io.clouds import parse_pcd, parse_ply

@@ -28,7 +28,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 import tyro
-from dpmjax.cli.run import HISTORY, Numbers, Run, RunOptions, run_command
+from dpmjax.cli.options import RunOptions
+from dpmjax.cli.run import HISTORY, Numbers, Run, run_command
 
 @dataclass(frozen=True, kw_only=True)
 class ToyOptions(RunOptions):
@@ -104,18 +105,6 @@ def test_help_shows_the_examples(toy):
     assert "usage: python -m experiments.toy" in output
 
 
-def test_finished_run_exits_with_zero(toy, tmp_path):
-    code, _, errors = finish(toy("-o", "out"))
-    assert (code, errors) == (0, "")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "config.json",
-        "metrics.csv",
-        "metrics.json",
-        "log.txt",
-        "report.html",
-    }
-
-
 def test_bad_input_is_one_line_and_leaves_no_folder(toy, tmp_path):
     code, _, errors = finish(toy("missing.pcd", "-o", "out"))
     assert code == 2
@@ -144,13 +133,6 @@ def test_a_device_that_is_not_there_is_one_line_with_exit_code_2(tmp_path, monke
     assert not (tmp_path / "out").exists()
 
 
-def test_wrong_usage_exits_with_two(toy):
-    code, output, errors = finish(toy("--bad-option"))
-    assert code == 2
-    assert output == ""
-    assert "--bad-option" in errors
-
-
 def test_failure_on_the_way_exits_with_one_and_names_the_partial_results(toy, tmp_path):
     code, _, errors = finish(toy("-o", "out", "--fail"))
     assert code == 1
@@ -176,14 +158,6 @@ def test_stopped_run_writes_what_it_has_and_resumes(toy, tmp_path, number, expec
 def test_second_signal_ends_at_once(toy):
     code, _, errors = stop_after_first_step(toy("--seed", "99"), signal.SIGINT, signal.SIGINT)
     assert (code, errors) == (130, f"{STOPPING}dpmjax: stopped by SIGINT\n")
-
-
-def test_resumed_run_keeps_the_options_that_are_not_given(toy):
-    assert finish(toy("-o", "out", "--seed", "5"))[0] == 0
-    assert finish(toy("-o", "out", "--resume"))[0] == 0
-    code, _, errors = finish(toy("-o", "out", "--resume", "--seed", "6"))
-    assert code == 2
-    assert "--seed was 5" in errors
 
 
 @pytest.mark.slow

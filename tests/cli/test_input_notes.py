@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run import EXIT_FAILED, EXIT_OK
 from dpmjax.cli.slam_numbers import status_of, why_failed
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
@@ -115,14 +116,6 @@ def test_inverted_reference_poses_are_doubted(tmp_path: Path, capsys: pytest.Cap
     write_tum(drive / "poses_lidar.txt", rigid.inverse(write_room(drive, 6)))
     assert run(drive, "-o", tmp_path / "out") == EXIT_OK
     assert "does the reference map the world to the lidar, not the lidar to the world?" in capsys.readouterr().out
-
-
-def test_millimetres_and_a_map_are_named_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    write_room(tmp_path / "drive", 3)
-    far = np.random.default_rng(0).normal([5e5, 5.4e6, 300], 1, (500, 3))
-    write_pcd(tmp_path / "drive" / "000000.pcd", far)
-    assert run(tmp_path / "drive", "-o", tmp_path / "out") == EXIT_BAD_INPUT
-    assert "UTM; subtract an origin" in capsys.readouterr().err
 
 
 def test_a_doubt_about_the_unit_is_in_the_log_and_the_numbers(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ import pytest
 import dpmjax
 from dpmjax.cli import localize
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.cli.slam_numbers import localization_errors
 from dpmjax.geometry import rigid
 from dpmjax.io import open_lidar_sequence, read_poses

@@ -19,7 +19,7 @@ from dpmjax.cli.run import Run, run_command
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
-from tests.data_sets import write_deepmapping_folder, write_pcd
+from tests.data_sets import write_deepmapping_folder
 
 REPOSITORY = Path(__file__).parents[2]
 NUM_SCANS = 16
@@ -190,20 +190,6 @@ def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch)
     assert found["kept"] == "incremental ICP, point to line, refined"
     assert found["assessment"]["is_trusted"]
     assert found["ate_px"] < 0.1
-
-
-def test_a_missing_file_is_named(as_user, tmp_path, capsys) -> None:
-    assert "nowhere.npz" in refused(tmp_path, capsys, tmp_path / "nowhere.npz")
-
-
-def test_a_truncated_cloud_is_named(as_user, walk, tmp_path, capsys) -> None:
-    folder = write_deepmapping_folder(tmp_path / "scans", walk)
-    path = folder / "003.pcd"
-    write_pcd(path, np.ones((40, 3), np.float32))
-    path.write_bytes(path.read_bytes()[:-30])
-    error = refused(tmp_path, capsys, folder)
-    assert "003.pcd" in error
-    assert "truncated" in error
 
 
 @pytest.mark.parametrize(

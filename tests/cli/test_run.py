@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -15,7 +15,10 @@ import pytest
 from tyro.conf import Positional, arg
 
 from dpmjax.cli import run as run_module
-from dpmjax.cli.run import OutputOptions, Run, RunOptions, load_options, parse_options, write_json
+from dpmjax.cli.options import OutputOptions, RunOptions, parse_options
+from dpmjax.cli.result_files import write_json
+from dpmjax.cli.run import Run
+from dpmjax.cli.run_folder import load_options
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,8 @@ def test_a_run_that_has_ended_meanwhile_is_not_replaced(start, tmp_path):
 def test_no_second_process_may_write_a_run_before_the_first_one_ends(start, tmp_path):
     run = start(output=tmp_path / "out")
     program = (
-        "import sys; from pathlib import Path; from dpmjax.cli.run import Run, RunOptions\n"
-        "try: Run('toy', RunOptions(output=Path(sys.argv[1]), resume=True)).open()\n"
+        "import sys; from pathlib import Path; from dpmjax import cli\n"
+        "try: cli.Run('toy', cli.RunOptions(output=Path(sys.argv[1]), resume=True)).open()\n"
         "except ValueError as error: print(error)"
     )
     other = [sys.executable, "-c", program, str(run.path)]
@@ -184,14 +187,6 @@ def test_metrics_are_valid_json_with_seed_and_versions(start):
     assert {"device", "git_hash", "platform", "cpu", "num_cores", "wall_s"} <= set(found)
 
 
-def test_failed_write_keeps_the_old_file(tmp_path):
-    write_json(tmp_path / "a.json", {"x": 1})
-    with pytest.raises(TypeError):
-        write_json(tmp_path / "a.json", {"x": object()})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"x": 1}
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-
-
 def test_the_table_of_a_resumed_run_continues_at_its_checkpoint(start):
     run = start()
     for step in range(5):
@@ -210,13 +205,6 @@ def test_the_table_of_a_resumed_run_continues_at_its_checkpoint(start):
 
 def parse(*words):
     return parse_options(ToyOptions, words, prog="dpmjax toy")
-
-
-def test_values_of_every_kind_are_read():
-    words = ["scans", "-n", "3", "--seconds", "1e-1", "--device", "gpu", "--world", "grove", "--groups", "8", "16"]
-    expected = ToyOptions(data=Path("scans"), steps=3, seconds=0.1, device="gpu", world="grove", groups=(8, 16))
-    assert parse(*words) == expected
-    assert parse("--world", "1") == replace(ToyOptions(), world=1)
 
 
 def test_a_check_of_the_options_says_what_it_expects():

@@ -20,9 +20,9 @@ import pytest
 
 from dpmjax import viz
 from dpmjax.cli import slam, slam_run
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json, run_command
-from dpmjax.geometry import rigid
-from dpmjax.io import LidarSequence, read_poses, write_tum
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
+from dpmjax.io import LidarSequence, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
 from tests.optional import import_or_skip
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
@@ -157,24 +157,6 @@ def test_results_say_what_was_done(whole, drive) -> None:
         assert (whole / name).stat().st_size > 0
 
 
-def test_evo_reads_the_trajectories(whole) -> None:
-    file_interface = import_or_skip("evo.tools.file_interface")
-    expected = np.load(whole / "trajectory.npy")
-    for read, name in (("read_tum_trajectory_file", "trajectory_tum"), ("read_kitti_poses_file", "trajectory_kitti")):
-        found = getattr(file_interface, read)(str(whole / f"{name}.txt"))
-        np.testing.assert_allclose(found.positions_xyz, expected[:, :3, 3], atol=1e-6)
-    assert file_interface.read_tum_trajectory_file(str(whole / "keyframes.txt")).num_poses > 10
-    np.testing.assert_allclose(read_poses(whole / "trajectory_tum.txt"), expected, atol=1e-6)
-
-
-def test_gtsam_reads_the_graph(whole) -> None:
-    gtsam = import_or_skip("gtsam")
-    factors, values = gtsam.readG2o(str(whole / "graph.g2o"), True)
-    metrics = load_json(whole / "metrics.json")
-    assert values.size() == metrics["num_keyframes"]
-    assert factors.size() >= metrics["num_keyframes"] - 1 + metrics["num_loops"]
-
-
 def test_plyfile_reads_the_map(whole) -> None:
     plyfile = import_or_skip("plyfile")
     vertices = plyfile.PlyData.read(str(whole / "map.ply"))["vertex"]
@@ -264,14 +246,6 @@ def test_a_run_of_fewer_scans_than_are_done_is_refused(whole, with_truth, tmp_pa
     assert run("--resume", "-o", out, "-n", 3) == EXIT_BAD_INPUT
     assert "scans done, 3 wanted; give -n" in capsys.readouterr().err
     assert files == {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
-
-
-@pytest.mark.slow
-def test_every_nth_scan_keeps_its_reference(drive, with_truth, tmp_path) -> None:
-    assert run(drive, "-o", tmp_path / "out", "-j", 2, "-n", 50) == EXIT_OK
-    T = np.load(tmp_path / "out" / "trajectory.npy")
-    true = rigid.inverse(TRUTH[0]) @ TRUTH[:100:2]
-    assert np.linalg.norm((T - true)[:, :3, 3], axis=1).max() < 2.0
 
 
 PROCESS = """

@@ -7,13 +7,13 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from dpmjax.cli.run import load_json
+from dpmjax.cli.result_files import load_json
 from dpmjax.geometry import se2
 from dpmjax.registration2d import DEEPMAPPING
 from dpmjax.simulation import simulate_sequence
 from experiments import deepmapping_logs, deepmapping_suite
 from experiments._deepmapping_methods import METHODS, PACKAGES, Task, make_task
-from experiments.deepmapping_logs import row_of, write_corridor_log
+from experiments.deepmapping_logs import row_of
 from experiments.deepmapping_suite import run_method
 from tests.experiments.running import read_rows, run
 from tests.optional import import_or_skip
@@ -170,7 +170,7 @@ def test_logs_keep_finished_runs_and_leave_out_lost_odometry(tmp_path, capsys) -
 
 
 def test_logs_refuse_an_unknown_start(tmp_path, capsys) -> None:
-    log = write_corridor_log(tmp_path / "a.npz", 0)
-    assert run(deepmapping_logs, log, "-o", tmp_path / "out", "--inits", "compass") == 2
+    (tmp_path / "a.log").touch()
+    assert run(deepmapping_logs, tmp_path / "a.log", "-o", tmp_path / "out", "--inits", "compass") == 2
     assert "--inits: expected some of auto" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

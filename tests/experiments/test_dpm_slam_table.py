@@ -13,10 +13,11 @@ import pytest
 import dpmjax
 from dpmjax.cli import why_not_importable
 from dpmjax.cli.drives import DriveOptions
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, Run, load_json
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, Run
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
-from dpmjax.slam import SlamConfig, SlamMethods, init_slam, step_slam
+from dpmjax.slam import SlamConfig, SlamMethods
 from experiments import _slam_peers, dpm_slam_table
 from experiments._slam_peers import FoundLoop
 from experiments._slam_settings import NETWORK, NO_OFFSETS, PAPER, WHOLE, make_setting
@@ -81,7 +82,7 @@ def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(model,
     town = toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
     monkeypatch.setattr(dpm_slam_table, "simulate_town", lambda *_: town)
     dpmjax.save_model(model, tmp_path / "model.safetensors")
-    out, methods = tmp_path / "out", (PEER, WHOLE, NETWORK, PAPER, "64 elements", "agents")
+    out, methods = tmp_path / "out", (PEER, WHOLE, NETWORK, PAPER, "agents")
     options = ("--weights", "model.safetensors", "--num-towns", 1, "--localize", 3, "-o", out)
     assert run(dpm_slam_table, "town", "--methods", *methods, *options) == EXIT_OK
     rows = {row["method"]: row for row in read_rows(out)}
@@ -206,19 +207,6 @@ def test_a_peer_follows_a_straight_drive(name: str) -> None:
     assert loops == []
     assert peer.map_bytes(scans) > 1000
     assert dpmjax.absolute_trajectory_error(T[:, :3, 3], drive.T_world_lidar[:, :3, 3]) < 0.3
-
-
-@pytest.mark.parametrize("num_elements", [16, 24])
-def test_a_map_of_fewer_elements_holds_the_first_ones(model, num_elements: int) -> None:
-    drive = toy.drive(1, num_scans=1)
-    maps = [
-        step_slam(make_setting(model, setting), init_slam(), drive[0])[0].slam_map
-        for setting in (WHOLE, f"{num_elements} elements")
-    ]
-    whole, fewer = (slam_map.keyframes[0].compact for slam_map in maps)
-    np.testing.assert_array_equal(fewer.elements.positions, whole.elements.positions[:num_elements])
-    np.testing.assert_array_equal(fewer.features, whole.features[:num_elements])
-    assert len(fewer.cloud.described.mask) == min(num_elements, len(whole.features))
 
 
 def test_the_offset_head_is_off_only_where_a_setting_says_so(model) -> None:

@@ -23,7 +23,6 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, io, metrics, registration_rgbd, simulation, viz
-from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
 from dpmjax.sequences import DepthSequence
 
 _NUM_SIMULATED = 8
@@ -34,7 +33,7 @@ _LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthOptions(ScanOptions, RunOptions):
+class DepthOptions(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
@@ -47,7 +46,7 @@ class DepthOptions(ScanOptions, RunOptions):
         cli.check_least(self, n_scans=2, jump=1)
 
 
-def main(options: DepthOptions, run: Run) -> Numbers:
+def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
     """Registers depth images and writes the results."""
     import jax
 
@@ -83,7 +82,7 @@ def read_images(options: DepthOptions) -> DepthSequence:
     return chosen
 
 
-def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> Numbers:
+def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli.Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
@@ -114,7 +113,7 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> Num
     }
 
 
-def draw(run: Run, sequence: DepthSequence, found: deepmapping.Registered) -> None:
+def draw(run: cli.Run, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
     assert found.start is not None
     panels = []

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
-from dpmjax.cli.run import RESULTS, ModelOptions, RunOptions, ScanOptions, check_least
+from dpmjax.cli.options import ModelOptions, RunOptions, ScanOptions, check_least
+from dpmjax.cli.run_folder import RESULTS
 from dpmjax.sequences import InputError, LidarSequence, Note
 
 LOGGER = logging.getLogger("dpmjax.drives")

@@ -19,7 +19,6 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, io, pose_graph, viz
-from dpmjax.cli.run import Numbers, OutputOptions, Run
 from dpmjax.sequences import Note
 
 # Edges below this weight are rejected.
@@ -27,7 +26,7 @@ LET_GO = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class GraphOptions(OutputOptions):
+class GraphOptions(cli.OutputOptions):
     """Options of the run."""
 
     graph: Annotated[Positional[Path], arg(metavar="GRAPH")]
@@ -46,7 +45,7 @@ class GraphOptions(OutputOptions):
             raise ValueError(f"--outlier-chi2: expected more than 0, got {self.outlier_chi2}")
 
 
-def main(options: GraphOptions, run: Run) -> Numbers:
+def main(options: GraphOptions, run: cli.Run) -> cli.Numbers:
     """Optimises a pose graph and writes the results."""
     graph = io.read_g2o(options.graph, nearest_psd=options.nearest_psd)
     settings = pose_graph.PoseGraphConfig(outlier_chi2=options.outlier_chi2, max_iterations=options.iterations)
@@ -68,7 +67,7 @@ def main(options: GraphOptions, run: Run) -> Numbers:
     return numbers
 
 
-def graph_numbers(options: GraphOptions, found: pose_graph.OptimizedPoseGraph) -> Numbers:
+def graph_numbers(options: GraphOptions, found: pose_graph.OptimizedPoseGraph) -> cli.Numbers:
     """Returns the numbers of an optimisation, with its status and verdict."""
     num_let_go = int((found.weights < LET_GO).sum())
     verdict = f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations"

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dpmjax import cli
 from dpmjax.cli.machine import EXTRAS, device_name, environment, why_not_importable
-from dpmjax.cli.run import Numbers, Run
 from dpmjax.compile_cache import enable_compile_cache
 
 
@@ -19,7 +19,7 @@ class InfoOptions:
     """The command has no options."""
 
 
-def main(options: InfoOptions, run: Run) -> Numbers:
+def main(options: InfoOptions, run: cli.Run) -> cli.Numbers:
     """Prints versions, devices, weights and extras of this installation."""
     import jax
 

@@ -22,7 +22,6 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, geometry, io, slam, viz, weights
-from dpmjax.cli.run import Numbers, Run
 from dpmjax.sequences import LidarSequence
 
 TABLE = "localizations.csv"
@@ -71,7 +70,7 @@ class Case(NamedTuple):
     is_calibrated: bool
 
 
-def main(options: LocalizeOptions, run: Run) -> Numbers:
+def main(options: LocalizeOptions, run: cli.Run) -> cli.Numbers:
     """Localises the remaining scans, and writes table, trajectory, numbers and picture."""
     model = weights.load_model(options.weights)
     slam_map = cli.open_map(options.map, slam.make_methods(model, weights=options.weights))
@@ -146,7 +145,7 @@ def as_localization(row: dict[str, str]) -> slam.Localization:
     return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"], part=part)
 
 
-def write_found(run: Run, options: LocalizeOptions, case: Case, rows: list[dict[str, str]]) -> Numbers:
+def write_found(run: cli.Run, options: LocalizeOptions, case: Case, rows: list[dict[str, str]]) -> cli.Numbers:
     """Writes trajectory and picture; returns the numbers."""
     results = [as_localization(row) for row in rows]
     rows_found = [number for number, result in enumerate(results) if result.is_in_map]
@@ -185,7 +184,7 @@ def write_found(run: Run, options: LocalizeOptions, case: Case, rows: list[dict[
     return numbers
 
 
-def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[Numbers, np.ndarray | None]:
+def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[cli.Numbers, np.ndarray | None]:
     """Returns the numbers of right and wrong scans, and True for each found scan with a wrong pose.
 
     Without a reference there are no numbers, and None.
@@ -196,7 +195,7 @@ def error_numbers(case: Case, results: list[slam.Localization]) -> tuple[Numbers
     errors = cli.localization_errors(results, case.slam_map, reference, drive.T_world_lidar)
     is_wrong = (~errors.is_right & drive.has_reference)[errors.is_found]
     num_inside, num_right = int((errors.keyframe_distance_m <= REACH_M).sum()), int(errors.is_right.sum())
-    numbers: Numbers = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
+    numbers: cli.Numbers = {"num_inside": num_inside, "num_right": num_right, "num_wrong": int(is_wrong.sum())}
     if num_right:
         numbers["median_error_m"] = float(np.median(errors.translation_m[errors.is_right]))
         numbers["median_error_deg"] = float(np.median(errors.rotation_deg[errors.is_right]))

@@ -30,7 +30,6 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation
 from dpmjax.cli import map2d_results as results
-from dpmjax.cli.run import Numbers, Run, RunOptions, ScanOptions
 from dpmjax.sequences import FloatArray, ScanSequence
 
 # Scans of a recording in metres that lie this far apart are registered.
@@ -38,7 +37,7 @@ _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
-class Map2dOptions(ScanOptions, RunOptions):
+class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
@@ -80,7 +79,7 @@ class Map2dOptions(ScanOptions, RunOptions):
             raise ValueError("--world and --range-noise-px choose simulated scans; leave them out beside DATA")
 
 
-def main(options: Map2dOptions, run: Run) -> Numbers:
+def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
     """Registers planar scans and writes the results."""
     sequence = read_scans(options)
     start = starting_poses(options, sequence)
@@ -105,7 +104,7 @@ def main(options: Map2dOptions, run: Run) -> Numbers:
 
 
 def register_sequence(
-    sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: Run
+    sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
     """Registers the scans, with the recorder as engine of the fit, and prints each stage and a bar of all."""
     import jax
@@ -138,7 +137,7 @@ def register_sequence(
         )
 
 
-def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> Numbers:
+def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> cli.Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
     registered = sequence.take(result.recording.chosen)
     start, kept = (result.candidates[name].poses for name in (result.start, result.kept))

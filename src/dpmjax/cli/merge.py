@@ -25,12 +25,11 @@ from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
 from dpmjax.cli import slam_numbers
-from dpmjax.cli.run import ModelOptions, Numbers, OutputOptions, Run
 from dpmjax.sequences import counted
 
 
 @dataclass(frozen=True, kw_only=True)
-class MergeOptions(ModelOptions, OutputOptions):
+class MergeOptions(cli.ModelOptions, cli.OutputOptions):
     """Options of the run."""
 
     maps: Annotated[Positional[tuple[Path, ...]], arg(metavar="MAP MAP ...", help_behavior_hint="required")] = ()
@@ -45,7 +44,7 @@ class MergeOptions(ModelOptions, OutputOptions):
                 raise ValueError(f"{path} is given twice; give each map once")
 
 
-def main(options: MergeOptions, run: Run) -> Numbers:
+def main(options: MergeOptions, run: cli.Run) -> cli.Numbers:
     """Merges maps and writes the results."""
     methods = slam.make_methods(weights.load_model(options.weights), weights=options.weights)
     maps = [cli.open_map(path, methods) for path in options.maps]
@@ -62,7 +61,7 @@ def main(options: MergeOptions, run: Run) -> Numbers:
     return numbers
 
 
-def write_maps(run: Run, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
+def write_maps(run: cli.Run, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
     """Writes the maps, the graph and the table of loops."""
     for part, slam_map in enumerate(merged.maps, start=1):
         saved_maps.save_map(run / map_name(part, len(merged.maps)), slam_map)
@@ -86,9 +85,9 @@ def short_name(path: Path) -> str:
     return str(Path(*path.parts[-2:]))
 
 
-def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> Numbers:
+def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> cli.Numbers:
     """Returns the content of `metrics.json`: connected maps, and the numbers of loops and keyframes."""
-    parts: list[Numbers] = [
+    parts: list[cli.Numbers] = [
         {
             "file": map_name(part, len(merged.maps)),
             "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
@@ -136,7 +135,7 @@ def layers_of(path: Path, merged: slam.MergedMaps, number: int) -> list[viz.Laye
     return cli.map_layers(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
 
 
-def merge_text(metrics: Numbers) -> str:
+def merge_text(metrics: cli.Numbers) -> str:
     """Returns the verdict: what has become of each map."""
     names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
     texts = [

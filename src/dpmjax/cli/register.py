@@ -20,7 +20,6 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deeppointmap, io, viz, weights
-from dpmjax.cli.run import ModelOptions, Numbers, OutputOptions, Run
 
 if TYPE_CHECKING:
     from dpmjax.types import Registration
@@ -31,7 +30,7 @@ SOURCE_COLOR, TARGET_COLOR = (58, 134, 192), (240, 168, 64)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterOptions(ModelOptions, OutputOptions):
+class RegisterOptions(cli.ModelOptions, cli.OutputOptions):
     """Options of the run."""
 
     source: Annotated[Positional[Path], arg(metavar="A")]
@@ -39,7 +38,7 @@ class RegisterOptions(ModelOptions, OutputOptions):
     target: Annotated[Positional[Path], arg(metavar="B")]
     """Scan in whose frame they end."""
     columns: Annotated[int | None, arg(metavar="N")] = None
-    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    """cli.Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     refine: bool = True
     """End with a fine point-to-plane alignment."""
 
@@ -48,7 +47,7 @@ class RegisterOptions(ModelOptions, OutputOptions):
         cli.check_least(self, columns=3)
 
 
-def main(options: RegisterOptions, run: Run) -> Numbers:
+def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     """Registers two scans and writes the results."""
     paths = (options.source, options.target)
     source, target = (io.read_lidar_file(path, bin_columns=options.columns) for path in paths)
@@ -75,7 +74,7 @@ def main(options: RegisterOptions, run: Run) -> Numbers:
     return numbers
 
 
-def verdict_numbers(found: Registration, is_calibrated: bool) -> Numbers:
+def verdict_numbers(found: Registration, is_calibrated: bool) -> cli.Numbers:
     """Returns status and verdict of a registration, its confidence, and the evidence for it."""
     names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
     shares = {name: float(getattr(found.verification, name)) for name in names}
@@ -104,7 +103,7 @@ def verdict_numbers(found: Registration, is_calibrated: bool) -> Numbers:
     }
 
 
-def motion_numbers(T_target_source: np.ndarray) -> Numbers:
+def motion_numbers(T_target_source: np.ndarray) -> cli.Numbers:
     """Returns the motion as a matrix, a distance and an angle."""
     from scipy.spatial.transform import Rotation
 
@@ -116,7 +115,7 @@ def motion_numbers(T_target_source: np.ndarray) -> Numbers:
     }
 
 
-def write_motion(run: Run, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
+def write_motion(run: cli.Run, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
     """Writes T_target_source.txt and aligned.ply."""
     rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
     io.write_atomically(run / "T_target_source.txt", "\n".join(rows) + "\n")

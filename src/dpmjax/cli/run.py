@@ -15,100 +15,45 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import itertools
-import json
 import logging
 import math
 import os
-import re
 import shutil
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
-from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, get_type_hints
+from typing import Any, NoReturn, get_type_hints
 
-import numpy as np
-import tyro
-from tqdm import tqdm
-from tyro.conf import FlagCreatePairsOff, arg
-
-from dpmjax import io
 from dpmjax.cli import program
 from dpmjax.cli.machine import environment, select_device
+from dpmjax.cli.options import parse_options
 from dpmjax.cli.report import write_report
+from dpmjax.cli.result_files import write_json, write_table
+from dpmjax.cli.run_folder import (
+    CONFIG,
+    RESULTS,
+    cannot_write,
+    check_replaceable,
+    check_same_options,
+    find_run,
+    load_options,
+    lock_folder,
+    make_latest,
+)
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError, Note
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
-CONFIG, METRICS, HISTORY, LOG, CHECKPOINTS = "config.json", "metrics.json", "metrics.csv", "log.txt", "checkpoints"
-RESULTS = Path("results")
-# Options that do not change the result.
-FREE_OPTIONS = frozenset(
-    {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
-)
+METRICS, HISTORY, LOG, CHECKPOINTS = "metrics.json", "metrics.csv", "log.txt", "checkpoints"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
 LOGGERS = ("dpmjax", "experiments", "__main__")
 
 Numbers = dict[str, Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class OutputOptions:
-    """Options of every command that writes results."""
-
-    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
-    """Folder for the results, instead of results/<command>/<time>."""
-    force: FlagCreatePairsOff[bool] = False
-    """Replace OUT and everything in it, where it holds an earlier run."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(OutputOptions):
-    """Options of every command that can be interrupted and resumed.
-
-    Attributes:
-        may_change: options that a resumed run may change, besides those that do not affect the computation.
-    """
-
-    may_change: ClassVar[frozenset[str]] = frozenset()
-
-    seed: int = 0
-    """Seed of everything random."""
-    resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScanOptions:
-    """Options of every command that reads scans or images in a row."""
-
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
-    """Use the first N scans, after --jump; without it, all."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
-    """Use every Nth scan."""
-
-    @property
-    def selection(self) -> slice:
-        """Returns the rows of the scans to use."""
-        return slice(None, None if self.n_scans is None else self.n_scans * self.jump, self.jump)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelOptions:
-    """Options of every command that uses trained weights."""
-
-    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file; a saved map needs the weights that made it."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -148,9 +93,9 @@ class Run:
         self.path = Path(output or RESULTS / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
         if self.is_resumed:
             self.path = find_run(name, output)
-            _check_same_options(self.path, options)
+            check_same_options(self.path, options)
         elif output is not None:
-            _check_replaceable(self.path, options)
+            check_replaceable(self.path, options)
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -182,17 +127,17 @@ class Run:
         output = self._options.output
         try:
             if output is None and not self.is_resumed:
-                self.path = _make_latest(self.path)
+                self.path = make_latest(self.path)
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = _lock(self.path)
+            self._lock = lock_folder(self.path)
             if output is not None and not self.is_resumed:
-                _check_replaceable(self.path, self._options)  # another run may have ended here meanwhile
+                check_replaceable(self.path, self._options)  # another run may have ended here meanwhile
                 for entry in self.path.iterdir():
                     shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
             write_json(self / CONFIG, self._options)
             self._handler = logging.FileHandler(self / LOG, encoding="utf-8")
         except OSError as error:
-            raise ValueError(_cannot_write(self.path, error.strerror or str(error))) from error
+            raise ValueError(cannot_write(self.path, error.strerror or str(error))) from error
         self._handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         for logger in map(logging.getLogger, LOGGERS):
             logger.addHandler(self._handler)
@@ -379,247 +324,8 @@ def _read_options(main: Callable[..., Numbers], name: str, description: str | No
     return dataclasses.replace(options, **{name: value for name, value in paths.items() if name != "output"})
 
 
-def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -> Any:
-    """Makes the options of a command line, or prints the help.
-
-    Args:
-        options_type: frozen dataclass of the options.
-        arguments: the command line.
-        **details: further arguments of `tyro.cli`, such as `prog` and `default`.
-
-    Returns:
-        The options.
-
-    Raises:
-        ValueError: an option is unknown, is missing, or has a wrong value.
-        SystemExit: the help was printed.
-    """
-    width = os.environ.get("COLUMNS")
-    if not {"-h", "--help"} & set(arguments):
-        os.environ["COLUMNS"] = "10000"  # no line breaks within a message
-    try:
-        with redirect_stderr(StringIO()) as box:
-            return tyro.cli(options_type, args=arguments, **details)
-    except SystemExit as done:
-        if not done.code:
-            raise
-    finally:
-        os.environ.pop("COLUMNS", None) if width is None else os.environ.update(COLUMNS=width)
-    # tyro draws a box: a line with the title, the message, a line across, and help.
-    rows = (row[2:].strip("│ ") for row in re.sub("\x1b[^m]*m", "", box.getvalue()).splitlines()[1:])
-    is_text = lambda row: bool(row.strip(" ─-"))  # noqa: E731
-    message = " ".join(itertools.takewhile(is_text, itertools.dropwhile(lambda row: not is_text(row), rows)))
-    own = f"Error parsing {options_type.__name__}: "
-    if message.startswith(own):  # a check of the options themselves
-        raise ValueError(message.removeprefix(own))
-    raise ValueError(f"{message.rstrip('.') or 'wrong options'}; --help describes the options")
-
-
 def _without_latest(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_without_latest, value))
     is_link = isinstance(value, str | Path) and "latest" in Path(value).parts and Path(value).exists()
     return type(value)(Path(value).resolve()) if is_link else value
-
-
-def load_options(path: Path, options_type: Any) -> Any:
-    """Reads the options of an earlier run; missing options, and those such as `output`, get their defaults.
-
-    Args:
-        path: folder of the run.
-        options_type: dataclass of the options.
-
-    Returns:
-        The options.
-
-    Raises:
-        ValueError: its `config.json` holds an option that `options_type` does not have, or is no JSON.
-    """
-    from dpmjax.weights.config_json import config_from_json
-
-    stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
-    try:
-        return config_from_json(stored, options_type)
-    except ValueError as error:
-        raise ValueError(f"{path / CONFIG} holds options of another command or version: {error}") from error
-
-
-def find_run(name: str, output: Path | None) -> Path:
-    """Finds the folder of an earlier run.
-
-    Args:
-        name: name of the command.
-        output: the folder, or None for the latest run of this command.
-
-    Returns:
-        The folder.
-
-    Raises:
-        ValueError: there is none.
-    """
-    path = output or RESULTS / name / "latest"
-    if not (path / CONFIG).is_file():
-        raise ValueError(f"{path} holds no {CONFIG}: it is no run of {name}; name one (--resume -o OUT)")
-    return path if output else path.resolve()
-
-
-def _check_same_options(path: Path, options: Any) -> None:
-    if options.force:
-        raise ValueError("--resume continues a run and --force starts it over: give one of them")
-    stored, now = load_json(path / CONFIG), as_json(options)
-    for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - options.may_change):
-        if stored[name] != now[name]:
-            was, is_now = ("not given" if value is None else value for value in (stored[name], now[name]))
-            raise ValueError(
-                f"--{name.replace('_', '-')} was {was} in {path} and is {is_now} now: a resumed run keeps its options; "
-                "start a new run for others"
-            )
-
-
-def _check_replaceable(path: Path, options: Any) -> None:
-    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise ValueError(_cannot_write(path, "permission denied" if existing.is_dir() else f"{existing} is a file"))
-    if existing != path or not any(path.iterdir()):
-        return
-    if not (path / CONFIG).is_file() or "output" not in load_json(path / CONFIG):
-        raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")
-    if not options.force:
-        resume = "--resume continues it, " if hasattr(options, "resume") else ""
-        raise ValueError(f"{path} holds an earlier run: {resume}--force replaces it, -o names another")
-    values = [value for name, value in vars(options).items() if name != "output"]
-    for value in itertools.chain(*(value if isinstance(value, tuple) else (value,) for value in values)):
-        inside = isinstance(value, str | Path) and str(value) and Path(value).resolve().is_relative_to(path.resolve())
-        if inside and Path(value).exists():
-            raise ValueError(f"--force would remove {value}, an input: name another folder with -o")
-
-
-def _cannot_write(path: Path, reason: str) -> str:
-    return f"cannot write to {path}: {reason}; name another folder with -o"
-
-
-def _make_latest(path: Path) -> Path:
-    """Makes a new folder, and lets the link `latest` beside it point there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    names = itertools.chain([path.name], (f"{path.name}_{number}" for number in itertools.count(2)))
-    path = next(new for new in map(path.with_name, names) if not new.exists())
-    path.mkdir()
-    link = path.parent / f".latest_{path.name}"
-    link.symlink_to(path.name, target_is_directory=True)
-    link.replace(path.parent / "latest")
-    return path
-
-
-def _lock(path: Path) -> int | None:
-    """Keeps other processes out of a folder, where the system can lock folders."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise ValueError(f"{path}: another process is writing this run; let it end, or stop it") from error
-    except OSError:
-        pass  # a network file system without locks
-    return handle
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Writes dataclasses, paths and NumPy values as JSON, atomically."""
-    io.write_atomically(path, json.dumps(as_json(value), indent=2, allow_nan=False) + "\n")
-
-
-def load_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON object; a file that holds something else is a ValueError."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: expected a JSON object, found {type(value).__name__}")
-    return value
-
-
-def as_json(value: Any) -> Any:
-    """Returns the same value made of JSON's types; NaN and infinity become null."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = dataclasses.asdict(value)
-    if isinstance(value, Mapping):
-        return {str(name): as_json(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_json(entry) for entry in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "__array__"):
-        return as_json(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes a CSV file atomically."""
-    text = StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    io.write_atomically(path, text.getvalue())
-
-
-def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum: Any) -> None:
-    """Writes poses in the plane or in space as NAME.npy, NAME_tum.txt and NAME_kitti.txt.
-
-    Args:
-        folder: folder of the files.
-        poses: poses of all scans.
-        name: beginning of the names of the files.
-        **tum: options of `io.write_tum`, such as the times.
-    """
-    io.write_poses_npy(folder / f"{name}.npy", poses)
-    io.write_tum(folder / f"{name}_tum.txt", poses, **tum)
-    io.write_kitti(folder / f"{name}_kitti.txt", poses)
-
-
-def check_least(options: Any, **least: float) -> None:
-    """Checks the ranges of options that are numbers, tuples of numbers, or None.
-
-    Args:
-        options: the options.
-        **least: the smallest allowed value of each option.
-
-    Raises:
-        ValueError: an option is smaller, or not finite.
-    """
-    for name, smallest in least.items():
-        values = getattr(options, name)
-        for value in values if isinstance(values, tuple) else (values,):
-            if value is not None and not smallest <= value < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')}: expected at least {smallest}, got {value}")
-
-
-def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
-    """Raises a ValueError where a name is not allowed, or no name is given."""
-    unknown = [name for name in names if name not in allowed]
-    if unknown or not names:
-        raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")
-
-
-@contextmanager
-def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Shows a bar while the block runs; yields a callback with the number of finished items and of all.
-
-    Args:
-        description: shown before the bar.
-        unit: unit of the numbers, with a space before it.
-
-    Yields:
-        The callback.
-    """
-    with tqdm(desc=description, unit=unit, dynamic_ncols=True) as bar:
-
-        def on_progress(num_done: int, num_all: int) -> None:
-            bar.total = num_all
-            bar.update(num_done - bar.n)
-
-        yield on_progress

@@ -27,7 +27,6 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from dpmjax import cli, io, slam, viz, weights
 from dpmjax.cli import slam_files as files
 from dpmjax.cli import slam_numbers as results
-from dpmjax.cli.run import Numbers, Run, find_run
 from dpmjax.sequences import LidarSequence, counted, require
 
 
@@ -68,7 +67,7 @@ class SlamOptions(cli.DriveOptions):
             raise ValueError("--max-rmse: give it with --preset paper")
 
 
-def main(options: SlamOptions, run: Run) -> Numbers:
+def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     """Maps a drive and writes the results."""
     from dpmjax.cli.slam_run import find_beginning, run_scans
 
@@ -79,7 +78,7 @@ def main(options: SlamOptions, run: Run) -> Numbers:
     start = slam.init_slam(None if options.map is None else files.open_map(options.map, methods))
     sequence = cli.open_drive(options.data, options, options.sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
-    beginning = find_beginning(find_run("slam", options.output) if options.resume else None, methods, start)
+    beginning = find_beginning(cli.find_run("slam", options.output) if options.resume else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{counted(num_done, 'scan')} done, {len(sequence)} wanted"
     require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
@@ -142,7 +141,7 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
     return slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
 
 
-def write_map_results(run: Run, drive: MappedDrive, numbers: Numbers) -> Numbers:
+def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) -> cli.Numbers:
     """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
     sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
     files.write_trajectory(run.path, result.T_world_scan, sequence.times)

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
-from dpmjax.cli.run import write_poses, write_table
+from dpmjax.cli.result_files import write_poses, write_table
 from dpmjax.cli.slam_numbers import count_parts
 from dpmjax.sequences import LidarSequence, counted
 

@@ -1,9 +1,9 @@
-"""A SLAM run in its folder: progress, interim results, and the state for a resumed run."""
+"""A SLAM run in its folder: progress, and the state for a resumed run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -22,8 +22,6 @@ from dpmjax.sequences import LidarSequence, counted
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
 SAVE_EVERY_S = 10.0
-# Seconds between interim results.
-FLUSH_EVERY_S = 30.0
 # A scan as it was read, and as it is placed.
 _Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
 
@@ -77,7 +75,7 @@ def map_drive(run: Run, sequence: LidarSequence, methods: slam.SlamMethods) -> t
     """Maps a drive from its beginning, or from the state in its folder.
 
     Args:
-        run: folder for the state and interim results.
+        run: folder for the state.
         sequence: the drive.
         methods: matcher, geometry and settings.
 
@@ -104,7 +102,7 @@ def run_scans(
     """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
 
     Args:
-        run: folder for the state and interim results.
+        run: folder for the state.
         reader: reads the scans.
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
@@ -116,7 +114,7 @@ def run_scans(
     clock, sequence = _Clock(), reader.sequence
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
     first, failure, started = len(reports), None, clock.now_s()
-    flushed = saved = time.perf_counter()
+    saved = time.perf_counter()
     resumable: RunState | None = None
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
     with progress as bar, closing(_prepared_scans(reader, methods, first)) as scans:
@@ -138,9 +136,6 @@ def run_scans(
                     show_live(viewer, scan, state, report)
                 bar.set_postfix_str(_progress(state, report, clock.compile_s), refresh=False)
                 bar.update(1)
-                if time.perf_counter() - flushed > FLUSH_EVERY_S:
-                    write_interim(run, sequence, state, reports)
-                    flushed = time.perf_counter()
         except Exception as error:  # what was found is written before it goes on
             failure = error
         finally:
@@ -157,13 +152,6 @@ def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -
         return scan, slam.prepare_ahead(methods, scan)
 
     return slam.in_advance(prepare, range(first, len(reader.sequence)))
-
-
-def write_interim(run: Run, sequence: LidarSequence, state: slam.SlamState, reports: Sequence[slam.ScanReport]) -> None:
-    """Writes the present trajectory and scans.csv."""
-    slam_map, done = state.slam_map, sequence.take(slice(0, len(reports)))
-    files.write_trajectory(run.path, slam.place_scans(slam_map.T_world_keyframe, reports), done.times)
-    files.write_scans(run / "scans.csv", reports, [keyframe.scan for keyframe in slam_map.keyframes], done.sources)
 
 
 def _progress(state: slam.SlamState, report: slam.ScanReport, compile_s: float) -> str:

@@ -34,7 +34,8 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import cli, deeppointmap, io, simulation, weights
 from dpmjax.cli import train_files
-from dpmjax.cli.run import Numbers, Run, RunOptions
+from dpmjax.cli.options import RunOptions
+from dpmjax.cli.run import Numbers, Run
 from dpmjax.sequences import LidarSequence
 
 if TYPE_CHECKING:

@@ -1,0 +1,128 @@
+"""Options of commands: those that several share, the parser, and checks of ranges and names."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, arg
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """Options of every command that writes results."""
+
+    output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
+    """Folder for the results, instead of results/<command>/<time>."""
+    force: FlagCreatePairsOff[bool] = False
+    """Replace OUT and everything in it, where it holds an earlier run."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
+    """Where to compute; without it, JAX chooses."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(OutputOptions):
+    """Options of every command that can be interrupted and resumed.
+
+    Attributes:
+        may_change: options that a resumed run may change, besides those that do not affect the computation.
+    """
+
+    may_change: ClassVar[frozenset[str]] = frozenset()
+
+    seed: int = 0
+    """Seed of everything random."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanOptions:
+    """Options of every command that reads scans or images in a row."""
+
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    """Use the first N scans, after --jump; without it, all."""
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    """Use every Nth scan."""
+
+    @property
+    def selection(self) -> slice:
+        """Returns the rows of the scans to use."""
+        return slice(None, None if self.n_scans is None else self.n_scans * self.jump, self.jump)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions:
+    """Options of every command that uses trained weights."""
+
+    weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
+    """Name of a shipped model, or a .safetensors file; a saved map needs the weights that made it."""
+
+
+def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -> Any:
+    """Makes the options of a command line, or prints the help.
+
+    Args:
+        options_type: frozen dataclass of the options.
+        arguments: the command line.
+        **details: further arguments of `tyro.cli`, such as `prog` and `default`.
+
+    Returns:
+        The options.
+
+    Raises:
+        ValueError: an option is unknown, is missing, or has a wrong value.
+        SystemExit: the help was printed.
+    """
+    width = os.environ.get("COLUMNS")
+    if not {"-h", "--help"} & set(arguments):
+        os.environ["COLUMNS"] = "10000"  # no line breaks within a message
+    try:
+        with redirect_stderr(StringIO()) as box:
+            return tyro.cli(options_type, args=arguments, **details)
+    except SystemExit as done:
+        if not done.code:
+            raise
+    finally:
+        os.environ.pop("COLUMNS", None) if width is None else os.environ.update(COLUMNS=width)
+    # tyro draws a box: a line with the title, the message, a line across, and help.
+    rows = (row[2:].strip("│ ") for row in re.sub("\x1b[^m]*m", "", box.getvalue()).splitlines()[1:])
+    is_text = lambda row: bool(row.strip(" ─-"))  # noqa: E731
+    message = " ".join(itertools.takewhile(is_text, itertools.dropwhile(lambda row: not is_text(row), rows)))
+    own = f"Error parsing {options_type.__name__}: "
+    if message.startswith(own):  # a check of the options themselves
+        raise ValueError(message.removeprefix(own))
+    raise ValueError(f"{message.rstrip('.') or 'wrong options'}; --help describes the options")
+
+
+def check_least(options: Any, **least: float) -> None:
+    """Checks the ranges of options that are numbers, tuples of numbers, or None.
+
+    Args:
+        options: the options.
+        **least: the smallest allowed value of each option.
+
+    Raises:
+        ValueError: an option is smaller, or not finite.
+    """
+    for name, smallest in least.items():
+        values = getattr(options, name)
+        for value in values if isinstance(values, tuple) else (values,):
+            if value is not None and not smallest <= value < math.inf:
+                raise ValueError(f"--{name.replace('_', '-')}: expected at least {smallest}, got {value}")
+
+
+def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
+    """Raises a ValueError where a name is not allowed, or no name is given."""
+    unknown = [name for name in names if name not in allowed]
+    if unknown or not names:
+        raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")

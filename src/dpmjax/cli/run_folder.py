@@ -1,0 +1,124 @@
+"""The folder of a run: found, refused before any work, named by `latest`, and locked."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+from typing import Any
+
+from dpmjax.cli.result_files import as_json, load_json
+
+CONFIG, RESULTS = "config.json", Path("results")
+# Options that do not change the result.
+FREE_OPTIONS = frozenset(
+    {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
+)
+
+
+def load_options(path: Path, options_type: Any) -> Any:
+    """Reads the options of an earlier run; missing options, and those such as `output`, get their defaults.
+
+    Args:
+        path: folder of the run.
+        options_type: dataclass of the options.
+
+    Returns:
+        The options.
+
+    Raises:
+        ValueError: its `config.json` holds an option that `options_type` does not have, or is no JSON.
+    """
+    from dpmjax.weights.config_json import config_from_json
+
+    stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
+    try:
+        return config_from_json(stored, options_type)
+    except ValueError as error:
+        raise ValueError(f"{path / CONFIG} holds options of another command or version: {error}") from error
+
+
+def find_run(name: str, output: Path | None) -> Path:
+    """Finds the folder of an earlier run.
+
+    Args:
+        name: name of the command.
+        output: the folder, or None for the latest run of this command.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: there is none.
+    """
+    path = output or RESULTS / name / "latest"
+    if not (path / CONFIG).is_file():
+        raise ValueError(f"{path} holds no {CONFIG}: it is no run of {name}; name one (--resume -o OUT)")
+    return path if output else path.resolve()
+
+
+def check_same_options(path: Path, options: Any) -> None:
+    """Raises a ValueError where a resumed run would have other options than the earlier one."""
+    if options.force:
+        raise ValueError("--resume continues a run and --force starts it over: give one of them")
+    stored, now = load_json(path / CONFIG), as_json(options)
+    for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - options.may_change):
+        if stored[name] != now[name]:
+            was, is_now = ("not given" if value is None else value for value in (stored[name], now[name]))
+            raise ValueError(
+                f"--{name.replace('_', '-')} was {was} in {path} and is {is_now} now: a resumed run keeps its options; "
+                "start a new run for others"
+            )
+
+
+def check_replaceable(path: Path, options: Any) -> None:
+    """Raises a ValueError for a folder that cannot be written, is not empty, or that --force must not remove."""
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise ValueError(cannot_write(path, "permission denied" if existing.is_dir() else f"{existing} is a file"))
+    if existing != path or not any(path.iterdir()):
+        return
+    if not (path / CONFIG).is_file() or "output" not in load_json(path / CONFIG):
+        raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")
+    if not options.force:
+        resume = "--resume continues it, " if hasattr(options, "resume") else ""
+        raise ValueError(f"{path} holds an earlier run: {resume}--force replaces it, -o names another")
+    values = [value for name, value in vars(options).items() if name != "output"]
+    for value in itertools.chain(*(value if isinstance(value, tuple) else (value,) for value in values)):
+        inside = isinstance(value, str | Path) and str(value) and Path(value).resolve().is_relative_to(path.resolve())
+        if inside and Path(value).exists():
+            raise ValueError(f"--force would remove {value}, an input: name another folder with -o")
+
+
+def cannot_write(path: Path, reason: str) -> str:
+    """Returns the message on a folder that cannot be written."""
+    return f"cannot write to {path}: {reason}; name another folder with -o"
+
+
+def make_latest(path: Path) -> Path:
+    """Makes a new folder, and lets the link `latest` beside it point there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = itertools.chain([path.name], (f"{path.name}_{number}" for number in itertools.count(2)))
+    path = next(new for new in map(path.with_name, names) if not new.exists())
+    path.mkdir()
+    link = path.parent / f".latest_{path.name}"
+    link.symlink_to(path.name, target_is_directory=True)
+    link.replace(path.parent / "latest")
+    return path
+
+
+def lock_folder(path: Path) -> int | None:
+    """Keeps other processes out of a folder, where the system can lock folders."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise ValueError(f"{path}: another process is writing this run; let it end, or stop it") from error
+    except OSError:
+        pass  # a network file system without locks
+    return handle
