@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from dpmjax.io import write_kitti, write_ply, write_tum
 from dpmjax.slam import Match, Proposal, SlamConfig, SlamMethods, SurfaceGeometry
 from tests.cli.test_slam import run
 from tests.data_sets import write_pcd
+from tests.io.test_fuzz import spoil
 from tests.slam.test_odometry import compacted, motion, planes, seen_from
 
 NUM_FUZZED = int(os.environ.get("DPMJAX_NUM_FUZZED_DRIVES", "40"))
@@ -86,32 +86,6 @@ def write_drive(folder: Path, rng: np.random.Generator) -> None:
         (folder / "times.txt").write_text("".join(f"{0.1 * number:.6f}\n" for number in range(NUM_SCANS)))
 
 
-def cut(path: Path, rng: np.random.Generator) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[: int(rng.integers(0, len(content) + 1))])
-
-
-def flip(path: Path, rng: np.random.Generator) -> None:
-    content = bytearray(path.read_bytes())
-    for place in rng.integers(0, len(content), int(rng.integers(1, 30))) if content else ():
-        content[place] = int(rng.integers(256))
-    path.write_bytes(content)
-
-
-def empty(path: Path, rng: np.random.Generator) -> None:
-    path.write_bytes(b"")
-
-
-def foreign(path: Path, rng: np.random.Generator) -> None:
-    heads = [b"\x89PNG\r\n", b"PK\3\4", b"%PDF-1.4", b"ply\nformat", b"\x93NUMPY\1\0", b"# .PCD v0.7\n", b""]
-    path.write_bytes(heads[rng.integers(len(heads))] + rng.bytes(int(rng.integers(0, 400))))
-
-
-def wrong_text(path: Path, rng: np.random.Generator) -> None:
-    words = ["nan", "inf", "1e400", "abc", "0", "-1", "\n", "1 2 3\n", ",", "é", "1e308", "\0"]
-    path.write_text(" ".join(rng.choice(words, int(rng.integers(1, 40)))), encoding="utf-8")
-
-
 def bad_numbers(path: Path, rng: np.random.Generator) -> None:
     values = np.array([np.nan, np.inf, -np.inf, 1e38, 0.0, 1e-40, 1e6], np.float32)
     points = rng.normal(size=(200, 3)).astype(np.float32) * 10
@@ -132,22 +106,7 @@ def few_points(path: Path, rng: np.random.Generator) -> None:
         path.write_text("")
 
 
-def missing(path: Path, rng: np.random.Generator) -> None:
-    path.unlink()
-
-
-def a_folder(path: Path, rng: np.random.Generator) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def another_name(path: Path, rng: np.random.Generator) -> None:
-    path.rename(path.with_name(str(rng.choice(["scan", "-1", "9" * 30, "x y"])) + path.suffix))
-
-
-DAMAGES: tuple[Callable[[Path, np.random.Generator], None], ...] = (
-    cut, flip, empty, foreign, wrong_text, bad_numbers, few_points, missing, a_folder, another_name,
-)  # fmt: skip
+DAMAGES = (bad_numbers, few_points, spoil, spoil, spoil)
 
 
 def damage(folder: Path, rng: np.random.Generator) -> list[str]:
@@ -158,9 +117,9 @@ def damage(folder: Path, rng: np.random.Generator) -> list[str]:
         texts = [path for path in files if path.suffix == ".txt"]
         chosen = texts if texts and rng.random() < 0.4 else files
         if chosen:
-            path, spoil = chosen[rng.integers(len(chosen))], DAMAGES[rng.integers(len(DAMAGES))]
-            spoil(path, rng)
-            done.append(f"{spoil.__name__} {path.name}")
+            path, harm = chosen[rng.integers(len(chosen))], DAMAGES[rng.integers(len(DAMAGES))]
+            harm(path, rng)
+            done.append(f"{harm.__name__} {path.name}")
     return done
 
 

@@ -52,17 +52,6 @@ def test_without_a_right_pair_support_is_that_of_chance() -> None:
     assert max(chance) < min(right)
 
 
-def test_padded_equals_unpadded() -> None:
-    source, target, _, _ = pairs_with_outliers(1, 15, 40)
-    plain = find_consensus(source, target)
-    padding = np.full((9, 3), np.nan, np.float32)
-    mask = np.arange(64) < 55
-    padded = find_consensus(np.concatenate([source, padding]), np.concatenate([target, padding]), mask)
-    np.testing.assert_allclose(padded.T_target_source[0], plain.T_target_source[0], atol=1e-5)
-    assert not padded.is_inlier[:, 55:].any()
-    np.testing.assert_array_equal(padded.is_inlier[0, :55], plain.is_inlier[0])
-
-
 def test_moving_both_frames_moves_the_motion() -> None:
     source, target, _, _ = pairs_with_outliers(2, 20, 40)
     motions = [np.eye(4, dtype=np.float32) for _ in range(2)]

@@ -59,13 +59,6 @@ def test_both_builders_give_the_same_elements(num_valid: int) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), ours, host)
 
 
-def test_padding_changes_no_element() -> None:
-    points = plane(300, 0.02)
-    padded = np.concatenate([points, np.full((50, 3), np.nan, np.float32)])
-    expected, found = elements_of(points), elements_of(padded, np.arange(350) < 300)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **ROUNDING), expected, found)
-
-
 def test_points_of_a_line_or_of_one_place_are_no_plane() -> None:
     line = np.linspace(0, 1, 100, dtype=np.float32)[:, None] * np.array([1, 2, 3], np.float32)
     for points in (line, np.ones((100, 3), np.float32)):

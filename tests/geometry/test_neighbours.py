@@ -34,16 +34,6 @@ def test_neighbours_are_those_of_a_tree(dim: int, k: int) -> None:
     assert near.indices.dtype == jnp.int32
 
 
-@DIMS
-@KS
-def test_masked_points_are_never_found(dim: int, k: int) -> None:
-    queries, points = clouds(1, dim)
-    mask = np.random.default_rng(2).random(len(points)) < 0.5
-    near, expected = jax.device_get((k_nearest(queries, points, k, mask), k_nearest(queries, points[mask], k)))
-    np.testing.assert_array_equal(near.indices, np.flatnonzero(mask)[expected.indices])
-    np.testing.assert_array_equal(near.squared_distances, expected.squared_distances)
-
-
 @KS
 def test_equally_near_points_come_in_order(k: int) -> None:
     points = np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0], [0, 1]], np.float32)

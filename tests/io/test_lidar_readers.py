@@ -28,7 +28,6 @@ from tests.io.drives import (
     write_kitti_360,
     write_kitti_odometry,
     write_kitti_raw,
-    write_mulran,
 )
 
 
@@ -133,11 +132,6 @@ def test_scans_of_kitti_360_that_stand_still_are_interpolated(tmp_path, clouds, 
     assert_same(sequence.take(sequence.has_reference), clouds[1:5], rigid.inverse(wanted[0]) @ wanted)
 
 
-def test_beams_of_mulran_that_met_nothing_are_left_out(tmp_path, clouds, poses):
-    with_nothing = [np.vstack([cloud, np.zeros((5, 3))]) for cloud in clouds]
-    assert_same(open_lidar_sequence(write_mulran(tmp_path, with_nothing, poses, "sensor_data/Ouster")), clouds, poses)
-
-
 FORMATS = {
     ".bin": write_bin,
     ".npy": np.save,
@@ -219,15 +213,6 @@ def test_a_scan_in_millimetres_is_warned_of(tmp_path, clouds, caplog):
     assert caplog.text.count("are these millimetres or centimetres?") == 1
     read_lidar_file(tmp_path / "1.bin")
     assert "1.bin" in caplog.text
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_points_that_are_not_finite_are_left_out_of_every_format(tmp_path, clouds, suffix):
-    holes = clouds[0].copy()
-    holes[2], holes[5, 1], holes[7, 2] = np.nan, np.inf, -np.inf
-    FORMATS[suffix](tmp_path / f"0{suffix}", holes)
-    expected = np.delete(clouds[0], [2, 5, 7], axis=0)
-    np.testing.assert_allclose(read_lidar_file(tmp_path / f"0{suffix}"), expected, rtol=1e-6)
 
 
 def write_timed(folder, kind, points, times):
