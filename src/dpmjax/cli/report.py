@@ -39,7 +39,8 @@ def write_report(folder: Path, read_table: ReadTable) -> Path:
     """
     numbers = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     parts = [_HEAD.format(escape(folder.resolve().name)), f"<p>status: {escape(str(numbers['status']))}</p>"]
-    parts += [f'<p class="verdict">{escape(str(numbers["verdict"]))}</p>'] * ("verdict" in numbers)
+    if "verdict" in numbers:
+        parts.append(f'<p class="verdict">{escape(str(numbers["verdict"]))}</p>')
     parts += [_map_view(folder, path, read_table) for path in map(folder.joinpath, _CLOUDS) if path.exists()]
     for picture in sorted(folder.glob("*.png")):
         code = base64.b64encode(picture.read_bytes()).decode()

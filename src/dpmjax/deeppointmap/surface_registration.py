@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from scipy.special import expit
 
@@ -11,6 +13,7 @@ from dpmjax.deeppointmap.encoding import valid_points
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.prepared_scans import RawScan
 from dpmjax.deeppointmap.verification import VerificationConfig
+from dpmjax.reading import read_path
 from dpmjax.scans.lidar import measure_scan
 from dpmjax.scans.pair_registration import PairEvidence, ScanRegistration
 from dpmjax.scans.pairs import nearest_planes
@@ -22,7 +25,8 @@ def register_surfaces(source: RawScan, target: RawScan) -> ScanRegistration:
     """Registers two lidar scans without a first guess and without a model, as `register` does without descriptors.
 
     Args:
-        source: (n, 3) points in metres, in the frame of the lidar, z up; points that are not finite are dropped.
+        source: (n, 3) points in metres, in the frame of the lidar, z up, or their file; points that are not finite are
+            dropped.
         target: the same.
 
     Returns:
@@ -32,7 +36,8 @@ def register_surfaces(source: RawScan, target: RawScan) -> ScanRegistration:
         ValueError: the points are no real numbers (n, 3).
     """
     config = VerificationConfig()
-    ends = tuple(measure_scan(valid_points(points), config.surface) for points in (source, target))
+    given = (cast(RawScan, read_path(scan, "io.read_lidar_file")) for scan in (source, target))
+    ends = tuple(measure_scan(valid_points(points), config.surface) for points in given)
     chosen = choose_motion(ends[0], ends[1], np.eye(4)[None], config)
     T = refine_motion(ends[0], ends[1], chosen, config).T_target_source
     agreement, surfaces = chosen.verification, (ends[0].surface, ends[1].surface)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from dpmjax.deeppointmap.prepared_scans import RawScan, descriptors_of, prepare_
 from dpmjax.deeppointmap.scan_registration import register_each
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
+from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan
 from dpmjax.slam.joint import near_pairs, refine_jointly
 from dpmjax.types import Pose, Poses
@@ -81,7 +83,7 @@ class RegisteredClouds(NamedTuple):
 
 def register_unposed(
     model: Model,
-    scans: Sequence[RawScan],
+    scans: Sequence[RawScan] | Path,
     *,
     on_stage: Callable[[str], None] = lambda _stage: None,
 ) -> RegisteredClouds:
@@ -89,7 +91,7 @@ def register_unposed(
 
     Args:
         model: a trained model.
-        scans: two or more, (n, 3) points in metres, each in the frame of its lidar.
+        scans: two or more, (n, 3) points in metres, each in the frame of its lidar, or their files; or a folder.
         on_stage: called with the name of each stage.
 
     Returns:
@@ -98,10 +100,11 @@ def register_unposed(
     Raises:
         ValueError: there are fewer than two scans, or the points of one are no real numbers (n, 3).
     """
-    if len(scans) < 2:
-        raise ValueError(f"scans: expected two or more, got {len(scans)}")
-    on_stage(f"encoding of {len(scans)} scans")
-    prepared = prepare_scans(model, scans)
+    given: Sequence[RawScan] = read_path(scans, "io.open_lidar_sequence")
+    if len(given) < 2:
+        raise ValueError(f"scans: expected two or more, got {len(given)}")
+    on_stage(f"encoding of {len(given)} scans")
+    prepared = prepare_scans(model, given)
     pairs = _probable_pairs(model, prepared)
     on_stage(f"registration of {len(pairs)} pairs")
     found = register_each(model, [(prepared[a], prepared[b]) for a, b in pairs])
@@ -110,7 +113,7 @@ def register_unposed(
         for pair, match in zip(pairs, found, strict=True)
     ]
     motions.sort(key=lambda motion: -motion.confidence)
-    T_world, part = join_parts(motions, len(scans))
+    T_world, part = join_parts(motions, len(given))
     on_stage("joint refinement")
     for number in range(part.max() + 1):
         rows = np.flatnonzero(part == number)
