@@ -11,7 +11,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv check test slow demo slam bench docs release-check clean
+.PHONY: help venv check test slow field demo slam bench docs release-check clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' Makefile
@@ -38,6 +38,9 @@ test: $(STAMP)  ## the test suite, without what is slow
 
 slow: $(STAMP)  ## the tests that train, start processes, or compile for seconds
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+field: $(STAMP)  ## the commands on inputs of users that once were wrong, where the data are there (DPMJAX_DATA)
+	$(BIN)/python -m pytest -n 0 -q -m field tests/test_field.py
 
 demo: $(STAMP)  ## register the built-in 2-D world; pictures in results/demo
 	$(BIN)/dpmjax map2d --init odometry --force -o results/demo

@@ -12,7 +12,7 @@ from dpmjax.geometry import rigid, se2
 from dpmjax.scans.lidar import measure_scan
 from dpmjax.simulation.walk2d import scan_world
 from dpmjax.slam.joint import refine_jointly
-from dpmjax.slam.unposed import PairMotion, join_parts
+from dpmjax.slam.unposed import PairMotion, join_scans
 from tests.deeppointmap import toy
 from tests.deeppointmap.test_lookalikes import T_TRUE, room
 from tests.scans.surface_scenes import motion, seen_from
@@ -110,8 +110,8 @@ def T_world() -> np.ndarray:
 def test_unsure_motions_join_parts_only_together(T_world) -> None:
     sure = motions_of(T_world, (1, 0, 0.99), (2, 1, 0.95), (4, 3, 0.97))
     one, two = motions_of(T_world, (3, 2, 0.6)), motions_of(T_world, (3, 2, 0.6), (0, 4, 0.5))
-    assert join_parts(sure + one, 6)[1].tolist() == [0, 0, 0, 1, 1, 2]
-    T, part = join_parts(sure + two, 6)
+    assert join_scans(sure + one, 6)[1].tolist() == [0, 0, 0, 1, 1, 2]
+    T, part = join_scans(sure + two, 6)
     assert part.tolist() == [0, 0, 0, 0, 0, 1]
     np.testing.assert_allclose(rigid.inverse(T[0]) @ T[4], rigid.inverse(T_world[0]) @ T_world[4], atol=1e-9)
 
@@ -119,8 +119,8 @@ def test_unsure_motions_join_parts_only_together(T_world) -> None:
 def test_a_contradicting_answer_of_equal_support_joins_nothing(T_world) -> None:
     right = motions_of(T_world, (1, 0, 0.95))
     rival = [PairMotion(1, 0, motion(90, (5.0, 5.0, 0.0)), 0.94)]
-    assert join_parts(right + rival, 2)[1].tolist() == [0, 1]
-    assert join_parts(right, 2)[1].tolist() == [0, 0]
+    assert join_scans(right + rival, 2)[1].tolist() == [0, 1]
+    assert join_scans(right, 2)[1].tolist() == [0, 0]
 
 
 def test_joint_refinement_recovers_the_poses() -> None:

@@ -19,6 +19,7 @@ from dpmjax.slam.keyframe_map import Keyframe, add_keyframe
 from dpmjax.slam.local_map import local_map_of
 from dpmjax.slam.surface_geometry import CONTRADICTION_WEIGHT
 from dpmjax.types import SurfaceElements
+from experiments.made_cases import scan_gallery
 
 
 def planes(rng: np.random.Generator, *, is_corridor: bool = False, num: int = 4000) -> np.ndarray:
@@ -143,40 +144,16 @@ def test_without_an_end_in_sight_the_way_along_a_corridor_is_unknown(geometry) -
     assert geometry.thin(planes(np.random.default_rng(0))).weak_axis is None
 
 
-def beams_in_gallery(x: float, relief_m: float) -> np.ndarray:
-    """32 beams between two walls 6 m apart, with pilasters of a relief at uneven steps on both."""
-    azimuth, elevation = np.meshgrid(
-        np.linspace(-np.pi, np.pi, 375, endpoint=False), np.deg2rad(np.linspace(-25, 25, 32))
-    )
-    flat = np.cos(elevation)
-    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
-    starts, widths = np.cumsum(np.random.default_rng(0).uniform(0.4, 1.8, (2, 20)), axis=1) - 15, 0.4
-    ranges = np.where(rays[:, 2] < 0, -1.5 / np.minimum(rays[:, 2], -1e-9), np.inf)
-    for side, sign in zip(starts, (-1, 1), strict=True):
-        ahead = np.maximum(sign * rays[:, 1], 1e-9)
-        ranges = np.minimum(ranges, 3.0 / ahead)
-        front = (3.0 - relief_m) / ahead
-        for start in side - x:
-            # The front of a pilaster, and the side of it that faces the lidar.
-            is_front = (front * rays[:, 0] > start) & (front * rays[:, 0] < start + widths)
-            edge = start if start > 0 else start + widths
-            beside = np.where(edge * rays[:, 0] > 0, edge / rays[:, 0], np.inf)
-            is_beside = (beside * ahead > 3.0 - relief_m) & (beside * ahead < 3.0)
-            ranges = np.minimum(ranges, np.where(is_front, front, np.where(is_beside, beside, np.inf)))
-    ranges += np.random.default_rng(round(100 * x)).normal(0, 0.006, len(ranges))
-    return (rays * ranges[:, None])[ranges < 30]
-
-
 @pytest.mark.parametrize("relief_m", [0.03, 0.12, 0.2])
 def test_a_relief_of_centimetres_holds_the_way_along_a_wall(geometry, relief_m: float) -> None:
-    first, second = (geometry.thin(beams_in_gallery(x, relief_m)) for x in (0.0, 0.15))
+    first, second = (geometry.thin(scan_gallery(x, relief_m)) for x in (0.0, 0.15))
     found = geometry.align(map_of_one(first)._replace(surface=first.surface), second, np.eye(4))
     assert_is_at(found, motion(0.15, 0, 0), 0.05, 0.005)
     assert sigma_along(found.information, second.weak_axis) < 0.2
 
 
 def test_a_bare_wall_holds_no_way_along_it(geometry) -> None:
-    first, second = (geometry.thin(beams_in_gallery(x, 0.0)) for x in (0.0, 0.15))
+    first, second = (geometry.thin(scan_gallery(x, 0.0)) for x in (0.0, 0.15))
     for start in (np.eye(4), motion(0.15, 0, 0)):
         found = geometry.align(map_of_one(first)._replace(surface=first.surface), second, start)
         assert sigma_along(found.information, second.weak_axis) > 1

@@ -13,7 +13,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.weak_directions import diagonal_information
 from dpmjax.slam.config import DescriptorConfig
-from dpmjax.slam.front_end import UNKNOWN_M, FrontEndState, RegisteredScan, ScanReport, with_keyframe
+from dpmjax.slam.front_end import UNKNOWN_M, FrontEndState, RegisteredScan, ScanReport, empty_reason, with_keyframe
 from dpmjax.slam.interfaces import Match, PreparedInput, SlamMethods
 from dpmjax.slam.keyframe_map import SUBMAP_RADIUS_M, Keyframe, KeyframeMap, MapEdge, Submap, steps_from, submap_of
 from dpmjax.slam.loops import DESCRIPTOR_INFORMATION
@@ -54,7 +54,7 @@ def place_by_descriptors(
     """
     row, thinned, compact = max(len(slam_map) - 1, 0), scan.thinned, scan.compact
     predicted = state.T_keyframe_last @ np.linalg.matrix_power(state.T_before_last, len(state.dropped) + 1)
-    report = ScanReport(state.num_scans, "empty", "too few points", row, predicted, num_points=scan.num_points)
+    report = ScanReport(state.num_scans, "empty", empty_reason(scan), row, predicted, num_points=scan.num_points)
     state = state._replace(num_scans=state.num_scans + 1)
     if thinned is None or compact is None:
         return state._replace(dropped=(*state.dropped, None)), slam_map, report

@@ -174,7 +174,7 @@ def place_scan(
         The state and the map after the scan, and its report.
     """
     thinned, row = scan.thinned, max(len(slam_map) - 1, 0)
-    report = ScanReport(state.num_scans, "empty", "too few points", row, state.predicted, num_points=scan.num_points)
+    report = ScanReport(state.num_scans, "empty", empty_reason(scan), row, state.predicted, num_points=scan.num_points)
     if thinned is None:
         return state._replace(num_scans=state.num_scans + 1, T_keyframe_last=state.predicted), slam_map, report
     report = report._replace(T_turn=scan.T_turn)
@@ -201,6 +201,18 @@ def place_scan(
             surface = joined_surface((*local_map.keyframes, *recent))
             after = after._replace(recent=recent, local_map=local_map._replace(surface=surface))
     return after, slam_map, report
+
+
+def empty_reason(scan: PreparedInput) -> str:
+    """Returns the reason why a scan has no surface.
+
+    Args:
+        scan: the scan.
+
+    Returns:
+        One text.
+    """
+    return f"too few of its {scan.num_points} points lie on surfaces 1 to 60 m from the lidar"
 
 
 class _Located(NamedTuple):

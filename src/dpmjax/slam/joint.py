@@ -70,7 +70,7 @@ def refine_jointly(
     return T_world
 
 
-def near_pairs(surfaces: Sequence[Surface], T_world_scan: Poses) -> Int[np.ndarray, "p 2"]:
+def scans_in_reach(surfaces: Sequence[Surface], T_world_scan: Poses) -> Int[np.ndarray, "p 2"]:
     """Finds scans that are nearer to each other than the median range of both.
 
     Args:

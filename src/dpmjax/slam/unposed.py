@@ -23,7 +23,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan
-from dpmjax.slam.joint import near_pairs, refine_jointly
+from dpmjax.slam.joint import scans_in_reach, refine_jointly
 from dpmjax.types import Pose, Poses
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
@@ -113,12 +113,12 @@ def register_unposed(
         for pair, match in zip(pairs, found, strict=True)
     ]
     motions.sort(key=lambda motion: -motion.confidence)
-    T_world, part = join_parts(motions, len(given))
+    T_world, part = join_scans(motions, len(given))
     on_stage("joint refinement")
     for number in range(part.max() + 1):
         rows = np.flatnonzero(part == number)
         some = [prepared[row].surface for row in rows]
-        T_world[rows] = refine_jointly(some, T_world[rows], near_pairs(some, T_world[rows]))
+        T_world[rows] = refine_jointly(some, T_world[rows], scans_in_reach(some, T_world[rows]))
     used = [motion._replace(is_used=_agrees(motion, T_world, part)) for motion in motions]
     first = np.array([np.flatnonzero(part == number)[0] for number in part])
     return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(used))
@@ -143,7 +143,7 @@ def _probable_pairs(model: Model, scans: Sequence[Scan]) -> list[tuple[int, int]
     return [(int(a), int(b)) for a, b in pairs[is_taken]]
 
 
-def join_parts(motions: Sequence[PairMotion], count: int) -> tuple[Poses, Int[np.ndarray, " n"]]:
+def join_scans(motions: Sequence[PairMotion], count: int) -> tuple[Poses, Int[np.ndarray, " n"]]:
     """Joins scans to parts, by the motions with most support first.
 
     Args:

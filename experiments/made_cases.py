@@ -1,0 +1,167 @@
+"""Counts answers that are sure and wrong on made scans that tempt: reliefs, shells, other sizes, turns and tunnels.
+
+    python -m experiments.made_cases --draws 20                       20 draws of each kind
+    python -m experiments.made_cases --kinds relief scale --draws 200
+    python -m experiments.made_cases --resume --draws 200             go on, with more draws
+
+The file rows.csv has a row for each kind and draw, table.md a summary. A drive along a relief of 3 to 20 cm is right
+below an ATE of 0.05 m, a pair within 2 m and 5 degrees.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dpmjax import cli, deeppointmap, metrics, simulation, slam, weights
+from dpmjax.geometry import rigid
+
+EXPERIMENT = "made_cases"
+NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M = 25, 0.12, 0.006, 0.9, 0.05
+COLUMNS = ("sure_and_wrong", "right_and_sure", "is_sure", "is_right", "error_m", "seconds")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadeOptions(cli.RunOptions, cli.ModelOptions):
+    """Options of the made cases."""
+
+    may_change: ClassVar[frozenset[str]] = frozenset({"draws", "kinds"})
+
+    kinds: tuple[str, ...] = ("relief", "shell", "scale", "turn", "tunnel")
+    """Kinds of cases."""
+    draws: int = 5
+    """Draws of each kind."""
+
+    def __post_init__(self) -> None:
+        """Checks names and ranges."""
+        cli.check_names("--kinds", self.kinds, MAKERS)
+        cli.check_least(self, draws=1)
+
+
+def main(options: MadeOptions, run: cli.Run) -> cli.Row:
+    """Runs the missing cases, and writes the table."""
+    run.open()
+    model = weights.load_model(options.weights)
+
+    def work(kind: str, draw: int) -> cli.Row:
+        begun, rng = time.process_time(), np.random.default_rng([options.seed, draw, *kind.encode()])
+        if kind == "relief":
+            error_m, is_right, is_sure = map_gallery(model, rng)
+        else:
+            error_m, is_right, is_sure = register_pair(model, *MAKERS[kind](rng))
+        return {
+            "error_m": error_m,
+            "is_right": is_right,
+            "is_sure": is_sure,
+            "sure_and_wrong": is_sure and not is_right,
+            "right_and_sure": is_sure and is_right,
+            "seconds": time.process_time() - begun,
+        }
+
+    cases = [{"kind": kind, "draw": draw} for draw in range(options.draws) for kind in options.kinds]
+    rows = cli.fill_table(run, cases, work)
+    return cli.write_summary(run, cli.summarize(rows, ("kind",), COLUMNS))
+
+
+def scan_gallery(x: float, relief_m: float, *, seed: int = 0) -> np.ndarray:
+    """Simulates 32 beams between two walls 6 m apart, with pilasters of a relief at uneven steps on both.
+
+    Args:
+        x: place of the lidar along the walls.
+        relief_m: depth of the pilasters; 0 for bare walls.
+        seed: of the places of the pilasters.
+
+    Returns:
+        (n, 3) points in the frame of the lidar.
+    """
+    angles = np.linspace(-np.pi, np.pi, 375, endpoint=False), np.deg2rad(np.linspace(-25, 25, 32))
+    azimuth, elevation = np.meshgrid(*angles)
+    flat = np.cos(elevation)
+    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
+    starts, width = np.cumsum(np.random.default_rng(seed).uniform(0.4, 1.8, (2, 20)), axis=1) - 15, 0.4
+    ranges = np.where(rays[:, 2] < 0, -1.5 / np.minimum(rays[:, 2], -1e-9), np.inf)
+    for side, sign in zip(starts, (-1, 1), strict=True):
+        ahead = np.maximum(sign * rays[:, 1], 1e-9)
+        ranges, front = np.minimum(ranges, 3.0 / ahead), (3.0 - relief_m) / ahead
+        for start in side - x:
+            # The front of a pilaster, and the side of it that faces the lidar.
+            is_front = (front * rays[:, 0] > start) & (front * rays[:, 0] < start + width)
+            edge = start if start > 0 else start + width
+            beside = np.where(edge * rays[:, 0] > 0, edge / rays[:, 0], np.inf)
+            is_beside = (beside * ahead > 3.0 - relief_m) & (beside * ahead < 3.0)
+            ranges = np.minimum(ranges, np.where(is_front, front, np.where(is_beside, beside, np.inf)))
+    ranges += np.random.default_rng([seed, round(1000 * x)]).normal(0, NOISE_M, len(ranges))
+    return (rays * ranges[:, None])[ranges < 30]
+
+
+def map_gallery(model: deeppointmap.Model, rng: np.random.Generator) -> tuple[float, bool, bool]:
+    """Maps a drive along a gallery; returns its ATE, and whether it is right and few scans were guessed."""
+    relief_m, seed, poses = rng.uniform(0.03, 0.2), int(rng.integers(1 << 30)), np.tile(np.eye(4), (NUM_SCANS, 1, 1))
+    poses[:, 0, 3] = STEP_M * np.arange(NUM_SCANS)
+    scans = [scan_gallery(pose[0, 3], relief_m, seed=seed) for pose in poses]
+    result = slam.run_slam(model, scans)
+    error_m = float(metrics.trajectory_errors(result.T_world_scan, poses)["ate_m"])
+    num_guessed = sum(report.status not in ("first", "tracked", "network") for report in result.reports)
+    return error_m, error_m < RIGHT_ATE_M, 10 * num_guessed <= NUM_SCANS
+
+
+Pair = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def register_pair(model: deeppointmap.Model, source: np.ndarray, target: np.ndarray, T_true: np.ndarray) -> tuple:
+    """Registers a pair; returns its error, and whether it is right and sure."""
+    found = deeppointmap.register(model, source, target)
+    T = np.asarray(found.T_target_source, np.float64)
+    recall = metrics.registration_recall(T[None], T_true[None])
+    return float(np.linalg.norm((T - T_true)[:3, 3])), bool(recall.is_right[0]), float(found.confidence) >= SURE
+
+
+def draw_pair(rng: np.random.Generator, kind: str, most_apart: int) -> Pair:
+    """Draws two scans of a simulated drive, the second one turned."""
+    drive = simulation.simulate_drive(int(rng.integers(1 << 30)), kind=kind, length_m=160.0)
+    first = int(rng.integers(len(drive)))
+    second = int(np.clip(first + rng.integers(1, most_apart) * rng.choice([-1, 1]), 0, len(drive) - 1))
+    T_turned = np.eye(4)
+    T_turned[:3, :3] = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
+    source, target = (drive.read_points(row).astype(np.float32) for row in (first, second))
+    T = T_turned @ rigid.inverse(drive.T_world_lidar[second]) @ drive.T_world_lidar[first]
+    return source, (target @ T_turned[:3, :3].T).astype(np.float32), T
+
+
+def with_shell(rng: np.random.Generator) -> Pair:
+    """Draws a pair with 0.5 to 10 % of beams without an echo, at the largest range."""
+    source, target, T = draw_pair(rng, "suburb", 6)
+    share, range_m, noise_m = rng.uniform(0.005, 0.1), rng.uniform(25, 50), rng.choice([0.0, 0.1])
+    shelled = []
+    for points in (source, target):
+        near = points[np.linalg.norm(points, axis=1) < range_m - 0.5]
+        rays = rng.normal(size=(int(share * len(near)), 3)) * [1, 1, 0.2]
+        rays *= (range_m + noise_m * rng.normal(size=(len(rays), 1))) / np.linalg.norm(rays, axis=1, keepdims=True)
+        shelled.append(np.concatenate([near, rays]).astype(np.float32))
+    return shelled[0], shelled[1], T
+
+
+def with_scale(rng: np.random.Generator) -> Pair:
+    """Draws a pair whose source is enlarged by 0.9 to 1.1, not by less than 1 %: no motion of it is right."""
+    source, target, T = draw_pair(rng, "suburb", 6)
+    scale = 1 + rng.uniform(0.01, 0.1) * rng.choice([-1, 1])
+    return (scale * source).astype(np.float32), target, np.diag([1e6, 1e6, 1e6, 1]) @ T
+
+
+MAKERS: dict[str, Callable[[np.random.Generator], Pair] | None] = {
+    "relief": None,
+    "shell": with_shell,
+    "scale": with_scale,
+    "turn": lambda rng: draw_pair(rng, "corridor", 6),
+    "tunnel": lambda rng: draw_pair(rng, "tunnel", 80),
+}
+"""Maker of a pair by kind; reliefs are drives."""
+
+
+if __name__ == "__main__":
+    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
