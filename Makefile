@@ -63,8 +63,8 @@ release-check: $(STAMP)  ## build wheel and sdist, and use the wheel in bare env
 	for version in 3.11 3.12 3.13; do \
 	  python$$version --version >/dev/null 2>&1 || { echo "python$$version: not found, left out"; continue; }; \
 	  python$$version -m venv build/release/$$version && \
-	  build/release/$$version/bin/pip install --quiet build/release/*.whl && \
-	  (cd build/release && $$version/bin/python ../../docs/quick_start.py && $$version/bin/dpmjax info) || exit 1; \
+	  build/release/$$version/bin/python -I -m pip install --quiet build/release/*.whl && \
+	  (cd build/release && $$version/bin/python -I ../../docs/quick_start.py && $$version/bin/dpmjax info) || exit 1; \
 	done
 
 clean:  ## remove the environments and the caches (results/ stays)

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.optional import import_or_skip
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
@@ -79,6 +81,17 @@ def test_code_of_pages_and_examples_has_no_type_error_by_the_library(tmp_path) -
         [*mypy, *map(str, sorted(tmp_path.iterdir()))], capture_output=True, text=True, env=environment
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_notebook_runs(tmp_path) -> None:
+    nbformat, nbclient = (import_or_skip(name) for name in ("nbformat", "nbclient"))
+    notebook = nbformat.read(ROOT / "docs" / "notebooks" / "tour.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)  # outputs are of another day
+    nbclient.NotebookClient(notebook, timeout=900, resources={"metadata": {"path": tmp_path}}).execute()
+    kinds = [set(output.get("data", {})) for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert sum("image/png" in kind for kind in kinds) == 3
 
 
 def test_examples_are_numbered_and_short() -> None:
