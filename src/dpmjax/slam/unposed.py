@@ -23,7 +23,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan
-from dpmjax.slam.joint import scans_in_reach, refine_jointly
+from dpmjax.slam.joint import refine_jointly, scans_in_reach
 from dpmjax.types import Pose, Poses
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
