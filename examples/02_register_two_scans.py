@@ -21,3 +21,8 @@ sent, own = (dpmjax.encode(model, points, num_elements=1024) for points in (sour
 match = dpmjax.register(model, sent, own)
 error_m = np.linalg.norm((np.linalg.inv(T_target) @ T_source - match.T_target_source)[:3, 3])
 print(f"by {sent.features.shape} descriptors alone: error {error_m:.3f} m, probability {match.confidence:.3f}")
+
+# Planar scans need no model, nor do depth images, nor lidar scans.
+walk = simulation.simulate_sequence(0, 8)
+planar = dpmjax.register(None, walk.points[0], walk.points[1])
+print(f"planar scans: probability {planar.confidence:.3f}, lead {planar.lead:.2f}")

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,7 +39,7 @@ class MadeOptions(cli.RunOptions, cli.ModelOptions):
 
     def __post_init__(self) -> None:
         """Checks names and ranges."""
-        cli.check_names("--kinds", self.kinds, MAKERS)
+        cli.check_names("--kinds", self.kinds, KINDS)
         cli.check_least(self, draws=1)
 
 
@@ -50,18 +50,9 @@ def main(options: MadeOptions, run: cli.Run) -> cli.Row:
 
     def work(kind: str, draw: int) -> cli.Row:
         begun, rng = time.process_time(), np.random.default_rng([options.seed, draw, *kind.encode()])
-        if kind == "relief":
-            error_m, is_right, is_sure = map_gallery(model, rng)
-        else:
-            error_m, is_right, is_sure = register_pair(model, *MAKERS[kind](rng))
-        return {
-            "error_m": error_m,
-            "is_right": is_right,
-            "is_sure": is_sure,
-            "sure_and_wrong": is_sure and not is_right,
-            "right_and_sure": is_sure and is_right,
-            "seconds": time.process_time() - begun,
-        }
+        answer = KINDS[kind](model, rng)
+        sure = {"sure_and_wrong": answer.is_sure and not answer.is_right, "right_and_sure": all(answer[1:])}
+        return {**answer._asdict(), **sure, "seconds": time.process_time() - begun}
 
     cases = [{"kind": kind, "draw": draw} for draw in range(options.draws) for kind in options.kinds]
     rows = cli.fill_table(run, cases, work)
@@ -99,26 +90,42 @@ def scan_gallery(x: float, relief_m: float, *, seed: int = 0) -> np.ndarray:
     return (rays * ranges[:, None])[ranges < 30]
 
 
-def map_gallery(model: deeppointmap.Model, rng: np.random.Generator) -> tuple[float, bool, bool]:
-    """Maps a drive along a gallery; returns its ATE, and whether it is right and few scans were guessed."""
+class Answer(NamedTuple):
+    """Error of an answer, None where no answer is right, and whether it is right and sure."""
+
+    error_m: float | None
+    is_right: bool
+    is_sure: bool
+
+
+def map_gallery(model: deeppointmap.Model, rng: np.random.Generator) -> Answer:
+    """Maps a drive along a gallery; it is sure where few scans were guessed."""
     relief_m, seed, poses = rng.uniform(0.03, 0.2), int(rng.integers(1 << 30)), np.tile(np.eye(4), (NUM_SCANS, 1, 1))
     poses[:, 0, 3] = STEP_M * np.arange(NUM_SCANS)
     scans = [scan_gallery(pose[0, 3], relief_m, seed=seed) for pose in poses]
     result = slam.run_slam(model, scans)
     error_m = float(metrics.trajectory_errors(result.T_world_scan, poses)["ate_m"])
     num_guessed = sum(report.status not in ("first", "tracked", "network") for report in result.reports)
-    return error_m, error_m < RIGHT_ATE_M, 10 * num_guessed <= NUM_SCANS
+    return Answer(error_m, error_m < RIGHT_ATE_M, 10 * num_guessed <= NUM_SCANS)
 
 
-Pair = tuple[np.ndarray, np.ndarray, np.ndarray]
+class Pair(NamedTuple):
+    """Two scans, and T_target_source; None where no motion is right."""
+
+    source: np.ndarray
+    target: np.ndarray
+    T_target_source: np.ndarray | None
 
 
-def register_pair(model: deeppointmap.Model, source: np.ndarray, target: np.ndarray, T_true: np.ndarray) -> tuple:
-    """Registers a pair; returns its error, and whether it is right and sure."""
-    found = deeppointmap.register(model, source, target)
+def register_pair(model: deeppointmap.Model, pair: Pair) -> Answer:
+    """Registers a pair."""
+    found = deeppointmap.register(model, pair.source, pair.target)
+    is_sure, T_true = float(found.confidence) >= SURE, pair.T_target_source
+    if T_true is None:
+        return Answer(None, False, is_sure)
     T = np.asarray(found.T_target_source, np.float64)
     recall = metrics.registration_recall(T[None], T_true[None])
-    return float(np.linalg.norm((T - T_true)[:3, 3])), bool(recall.is_right[0]), float(found.confidence) >= SURE
+    return Answer(float(np.linalg.norm((T - T_true)[:3, 3])), bool(recall.is_right[0]), is_sure)
 
 
 def draw_pair(rng: np.random.Generator, kind: str, most_apart: int) -> Pair:
@@ -130,7 +137,7 @@ def draw_pair(rng: np.random.Generator, kind: str, most_apart: int) -> Pair:
     T_turned[:3, :3] = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
     source, target = (drive.read_points(row).astype(np.float32) for row in (first, second))
     T = T_turned @ rigid.inverse(drive.T_world_lidar[second]) @ drive.T_world_lidar[first]
-    return source, (target @ T_turned[:3, :3].T).astype(np.float32), T
+    return Pair(source, (target @ T_turned[:3, :3].T).astype(np.float32), T)
 
 
 def with_shell(rng: np.random.Generator) -> Pair:
@@ -143,24 +150,23 @@ def with_shell(rng: np.random.Generator) -> Pair:
         rays = rng.normal(size=(int(share * len(near)), 3)) * [1, 1, 0.2]
         rays *= (range_m + noise_m * rng.normal(size=(len(rays), 1))) / np.linalg.norm(rays, axis=1, keepdims=True)
         shelled.append(np.concatenate([near, rays]).astype(np.float32))
-    return shelled[0], shelled[1], T
+    return Pair(shelled[0], shelled[1], T)
 
 
 def with_scale(rng: np.random.Generator) -> Pair:
     """Draws a pair whose source is enlarged by 0.9 to 1.1, not by less than 1 %: no motion of it is right."""
-    source, target, T = draw_pair(rng, "suburb", 6)
+    pair = draw_pair(rng, "suburb", 6)
     scale = 1 + rng.uniform(0.01, 0.1) * rng.choice([-1, 1])
-    return (scale * source).astype(np.float32), target, np.diag([1e6, 1e6, 1e6, 1]) @ T
+    return Pair((scale * pair.source).astype(np.float32), pair.target, None)
 
 
-MAKERS: dict[str, Callable[[np.random.Generator], Pair] | None] = {
-    "relief": None,
-    "shell": with_shell,
-    "scale": with_scale,
-    "turn": lambda rng: draw_pair(rng, "corridor", 6),
-    "tunnel": lambda rng: draw_pair(rng, "tunnel", 80),
+KINDS: dict[str, Callable[[deeppointmap.Model, np.random.Generator], Answer]] = {
+    "relief": map_gallery,
+    "shell": lambda model, rng: register_pair(model, with_shell(rng)),
+    "scale": lambda model, rng: register_pair(model, with_scale(rng)),
+    "turn": lambda model, rng: register_pair(model, draw_pair(rng, "corridor", 6)),
+    "tunnel": lambda model, rng: register_pair(model, draw_pair(rng, "tunnel", 80)),
 }
-"""Maker of a pair by kind; reliefs are drives."""
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
+from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
 
 pytestmark = [pytest.mark.field, pytest.mark.timeout(3600), pytest.mark.filterwarnings("default")]
 
