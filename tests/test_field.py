@@ -56,8 +56,9 @@ CASES = (
     Case("slam field_3d/nuscenes_5_columns", "ends"),
     Case("depth field_4/depth_turning", "ate_m", 0.1),
     *(Case(f"map2d field_4/{name}", "ate_m", largest) for name, largest in (
-        ("silent_encoder.npz", 0.05), ("clock_back_10s", 0.05), ("one_covered_scan.npz", 0.05), ("empty_bag", 0.0),
-        ("renamed_bag", 0.05), ("walk_48.npz", 0.01), ("sick_codes.npz", 0.01))),
+        ("silent_encoder.npz", 0.05), ("one_covered_scan.npz", 0.05), ("walk_48.npz", 0.01), ("sick_codes.npz", 0.01))),
+    # Bags have no true poses: a line of the table shows what is said of them.
+    *(Case(f"map2d field_4/{name}", "ends") for name in ("clock_back_10s", "empty_bag", "renamed_bag")),
     *(Case(f"map2d field_2d/{name}.npz", "ate_m", 0.3) for name in (
         "aca_corridor", "aca_degrees", "aca_dup", "aca_inf", "aca_maxwall", "aca_mirror80", "aca_odo_degrees",
         "johnhbell_scans")),
