@@ -41,22 +41,19 @@ FLOOR_M, FLOOR_RAD = 0.01, math.radians(0.05)
 NUM_SAMPLES, RADIUS_M = 3000, 0.5
 
 
-def refine_jointly(
-    surfaces: Sequence[Surface], T_world_scan: Poses, pairs: Int[np.ndarray, "p 2"], *, num_rounds: int = NUM_ROUNDS
-) -> Poses:
+def refine_jointly(surfaces: Sequence[Surface], T_world_scan: Poses, pairs: Int[np.ndarray, "p 2"]) -> Poses:
     """Refines the poses of scans by the alignments of pairs that see the same surfaces.
 
     Args:
         surfaces: surface of each of n scans.
         T_world_scan: (n, 4, 4) poses, right within about a metre and 5 degrees relative to each other.
         pairs: rows of scans that overlap; each pair once.
-        num_rounds: rounds of alignment and optimisation.
 
     Returns:
         The poses; the first scan stays where it is. Scans that no pair joins to others stay, too.
     """
     T_world = np.array(T_world_scan, np.float64)
-    for _ in range(num_rounds):
+    for _ in range(NUM_ROUNDS):
         found = [(pair, align_pair(surfaces, T_world, pair)) for pair in pairs.tolist()]
         kept = [(pair, *edge) for pair, edge in found if edge is not None]
         if not kept:

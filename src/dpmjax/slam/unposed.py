@@ -6,8 +6,9 @@ parts where several agree. Each part is refined jointly. Parts that no motion jo
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,8 @@ from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan
 from dpmjax.slam.joint import refine_jointly, scans_in_reach
 from dpmjax.types import Pose, Poses
+
+_log = logging.getLogger(__name__)
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
 # ones that are registered: fewer leave scans alone, more take longer.
@@ -81,18 +84,12 @@ class RegisteredClouds(NamedTuple):
         return not self.part.any()
 
 
-def register_unposed(
-    model: Model,
-    scans: Sequence[RawScan] | Path,
-    *,
-    on_stage: Callable[[str], None] = lambda _stage: None,
-) -> RegisteredClouds:
-    """Registers 3-D scans that have no poses and no order.
+def register_unposed(model: Model, scans: Sequence[RawScan] | Path) -> RegisteredClouds:
+    """Registers 3-D scans that have no poses and no order; takes some seconds a scan, and logs its stages.
 
     Args:
         model: a trained model.
         scans: two or more, (n, 3) points in metres, each in the frame of its lidar, or their files; or a folder.
-        on_stage: called with the name of each stage.
 
     Returns:
         The poses, and the parts that they are comparable in.
@@ -103,10 +100,10 @@ def register_unposed(
     given: Sequence[RawScan] = read_path(scans, "io.open_lidar_sequence")
     if len(given) < 2:
         raise ValueError(f"scans: expected two or more, got {len(given)}")
-    on_stage(f"encoding of {len(given)} scans")
+    _log.info("encoding of %d scans", len(given))
     prepared = prepare_scans(model, given)
     pairs = _probable_pairs(model, prepared)
-    on_stage(f"registration of {len(pairs)} pairs")
+    _log.info("registration of %d pairs, about half a second each", len(pairs))
     found = register_each(model, [(prepared[a], prepared[b]) for a, b in pairs])
     motions = [
         PairMotion(*pair, np.asarray(match.T_target_source, np.float64), float(match.confidence))
@@ -114,7 +111,7 @@ def register_unposed(
     ]
     motions.sort(key=lambda motion: -motion.confidence)
     T_world, part = join_scans(motions, len(given))
-    on_stage("joint refinement")
+    _log.info("joint refinement")
     for number in range(part.max() + 1):
         rows = np.flatnonzero(part == number)
         some = [prepared[row].surface for row in rows]
