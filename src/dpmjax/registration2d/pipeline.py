@@ -221,14 +221,7 @@ def register_scans(
     if config.refine and not hooks.stop():
         found |= _refined_candidates(run, found)
     hooks.report(_CHOICE, "choice and assessment")
-    kept, scores, assessment = _choose(run, found)
-    if evidence is None and config.is_ordered and config.refine and len(lines) > 2 and not hooks.stop():
-        restored = put_back_slid(lines, found[kept])
-        if restored is not None:
-            kept = f"{kept}, slid steps put back"
-            found[kept] = restored
-            _, own, assessment = _choose(run, {kept: restored})
-            scores |= own
+    kept, scores, assessment = _choose_mended(run, found)
     is_doubtful = evidence is not None and not evidence.is_mirrored and not assessment.is_trusted
     if is_doubtful and isinstance(start, str) and start == "auto" and config.refine and not hooks.stop():
         report = partial(hooks.report, _RETRIAL, "the map from odometry cannot be trusted: registration without it")
@@ -278,6 +271,19 @@ def _choose(run: _Run, candidates: dict[str, Floats]) -> tuple[str, dict[str, Sc
     fatal = fault if run.evidence is not None and run.evidence.is_mirrored else None
     assessment = assess_trajectory(run.lines, candidates[kept], prior=run.prior, fault=fatal)
     return kept, scores, assessment._replace(fault=fault)
+
+
+def _choose_mended(run: _Run, candidates: dict[str, Floats]) -> tuple[str, dict[str, Score], Assessment]:
+    """Chooses as `_choose`; without odometry, the best one with its slid steps put back is kept, if it is better."""
+    kept, scores, assessment = _choose(run, candidates)
+    is_mended = run.evidence is None and run.config.is_ordered and run.config.refine and len(run.lines) > 2
+    restored = put_back_slid(run.lines, candidates[kept]) if is_mended and not run.hooks.stop() else None
+    if restored is None:
+        return kept, scores, assessment
+    kept = f"{kept}, slid steps put back"
+    candidates[kept] = restored
+    _, own, assessment = _choose(run, {kept: restored})
+    return kept, scores | own, assessment
 
 
 def _checked_start(
