@@ -11,12 +11,13 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "dpmjax"
 
-EVERYBODY_MAY = {"types", "checks", "sequences", "reading", "kept_programs"}
+EVERYBODY_MAY = {"types", "checks", "sequences", "reading", "progress", "kept_programs"}
 ALLOWED: dict[str, set[str]] = {
     "types": set(),
     "checks": {"compile_cache"},
     "sequences": set(),
     "reading": set(),
+    "progress": set(),
     "checkpoints": set(),
     "compile_cache": set(),
     "kept_programs": {"compile_cache"},

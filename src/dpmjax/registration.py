@@ -18,7 +18,8 @@ from dpmjax.checks import runs_on_host
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.prepared_scans import RawScan, ScanOrCloud
-from dpmjax.registration2d.pipeline import RegisteredScans, RegistrationConfig
+from dpmjax.progress import progress_bar
+from dpmjax.registration2d.pipeline import RegisteredScans, RegistrationConfig, RegistrationHooks
 from dpmjax.scans.pair_registration import ScanRegistration
 from dpmjax.slam.unposed import RegisteredClouds, register_unposed
 from dpmjax.types import Registration, ScanSet
@@ -84,7 +85,9 @@ def _kind(scan: Any) -> str:
 
 
 @overload
-def register_scans(model: Model, scans: Sequence[RawScan], *, is_ordered: bool = False) -> RegisteredClouds: ...
+def register_scans(
+    model: Model, scans: Sequence[RawScan], *, is_ordered: bool = False, progress: bool = True
+) -> RegisteredClouds: ...
 
 
 @overload
@@ -93,7 +96,9 @@ def register_scans(
 ) -> RegisteredScans: ...
 
 
-def register_scans(*scans: Any, is_ordered: bool | None = None, **options: Any) -> RegisteredScans | RegisteredClouds:
+def register_scans(
+    *scans: Any, is_ordered: bool | None = None, progress: bool = True, **options: Any
+) -> RegisteredScans | RegisteredClouds:
     """Registers a set of scans of one sensor: planar scans, or 3-D scans without poses and order by a model.
 
         register_scans(scans, config, key=key)              # planar: `registration2d.register_scans`
@@ -103,6 +108,7 @@ def register_scans(*scans: Any, is_ordered: bool | None = None, **options: Any) 
         *scans: planar scans (n, b, 2) and perhaps their settings; or a model and a list of (n, 3) arrays, metres.
         is_ordered: True where the scans are in the order of time. None: as the settings say for planar scans, and
             False for 3-D scans, which `run_slam` maps in order.
+        progress: False shows no bar; hooks of your own take its place.
         **options: of `registration2d.register_scans`: key, start, odometry, hooks.
 
     Returns:
@@ -114,8 +120,14 @@ def register_scans(*scans: Any, is_ordered: bool | None = None, **options: Any) 
     if isinstance(scans[0], Model):
         if is_ordered:
             raise ValueError("is_ordered: expected False for 3-D scans; run_slam maps them in the order of time")
-        return register_unposed(*scans, **options)
+        return register_unposed(*scans, progress=progress, **options)
     if is_ordered is not None:
         config = (scans[1] if len(scans) > 1 else options.pop("config", None)) or RegistrationConfig()
         scans = (scans[0], replace(config, is_ordered=is_ordered))
-    return registration2d.register_scans(*scans, **options)
+    hooks = options.pop("hooks", None)
+    with progress_bar("registration", is_shown=progress and hooks is None) as bar:
+
+        def show(share: float) -> None:
+            bar.update(share - bar.n)
+
+        return registration2d.register_scans(*scans, hooks=hooks or RegistrationHooks(on_share=show), **options)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple, cast
 
@@ -16,11 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import Beams, require_type, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
-from dpmjax.deepmapping.engine import Fit, Report, fit
+from dpmjax.deepmapping.engine import Fit, Progress, Report, fit
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
 from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
+from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.registration_rgbd.depth_images import DepthScans, as_depth_scans
 from dpmjax.registration_rgbd.projective_consistency import projective_consistency
@@ -145,7 +147,8 @@ def fit_deepmapping(
     *,
     key: jax.Array,
     start: ArrayLike | None = None,
-    engine: Callable[..., Fit] = fit,
+    engine: Callable[..., Fit] | None = None,
+    progress: bool = True,
 ) -> Fitted:
     """Registers scans by optimising L-Net and M-Net on them alone (DeepMapping eq. 6).
 
@@ -157,7 +160,9 @@ def fit_deepmapping(
         start: initial poses, as `mapping_data` takes them; None: cold start, of all poses at zero, or free poses at the
             output of the untrained L-Net.
         engine: training function, called as `engine(problem, data, key=key)`;
-            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped.
+            `functools.partial(fit, on_report=..., stop=...)` reports each call of the step and can be stopped. None:
+            `fit` with a bar.
+        progress: False shows no bar.
 
     Returns:
         Fitted, poses in the unit of the points. The world is that of `start`, or arbitrary after a cold start.
@@ -168,7 +173,13 @@ def fit_deepmapping(
     config = config or DeepMappingConfig()
     require_type("config", config, DeepMappingConfig, "DeepMappingConfig or preset")
     data, unit = mapping_data(scans, start, unit=config.unit)
-    done = engine(mapping_problem(config, data), data, key=key)
+    problem = mapping_problem(config, data)
+    with progress_bar("DeepMapping", is_shown=progress and engine is None) as bar:
+
+        def show(report: Progress) -> None:
+            bar.update(report.share - bar.n)
+
+        done = (engine or partial(fit, on_report=show))(problem, data, key=key)
     poses = _SENSORS[type(data.scans)].unscaled(done.poses, unit)
     return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 
@@ -180,7 +191,8 @@ def register_depth(
     *,
     key: jax.Array,
     start: ArrayLike | PlacedImages | None = None,
-    engine: Callable[..., Fit] = fit,
+    engine: Callable[..., Fit] | None = None,
+    progress: bool = True,
 ) -> Registered:
     """Registers depth images by a search of initial poses and DeepMapping (section 4.2), and keeps the better poses.
 
@@ -195,6 +207,7 @@ def register_depth(
         key: key of the search and of the fit.
         start: (n, 4, 4) initial T_world_camera, or the result of `initialize_depth`, which is called for None.
         engine: engine of the fit, as in `fit_deepmapping`.
+        progress: False shows no bar.
 
     Returns:
         Registered, in the world of the start.
@@ -215,7 +228,7 @@ def register_depth(
     chosen = scans if len(keyframes) == len(scans.mask) else scans.take(keyframes)
     # Search and fit share the key, so that a fit from found poses equals a fit from the same poses, given as `start`.
     T_start = given[keyframes] if given.shape == (len(scans.mask), 4, 4) else given
-    fitted = fit_deepmapping(chosen, config, key=key, start=T_start, engine=engine)
+    fitted = fit_deepmapping(chosen, config, key=key, start=T_start, engine=engine, progress=progress)
     poses = {"fit": fitted.T_world_scan, "start": T_start}
     misfits = {name: 1.0 - float(projective_consistency(chosen, T)) for name, T in poses.items()}
     # Images at poses that are not finite contradict nothing.

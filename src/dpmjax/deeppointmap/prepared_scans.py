@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, cast
 
@@ -52,7 +52,7 @@ def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Scan:
     return prepare_scans(model, [points], scale=scale)[0]
 
 
-def prepare_scans(model: Model, scans: Sequence[RawScan], *, scale: float = 1.0) -> list[Scan]:
+def prepare_scans(model: Model, scans: Iterable[RawScan], *, scale: float = 1.0) -> list[Scan]:
     """Prepares scans in their order; threads measure their surfaces while JAX encodes.
 
     Raises a `ValueError` if the points of a scan are no real numbers (n, 3).

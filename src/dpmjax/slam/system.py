@@ -5,7 +5,7 @@ The work on a scan that needs no map is done in a thread, one scan ahead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from dpmjax.checks import as_host_points, require_shape, require_type, runs_on_h
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import PoseGraph
+from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.scans.corrections import deskew
 from dpmjax.slam.config import SlamConfig
@@ -201,6 +202,7 @@ def run_slam(
     config: SlamConfig | None = None,
     *,
     slam_map: KeyframeMap | str | Path | None = None,
+    progress: bool = True,
 ) -> SlamResult:
     """Makes one map of a drive by odometry, loop closure and optimisation of the pose graph (DeepPointMap section 4).
 
@@ -212,6 +214,7 @@ def run_slam(
             files, or the folder or bag of a drive (`io.open_lidar_sequence`). `TimedScan`s are deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
         slam_map: map from `load_map`, or its file, to be extended; None begins an empty one.
+        progress: False shows no bar.
 
     Returns:
         `T_world_scan` of every scan, keyframes, loops, graph, map and reports.
@@ -223,9 +226,12 @@ def run_slam(
     methods, reports = as_methods(model, config), []
     state = init_slam(read_path(slam_map, "saved_maps.load_map"))
     drive: Iterable[AnyScan] = read_path(scans, "io.open_lidar_sequence")
-    for scan in in_advance(partial(prepare_ahead, methods), drive):
-        state, report = step_slam(methods, state, scan)
-        reports.append(report)
+    total = len(drive) if isinstance(drive, Sized) else None
+    prepared = in_advance(partial(prepare_ahead, methods), drive)
+    with progress_bar("SLAM", prepared, total=total, unit="scans", is_shown=progress) as bar:
+        for scan in bar:
+            state, report = step_slam(methods, state, scan)
+            reports.append(report)
     return finish_slam(state, reports, methods.config)
 
 

@@ -6,7 +6,6 @@ parts where several agree. Each part is refined jointly. Parts that no motion jo
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,12 +21,11 @@ from dpmjax.deeppointmap.prepared_scans import RawScan, descriptors_of, prepare_
 from dpmjax.deeppointmap.scan_registration import register_each
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
+from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan
 from dpmjax.slam.joint import refine_jointly, scans_in_reach
 from dpmjax.types import Pose, Poses
-
-_log = logging.getLogger(__name__)
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
 # ones that are registered: fewer leave scans alone, more take longer.
@@ -42,6 +40,9 @@ SURE, MAX_RIVAL = 0.9, 0.5
 
 # Less probable motions support nothing.
 LEAST_CONFIDENCE = 0.05
+
+# Number of pairs that are registered between two counts of the bar.
+_BATCH = 8
 
 # Two motions agree if they put a scan to the same place.
 AGREE_M, AGREE_RAD = 2.0, math.radians(5.0)
@@ -84,12 +85,13 @@ class RegisteredClouds(NamedTuple):
         return not self.part.any()
 
 
-def register_unposed(model: Model, scans: Sequence[RawScan] | Path) -> RegisteredClouds:
-    """Registers 3-D scans that have no poses and no order; takes some seconds a scan, and logs its stages.
+def register_unposed(model: Model, scans: Sequence[RawScan] | Path, *, progress: bool = True) -> RegisteredClouds:
+    """Registers 3-D scans that have no poses and no order; takes some seconds a scan.
 
     Args:
         model: a trained model.
         scans: two or more, (n, 3) points in metres, each in the frame of its lidar, or their files; or a folder.
+        progress: False shows no bars.
 
     Returns:
         The poses, and the parts that they are comparable in.
@@ -100,22 +102,25 @@ def register_unposed(model: Model, scans: Sequence[RawScan] | Path) -> Registere
     given: Sequence[RawScan] = read_path(scans, "io.open_lidar_sequence")
     if len(given) < 2:
         raise ValueError(f"scans: expected two or more, got {len(given)}")
-    _log.info("encoding of %d scans", len(given))
-    prepared = prepare_scans(model, given)
+    with progress_bar("encode", given, unit="scans", is_shown=progress) as bar:
+        prepared = prepare_scans(model, bar)
     pairs = _probable_pairs(model, prepared)
-    _log.info("registration of %d pairs, about half a second each", len(pairs))
-    found = register_each(model, [(prepared[a], prepared[b]) for a, b in pairs])
+    with progress_bar("register", total=len(pairs), unit="pairs", is_shown=progress) as bar:
+        found = []
+        for begin in range(0, len(pairs), _BATCH):
+            some = pairs[begin : begin + _BATCH]
+            found += register_each(model, [(prepared[a], prepared[b]) for a, b in some])
+            bar.update(len(some))
     motions = [
         PairMotion(*pair, np.asarray(match.T_target_source, np.float64), float(match.confidence))
         for pair, match in zip(pairs, found, strict=True)
     ]
     motions.sort(key=lambda motion: -motion.confidence)
     T_world, part = join_scans(motions, len(given))
-    _log.info("joint refinement")
     for number in range(part.max() + 1):
         rows = np.flatnonzero(part == number)
-        some = [prepared[row].surface for row in rows]
-        T_world[rows] = refine_jointly(some, T_world[rows], scans_in_reach(some, T_world[rows]))
+        surfaces = [prepared[row].surface for row in rows]
+        T_world[rows] = refine_jointly(surfaces, T_world[rows], scans_in_reach(surfaces, T_world[rows]))
     used = [motion._replace(is_used=_agrees(motion, T_world, part)) for motion in motions]
     first = np.array([np.flatnonzero(part == number)[0] for number in part])
     return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(used))

@@ -36,6 +36,7 @@ from dpmjax.deeppointmap.training.overlap_stage import (
 from dpmjax.deeppointmap.training.processes import device_mesh, from_first, is_first, place
 from dpmjax.deeppointmap.training.scan_store import SampleMaker, ScanStore, prepare_drives
 from dpmjax.deeppointmap.training.step import TrainingReport, TrainingState, finish, init_training, make_step
+from dpmjax.progress import progress_bar
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import AnyArray, with_short_repr
 
@@ -115,7 +116,7 @@ class TrainingHooks:
 
     evaluate: Callable[[Model], float] | None = None
     evaluate_every: int = 100
-    on_report: Callable[[StepRecord, TrainingProgress], None] | None = None
+    on_report: Callable[[StepRecord, TrainingProgress], object] | None = None
     # int() is 0: by default nothing ends training.
     stop: Callable[[], int] = int
     steps_left: Callable[[int], int] | None = None
@@ -185,9 +186,6 @@ def after_evaluation(progress: TrainingProgress, score: float) -> TrainingProgre
     return TrainingProgress(state, state.params, np.asarray(score, np.float32), np.asarray(state.step, np.int32))
 
 
-NO_HOOKS = TrainingHooks()
-
-
 @runs_on_host("take the gradient of a loss on encode_pyramid there")
 def train(
     drives: Sequence[LidarSequence] | ScanStore,
@@ -196,7 +194,7 @@ def train(
     seed: int = 0,
     start: TrainingProgress | Model | None = None,
     cache: Path | None = None,
-    hooks: TrainingHooks = NO_HOOKS,
+    hooks: TrainingHooks | None = None,
 ) -> Trained:
     """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
 
@@ -213,7 +211,8 @@ def train(
         start: progress to continue from, of which that of process 0 counts; or a model with the first parameters;
             None begins with random ones.
         cache: folder where scans that are prepared here are kept for later calls; None keeps them in memory.
-        hooks: evaluation, which chooses the best model, reports and stopping.
+        hooks: evaluation, which chooses the best model, reports and stopping; None shows a bar, and
+            `TrainingHooks()` nothing.
 
     Returns:
         The model, without calibration, and the progress.
@@ -240,7 +239,9 @@ def train(
     config = config.for_scans(len(store.table), num_samples=jax.device_count())
     if not isinstance(start, TrainingProgress):
         begun = replace(begun, state=replace(begun.state, end=np.asarray(config.num_steps, np.int32)))
-    progress, stopped_by, speed = _run_steps(store, config, hooks, begun, seed=seed)
+    with progress_bar("train", total=config.num_steps, unit="steps", is_shown=hooks is None) as bar:
+        shown = hooks or TrainingHooks(on_report=lambda record, _: bar.update(record.step - bar.n))
+        progress, stopped_by, speed = _run_steps(store, config, shown, begun, seed=seed)
     params = progress.best_params if int(progress.best_step) > 0 else progress.state.params
     ended = replace(config.model, trained=() if stopped_by else ("registration",))
     first = Trained(_local(Model(params, ended)), progress, stopped_by, speed)
@@ -250,14 +251,17 @@ def train(
 
 
 def _with_trained_head(
-    first: Trained, store: ScanStore, config: TrainingConfig, hooks: TrainingHooks, *, seed: int
+    first: Trained, store: ScanStore, config: TrainingConfig, hooks: TrainingHooks | None, *, seed: int
 ) -> Trained:
     """Does the second stage, in process 0."""
     state = init_overlap(first.model)
+    num_steps = config.overlap.num_steps(len(store.table))
     if is_first():
-        _, state = train_overlap(store, first.model, config, seed=seed, hooks=OverlapHooks(stop=hooks.stop))
+        with progress_bar("train overlap", total=num_steps, unit="steps", is_shown=hooks is None) as bar:
+            shown = OverlapHooks(lambda *_: bar.update()) if hooks is None else OverlapHooks(stop=hooks.stop)
+            _, state = train_overlap(store, first.model, config, seed=seed, hooks=shown)
     state = from_first(state)
-    is_whole = int(state.step) >= config.overlap.num_steps(len(store.table))
+    is_whole = int(state.step) >= num_steps
     model = _local(with_head(first.model, state.head, is_trained=is_whole))
     return first._replace(model=model, stopped_by=0 if is_whole else 1, overlap=state)
 

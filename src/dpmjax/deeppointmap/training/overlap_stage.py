@@ -82,7 +82,7 @@ class OverlapHooks:
         stop: called before each step; any number but 0 ends the stage.
     """
 
-    on_report: Callable[[OverlapRecord, OverlapState], None] | None = None
+    on_report: Callable[[OverlapRecord, OverlapState], object] | None = None
     # int() is 0: by default nothing ends the stage.
     stop: Callable[[], int] = int
 
