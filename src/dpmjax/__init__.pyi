@@ -11,6 +11,7 @@ from . import losses as losses
 from . import metrics as metrics
 from . import nets as nets
 from . import pose_graph as pose_graph
+from . import progress as progress
 from . import reading as reading
 from . import registration as registration
 from . import registration2d as registration2d

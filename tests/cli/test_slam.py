@@ -31,7 +31,7 @@ REPOSITORY = Path(__file__).parents[2]
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
 SAME_FILES = (
     "trajectory.npy", "trajectory_tum.txt", "trajectory_kitti.txt", "odometry.npy", "keyframes.txt", "graph.g2o",
-    "loops.csv", "scans.csv", "map.ply", "map.npz",
+    "covariances.npy", "loops.csv", "scans.csv", "map.ply", "map.npz",
 )  # fmt: skip
 
 

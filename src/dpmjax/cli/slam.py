@@ -9,9 +9,9 @@
     dpmjax slam --resume                                continue the latest run
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
-graph.g2o, keyframes.txt, map.npz, map.ply, trajectory.png, map.png and metrics.json. The tables scans.csv and loops.csv
-have the reason of every decision. The file map.npz can be extended, and serves `dpmjax localize`. Ctrl-C ends the run
-and writes all files too.
+graph.g2o, covariances.npy, keyframes.txt, map.npz, map.ply, trajectory.png, map.png and metrics.json. The tables
+scans.csv and loops.csv have the reason of every decision. The file map.npz can be extended, and serves `dpmjax
+localize`. Ctrl-C ends the run and writes all files too.
 """
 
 from __future__ import annotations

@@ -48,9 +48,10 @@ def write_trajectory(
 
 
 def write_graph(folder: Path, result: slam.SlamResult) -> None:
-    """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
+    """Writes graph.g2o, covariances.npy, and keyframes.txt (number and pose of each keyframe)."""
     if result.graph is not None:
         io.write_g2o(folder / "graph.g2o", result.graph)
+        np.save(folder / "covariances.npy", result.covariances)
     poses, frame = result.map.T_world_keyframe, "T_map_keyframe; stamps are numbers of scans"
     io.write_tum(folder / "keyframes.txt", poses, times=result.keyframes, frame=frame)
 

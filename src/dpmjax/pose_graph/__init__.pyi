@@ -1,3 +1,4 @@
+from .covariances import pose_covariances as pose_covariances
 from .dense import DenseSolution as DenseSolution
 from .dense import solve_dense as solve_dense
 from .free_nodes import FreeNodes as FreeNodes

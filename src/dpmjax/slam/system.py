@@ -17,6 +17,7 @@ from jaxtyping import Float
 from dpmjax.checks import as_host_points, require_shape, require_type, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
+from dpmjax.pose_graph.covariances import pose_covariances
 from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
@@ -80,6 +81,11 @@ class SlamResult(NamedTuple):
     def __repr__(self) -> str:
         accepted = sum(loop.status == "accepted" for loop in self.loops)
         return f"SlamResult({len(self.reports)} scans, {len(self.keyframes)} keyframes, {accepted} loops)"
+
+    @property
+    def covariances(self) -> Float[np.ndarray, "k 6 6"]:
+        """Covariances of the poses of the keyframes (`pose_graph.pose_covariances`), computed at each access."""
+        return np.zeros((0, 6, 6)) if self.graph is None else pose_covariances(self.graph)
 
     @property
     def map(self) -> KeyframeMap:
