@@ -1,7 +1,7 @@
 """Pages of the site that are made from other files, and links that leave the site.
 
 index.md is README.md, reference.md has the docstring of each name of api.md, and examples.md has the examples and
-what they printed.
+what they printed. Each guide ends with what the examples printed that it links to.
 Links to files outside docs/ lead to the repository, where its address is known.
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
+MADE = runpy.run_path(str(ROOT / "docs" / "run_examples.py"))
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -40,7 +41,9 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return f"[{text}](index.md#{anchor})"
         return f"[{text}]({config.repo_url.rstrip('/')}/blob/main/{path})" if config.repo_url else text
 
-    return re.sub(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)", outside, markdown)
+    linked = sorted(set(re.findall(r"\(\S*examples/(\d\d_\w+)\.py\)", markdown)))
+    shown = [printed(name) for name in linked if page.file.src_uri.startswith("guides/")]
+    return "\n\n".join([re.sub(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)", outside, markdown), *shown])
 
 
 def reference() -> str:
@@ -56,11 +59,12 @@ def reference() -> str:
 def examples() -> str:
     """Returns the page of the examples: the code of each, and what it printed."""
     parts = ["# Examples\n\nEach is a file in `examples/`, which the tests run.\n"]
-    made = runpy.run_path(str(ROOT / "docs" / "run_examples.py"))
-    outputs = made["outputs"]()
-    for path in made["EXAMPLES"]:
+    for path in MADE["EXAMPLES"]:
         title = path.stem[3:].replace("_", " ").capitalize()
-        parts.append(f"## {title}\n\n```python\n{path.read_text(encoding='utf-8')}```\n")
-        if path.name in outputs:
-            parts.append(f"It prints:\n\n```\n{outputs[path.name]['output']}```\n")
+        parts.append(f"## {title}\n\n```python\n{path.read_text(encoding='utf-8')}```\n\n{printed(path.stem)}")
     return "\n".join(parts)
+
+
+def printed(name: str) -> str:
+    """Returns what an example printed when it was run."""
+    return f"`examples/{name}.py` prints:\n\n```\n{MADE['outputs']()[name + '.py']['output']}```\n"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import dpmjax
 from dpmjax import deeppointmap, simulation
 
-# One stage of the curriculum, pairs of scans; the preset has several, up to groups of eight scans.
+# One stage of the curriculum, pairs; the preset has several, up to groups of eight.
 stages = (deeppointmap.CurriculumStage(max_group=2, num_steps=10),)
 settings = replace(deeppointmap.training_preset("tiny"), curriculum=stages, num_variants=1, stages=("registration",))
 
