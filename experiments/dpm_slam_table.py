@@ -194,7 +194,7 @@ def map_by_agents(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods)
     T_world_scan, num_maps = np.concatenate(found.T_world_scan), max(found.component) + 1
     for component in range(num_maps):
         save_map(run / f"map_{component + 1}.npz", slam.take_component(found.joined, component))
-    cli.write_trajectory(run.path, T_world_scan, None)
+    cli.write_poses(run.path, T_world_scan, frame="T_world_lidar")
     scans = np.concatenate([start + agent.keyframes for start, agent in zip(starts, agents, strict=False)])
     loops = found_loops(found.joined.loops, scans)
     row: cli.Row = {"num_scans": len(T_world_scan), "num_loops": len(loops), "num_keyframes": len(scans)}
@@ -264,7 +264,7 @@ def found_loops(loops: Sequence[slam.Loop], scans: np.ndarray) -> list[FoundLoop
 
 def measure_trajectory(run: cli.Run, drive: LidarSequence, T_world_scan: np.ndarray, loops: list[FoundLoop]) -> cli.Row:
     """Writes a trajectory; returns its errors, how many loops are wrong, and the recall of the right ones."""
-    cli.write_trajectory(run.path, T_world_scan, drive.times)
+    cli.write_poses(run.path, T_world_scan, times=drive.times, frame="T_world_lidar")
     reference, row = drive.T_world_lidar, {"num_scans": len(T_world_scan), "num_loops": len(loops)}
     if reference is None:
         return row | {"path_m": float(metrics.path_lengths(T_world_scan)[-1])}

@@ -37,7 +37,6 @@ from .result_files import load_json as load_json
 from .result_files import progress_bar as progress_bar
 from .result_files import write_json as write_json
 from .result_files import write_poses as write_poses
-from .result_files import write_table as write_table
 from .run import CHECKPOINTS as CHECKPOINTS
 from .run import EXIT_BAD_INPUT as EXIT_BAD_INPUT
 from .run import HISTORY as HISTORY
@@ -47,18 +46,15 @@ from .run import Run as Run
 from .run import run_command as run_command
 from .run_folder import find_run as find_run
 from .run_folder import load_options as load_options
-from .slam_files import LOOP_CELLS as LOOP_CELLS
 from .slam_files import accepted_ends as accepted_ends
 from .slam_files import count_meetings as count_meetings
 from .slam_files import gather_map as gather_map
-from .slam_files import loop_rows as loop_rows
 from .slam_files import map_layers as map_layers
 from .slam_files import open_map as open_map
 from .slam_files import require_same_weights as require_same_weights
 from .slam_files import write_loops as write_loops
 from .slam_files import write_map_file as write_map_file
 from .slam_files import write_scans as write_scans
-from .slam_files import write_trajectory as write_trajectory
 from .slam_numbers import localization_errors as localization_errors
 from .slam_run import SlamRun as SlamRun
 from .slam_run import map_drive as map_drive

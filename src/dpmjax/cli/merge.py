@@ -71,8 +71,7 @@ def write_maps(run: cli.Run, maps: Sequence[slam.KeyframeMap], merged: slam.Merg
         for number, each in enumerate(maps, start=1)
         for keyframe in each.keyframes
     ]
-    columns = ("map", "scan", "other_map", "other_scan", *cli.LOOP_CELLS)
-    cli.write_table(run / "loops.csv", columns, cli.loop_rows(merged.loops, ends))
+    cli.write_loops(run / "loops.csv", merged.loops, ends)
 
 
 def map_name(part: int, num_parts: int) -> str:

@@ -50,12 +50,18 @@ def as_json(value: Any) -> Any:
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes a CSV file atomically."""
+    """Writes a CSV file atomically: these columns, numbers with six digits, truth values as 0 and 1, None as empty."""
     text = StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(row[column]) for column in columns] for row in rows)
     io.write_atomically(path, text.getvalue())
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return int(value) if isinstance(value, bool) else value
 
 
 def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum: Any) -> None:

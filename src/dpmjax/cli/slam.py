@@ -144,10 +144,10 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
 def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) -> cli.Numbers:
     """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
     sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
-    files.write_trajectory(run.path, result.T_world_scan, sequence.times)
-    files.write_trajectory(run.path, result.T_odometry_scan, sequence.times, "odometry")
+    for name, poses in (("trajectory", result.T_world_scan), ("odometry", result.T_odometry_scan)):
+        cli.write_poses(run.path, poses, name, times=sequence.times, frame="T_world_lidar")
     files.write_graph(run.path, result)
-    files.write_loops(run / "loops.csv", result.loops, result.keyframes)
+    files.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
     files.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
     sizes = files.write_map_file(run / "map.npz", slam_map) if len(slam_map) else {}
     run.write_numbers({**numbers, **sizes})  # also where a picture fails

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
-from dpmjax.cli.result_files import write_poses, write_table
+from dpmjax.cli.result_files import write_table
 from dpmjax.cli.slam_numbers import count_parts
 from dpmjax.sequences import LidarSequence, counted
 
@@ -19,7 +19,7 @@ MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
 # Points below this height above the lidar are the ground.
 GROUND_M = -1.0
-LOOP_CELLS = ("found_by", "status", "overlap", "probability", "rmse_m")
+LOOP_COLUMNS = ("found_by", "status", "overlap", "probability", "rmse_m")
 SCAN_COLUMNS = (
     "scan", "status", "is_keyframe", "keyframe_scan", "score", "probability", "weak_sigma_m", "num_accepted", "reason",
     "source",
@@ -40,13 +40,6 @@ class Cloud(NamedTuple):
     voxel_m: float
 
 
-def write_trajectory(
-    folder: Path, T_world_scan: np.ndarray, times: np.ndarray | None, name: str = "trajectory"
-) -> None:
-    """Writes a trajectory of the lidar as TUM, KITTI and npy."""
-    write_poses(folder, T_world_scan, name, times=times, frame="T_world_lidar")
-
-
 def write_graph(folder: Path, result: slam.SlamResult) -> None:
     """Writes graph.g2o and keyframes.txt (number and pose of each keyframe)."""
     if result.graph is not None:
@@ -55,34 +48,18 @@ def write_graph(folder: Path, result: slam.SlamResult) -> None:
     io.write_tum(folder / "keyframes.txt", poses, times=result.keyframes, frame=frame)
 
 
-def write_loops(path: Path, loops: Sequence[slam.Loop], keyframes: Sequence[int] | np.ndarray) -> None:
-    """Writes every candidate of a loop with its outcome."""
-    rows = loop_rows(loops, [{"scan": int(scan)} for scan in keyframes])
-    write_table(path, ("scan", "other_scan", *LOOP_CELLS), rows)
-
-
-def loop_rows(loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> list[dict[str, Any]]:
-    """Returns a row for each candidate of a loop: its two keyframes, its source, outcome, and the numbers of that.
+def write_loops(path: Path, loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> None:
+    """Writes every candidate of a loop: its two keyframes, its source and outcome, and the numbers of that.
 
     Args:
+        path: the file.
         loops: the candidates.
         ends: cells of each keyframe, in the order of the rows of the map; names of the target begin with `other_`.
-
-    Returns:
-        The rows.
     """
-    return [
-        {
-            **ends[loop.source],
-            **{f"other_{name}": cell for name, cell in ends[loop.target].items()},
-            "found_by": loop.found_by,
-            "status": loop.status,
-            "overlap": _number(loop.overlap),
-            "probability": _number(loop.probability),
-            "rmse_m": _number(loop.rmse),
-        }
-        for loop in loops
-    ]
+    others = [{f"other_{name}": cell for name, cell in end.items()} for end in ends]
+    rows = [{**ends[loop.source], **others[loop.target], **loop._asdict(), "rmse_m": loop.rmse} for loop in loops]
+    names = [*ends[0], *others[0]] if ends else ["scan", "other_scan"]
+    write_table(path, [*names, *LOOP_COLUMNS], rows)
 
 
 def count_meetings(joined: slam.JoinedMaps) -> list[tuple[list[int], int]]:
@@ -103,18 +80,7 @@ def write_scans(
 ) -> None:
     """Writes the reports on the placed scans."""
     rows = [
-        {
-            "scan": report.scan,
-            "status": report.status,
-            "is_keyframe": int(report.is_keyframe),
-            "keyframe_scan": int(keyframes[report.keyframe]) if len(keyframes) else "",
-            "score": _number(report.score),
-            "probability": _number(report.probability),
-            "weak_sigma_m": _number(report.weak_sigma_m),
-            "num_accepted": report.num_accepted,
-            "reason": report.reason,
-            "source": source,
-        }
+        report._asdict() | {"keyframe_scan": keyframes[report.keyframe] if len(keyframes) else "", "source": source}
         for report, source in zip(reports, sources, strict=False)
     ]
     write_table(path, SCAN_COLUMNS, rows)
@@ -124,10 +90,6 @@ def accepted_ends(loops: Sequence[slam.Loop]) -> np.ndarray:
     """Returns (m, 2) rows of the keyframes that accepted loops join."""
     ends = [(loop.source, loop.target) for loop in loops if loop.status == "accepted"]
     return np.array(ends, np.int64).reshape(-1, 2)
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}"
 
 
 def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray]) -> Cloud:
