@@ -31,7 +31,6 @@ from dpmjax import deeppointmap as dpm
 from dpmjax.metrics import mcnemar_p_value
 from dpmjax.scans import measure_scan
 
-EXPERIMENT = "dpm_evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
@@ -48,20 +47,20 @@ class PairOptions(cli.ModelOptions, cli.RunOptions):
 
     paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
-    pairs: Annotated[int, arg(metavar="N")] = 30
+    pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 30
     """Pairs for each distance."""
     clouds: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
     """Also register descriptor clouds, refined by N surface elements a scan."""
-    num_towns: Annotated[int, arg(metavar="N")] = 3
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """Number of towns, where town is among the paths."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
+    town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
     """Length of the route of a town."""
     no_kiss: FlagCreatePairsOff[bool] = False
     """Leave KISS-Matcher out."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, pairs=1, num_towns=1, town_length_m=100, seed=0)
+        """Checks bounds, and that there are data."""
+        super().__post_init__()
         if not self.paths:
             raise ValueError("give at least one folder of scans, or town")
 
@@ -157,4 +156,4 @@ def compare_methods(pooled: Sequence[cli.Row], shares: Sequence[str]) -> list[st
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

@@ -23,11 +23,11 @@ from .machine import select_device as select_device
 from .machine import why_not_importable as why_not_importable
 from .map2d_results import named_initial as named_initial
 from .map2d_results import spans_of as spans_of
+from .options import Bound as Bound
 from .options import ModelOptions as ModelOptions
 from .options import OutputOptions as OutputOptions
 from .options import RunOptions as RunOptions
 from .options import ScanOptions as ScanOptions
-from .options import check_least as check_least
 from .options import check_names as check_names
 from .program import end_process as end_process
 from .program import main as main
@@ -44,6 +44,7 @@ from .run import METRICS as METRICS
 from .run import Numbers as Numbers
 from .run import Run as Run
 from .run import run_command as run_command
+from .run import run_experiment as run_experiment
 from .run_folder import find_run as find_run
 from .run_folder import load_options as load_options
 from .slam_files import accepted_ends as accepted_ends

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
-from dpmjax.cli.options import ModelOptions, RunOptions, ScanOptions, check_least
+from dpmjax.cli.options import Bound, ModelOptions, RunOptions, ScanOptions
 from dpmjax.cli.run_folder import RESULTS
 from dpmjax.sequences import InputError, LidarSequence, Note
 
@@ -38,14 +38,10 @@ class DriveOptions(ScanOptions, ModelOptions, RunOptions):
 
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
     """Which clouds of a bag of ROS, where it holds several topics of them."""
-    columns: Annotated[int | None, arg(metavar="N")] = None
+    columns: Annotated[int | None, arg(metavar="N"), Bound(3)] = None
     """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
 
     def check_data(self, data: object, sequence: str | None) -> None:
         """Raises a ValueError where options belong to files and no folder is given."""

@@ -45,14 +45,14 @@ class EvaluateOptions(cli.ModelOptions, cli.RunOptions):
 
     data: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
     """Folders of scans with poses, or simulated towns."""
-    pairs: Annotated[int, arg(metavar="N")] = 15
+    pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 15
     """Pairs for each distance."""
-    num_towns: Annotated[int, arg(metavar="N")] = 1
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1
     """Number of towns, where town is among the data; a suburb first, then other kinds of place."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, pairs=1, num_towns=1, seed=0)
+        """Checks bounds, and that there are data."""
+        super().__post_init__()
         if not self.data:
             raise ValueError("give at least one folder of scans, or town")
 

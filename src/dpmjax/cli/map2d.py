@@ -56,21 +56,19 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
     """Also align all scans together, point to line, from the start and from the fit."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
     """Stop after N steps, rounded up to whole calls of the compiled program; without it, the preset decides."""
-    seconds: Annotated[float | None, arg(metavar="S")] = None
+    seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
     """Stop the fit after S seconds of run time, compile time not counted."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
     """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
     crowd: an office in which people walk about."""
-    range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
+    range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
-        if self.seconds is not None and not self.seconds > 0.0:
-            raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
+        """Checks bounds, and options that do not go together."""
+        super().__post_init__()
         if not self.ordered and self.init != "global" and not self.resume:
             raise ValueError(f"--no-ordered: only --init global needs no order, got --init {self.init}")
         if self.topic is not None and self.data is None and not self.resume:

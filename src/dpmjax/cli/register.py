@@ -37,14 +37,10 @@ class RegisterOptions(cli.ModelOptions, cli.OutputOptions):
     """Scan whose points are moved."""
     target: Annotated[Positional[Path], arg(metavar="B")]
     """Scan in whose frame they end."""
-    columns: Annotated[int | None, arg(metavar="N")] = None
-    """cli.Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    columns: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
+    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     refine: bool = True
     """End with a fine point-to-plane alignment."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, columns=3)
 
 
 def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import inspect
 import logging
 import math
 import os
@@ -266,6 +267,12 @@ def run_command(
             signal.signal(number, handler)
         if run is not None:
             run.close()
+
+
+def run_experiment(main: Callable[[Any, Run], Numbers]) -> NoReturn:
+    """Runs the `main` of a module of `experiments`, and ends the process."""
+    description = sys.modules[main.__module__].__doc__
+    program.end_process(run_command(main, name=Path(inspect.getfile(main)).stem, description=description))
 
 
 def _finish(run: Run, numbers: Numbers) -> int:

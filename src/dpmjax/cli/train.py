@@ -67,23 +67,23 @@ class TrainOptions(RunOptions):
     """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
     frame: Literal["lidar", "local"] | None = None
     """Frame of the encoder's features: of the lidar, or of the wall at each point; without it, the preset decides."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
-    epochs: Annotated[float | None, arg(metavar="N")] = None
+    epochs: Annotated[float | None, arg(metavar="N"), cli.Bound(0, is_allowed=False)] = None
     """Train until each scan was N times the first of a group, instead of --steps; `paper` takes 12, as published."""
-    groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
+    groups: Annotated[tuple[int, ...], arg(metavar="N ..."), cli.Bound(2)] = ()
     """Largest group of scans of each stage of the curriculum, such as 8 16 8 16; without it, the preset decides."""
-    scans: Annotated[int | None, arg(metavar="N")] = None
+    scans: Annotated[int | None, arg(metavar="N"), cli.Bound(2)] = None
     """How many scans a step takes; more keep a GPU busy, which computes all of them at once. Without it, the preset
     decides."""
-    num_towns: Annotated[int, arg(metavar="N")] = 3
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """How many towns to train on, where town is among the data."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
+    town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
     """Length of the drive through each town."""
     refine_labels: FlagCreatePairsOff[bool] = False
     """Align the scans of each group by point-to-plane ICP, from the given poses: for drives whose poses are decimetres
     off between neighbours."""
-    hours: Annotated[float | None, arg(metavar="H")] = None
+    hours: Annotated[float | None, arg(metavar="H"), cli.Bound(0, is_allowed=False)] = None
     """Train for about H hours, at most the steps of the preset: the learning rate falls until then. Without it, the
     steps decide."""
     finish: FlagCreatePairsOff[bool] = False
@@ -92,31 +92,25 @@ class TrainOptions(RunOptions):
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
     """Folder where prepared scans are kept between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The needed
     and the free space are printed first."""
-    variants: Annotated[int | None, arg(metavar="N")] = None
+    variants: Annotated[int | None, arg(metavar="N"), cli.Bound(0)] = None
     """Prepare each scan N times and choose among these; fewer need less disk, 0.8 MB for each of `paper`. 0: prepare it
     anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
-    held_out_pairs: Annotated[int, arg(metavar="N")] = 32
+    held_out_pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 32
     """Pairs of scans at each distance that choose the model, all drives together."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
     """Folders of scans with poses whose pairs choose the model, instead of held-out places of --data."""
-    recall_every: Annotated[int, arg(metavar="N")] = 100
+    recall_every: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 100
     """Measure recall every N steps, and at the end."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
     """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
-    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    num_processes: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
     """How many processes there are."""
-    process_id: Annotated[int | None, arg(metavar="I")] = None
+    process_id: Annotated[int | None, arg(metavar="I"), cli.Bound(0)] = None
     """Which of them this one is, from 0; process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2, scans=2)
-        cli.check_least(self, variants=0)
-        cli.check_least(self, town_length_m=100, num_processes=1, process_id=0)
-        if self.hours is not None and not 0 < self.hours < math.inf:
-            raise ValueError(f"--hours: expected more than 0, got {self.hours}")
-        if self.epochs is not None and not 0 < self.epochs < math.inf:
-            raise ValueError(f"--epochs: expected more than 0, got {self.epochs}")
+        """Checks bounds, and options that do not go together."""
+        super().__post_init__()
         if self.steps is not None and self.epochs is not None:
             raise ValueError("--epochs: expected without --steps; give one of the two")
         if not self.data:
