@@ -154,13 +154,20 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     trained = run_training(records, store, settings, hooks, seed=options.seed, total_s=total_s)
     if records is None:
         return {}
-    numbers = {**training_numbers(trained, records), "num_scans": len(store.table), "bad_scans": store.bad}
-    numbers["seed"] = options.seed
-    ended = evaluate_and_calibrate(options, trained, records, numbers, chosen_sources(options, sources))
-    numbers |= ended.numbers
-    numbers = {"verdict": train_files.training_verdict(numbers), **numbers}
-    train_files.write_training(records, trained, ended, numbers, origin=origin_of(options))
-    return numbers
+    numbers = training_numbers(trained, records) | {"num_scans": len(store.table), "bad_scans": store.bad}
+    evaluation, origin = None, f"{options.preset}, trained on {', '.join(options.data)}"
+    if not run.is_stopped:  # this and the calibration take minutes, which a stopped run does not have
+        evaluation, measured = evaluate(trained, records)
+        numbers |= measured
+    train_files.write_training(records, trained, evaluation, numbers, origin=origin)
+    numbers["calibration"] = {}
+    if options.calibrate and not run.is_stopped:
+        # A signal that comes from here on loses the calibration alone.
+        run.write_numbers({**numbers, "status": "interrupted"})
+        drives = chosen_sources(options, sources)
+        model, numbers["calibration"] = calibrate_on_sources(trained.model, drives, options.seed, run.check_stop)
+        train_files.write_model(run / train_files.MODEL, model, numbers, origin=origin)
+    return {"verdict": train_files.training_verdict(numbers), **numbers}
 
 
 def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
@@ -168,11 +175,6 @@ def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
     steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
     of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
     return f"{num_scans} scans; at most {of_stages}"
-
-
-def origin_of(options: TrainOptions) -> str:
-    """Returns the beginning of the description of a model."""
-    return f"{options.preset}, trained on {', '.join(options.data)}"
 
 
 def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
@@ -283,49 +285,28 @@ def training_settings(options: TrainOptions, first: deeppointmap.Model | None = 
         if "overlap" not in first.config.trained:  # this head begins, whatever is tuned
             rate_share = settings.overlap.rate_share / TUNING_SHARE
             settings = replace(settings, overlap=replace(settings.overlap, rate_share=rate_share))
-    settings = replace(settings, stages=options.stages)
+    given = {"num_variants": options.variants, "num_epochs": options.epochs}
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    settings = replace(settings, stages=options.stages, refines_labels=options.refine_labels)
     if options.frame is not None:
         encoder = replace(settings.model.encoder, frame=options.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
-    settings = replace(settings, refines_labels=options.refine_labels)
-    if options.variants is not None:
-        settings = replace(settings, num_variants=options.variants)
-    stages = settings.curriculum
+    stages, num_scans = settings.curriculum, options.scans or settings.sampling.num_scans
     if options.groups:
         num_steps = max(1, settings.num_steps // len(options.groups))
         stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in options.groups)
-    num_scans = options.scans or settings.sampling.num_scans
     settings = replace(settings, curriculum=stages, sampling=replace(settings.sampling, num_scans=num_scans))
     if jax.default_backend() != "cpu":
         settings = replace(settings, scans_at_once=num_scans)
     for part in options.without:
         settings = deeppointmap.without(settings, part)
-    if options.epochs is not None:
-        return replace(settings, num_epochs=options.epochs)
     return settings if options.steps is None else settings.with_steps(options.steps)
-
-
-def evaluate_and_calibrate(
-    options: TrainOptions,
-    trained: deeppointmap.Trained,
-    records: Records,
-    numbers: Numbers,
-    sources: Sequence[cli.Source],
-) -> train_files.Ended:
-    """Evaluates and calibrates, unless a signal came: both take minutes, which a stopped run does not have."""
-    run, model, calibration = records.run, trained.model, Numbers()
-    evaluation, measured = (None, {}) if run.is_stopped else evaluate(trained, records)
-    if options.calibrate and not run.is_stopped:
-        # A signal that comes from here on loses the calibration alone.
-        run.write_numbers({**numbers, **measured, "status": "interrupted"})
-        train_files.write_model(run / train_files.MODEL, model, {**numbers, **measured}, origin=origin_of(options))
-        model, calibration = calibrate_on_sources(model, sources, options.seed, run.check_stop)
-    return train_files.Ended(model, evaluation, {**measured, "calibration": calibration})
 
 
 def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers:
     """Returns steps, selection score and seconds for `metrics.json`."""
     return {
+        "seed": records.seed,
         "steps": int(trained.progress.state.step),
         "best_step": int(trained.progress.best_step) or None,
         "selection_score": float(trained.progress.best_score),
