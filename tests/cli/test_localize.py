@@ -12,9 +12,9 @@ import pytest
 import dpmjax
 from dpmjax.cli import localize
 from dpmjax.cli.program import main
-from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.cli.slam_numbers import localization_errors
+from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.slam_results import localization_errors
 from dpmjax.geometry import rigid
 from dpmjax.io import open_lidar_sequence, read_poses
 from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods

@@ -10,8 +10,8 @@ from scipy import stats
 import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli.evaluate import summarize_pairs
-from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.run_folder import load_json
 from experiments import dpm_evaluate
 from experiments.dpm_evaluate import MONITORED, compare_methods, pool_drives
 from tests.deeppointmap import toy

@@ -24,7 +24,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
-from dpmjax.cli import slam_numbers
+from dpmjax.cli import slam_results
 from dpmjax.sequences import counted
 
 
@@ -91,7 +91,7 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
             "file": map_name(part, len(merged.maps)),
             "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
             "num_keyframes": len(slam_map),
-            "num_measured_parts": slam_numbers.count_parts(slam_map),
+            "num_measured_parts": slam_results.count_parts(slam_map),
         }
         for part, slam_map in enumerate(merged.maps, start=1)
     ]

@@ -30,10 +30,9 @@ from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
 from dpmjax.cli import program
-from dpmjax.cli.machine import environment, select_device
+from dpmjax.cli.info import environment, select_device
 from dpmjax.cli.options import parse_options
 from dpmjax.cli.report import write_report
-from dpmjax.cli.result_files import write_json, write_table
 from dpmjax.cli.run_folder import (
     CONFIG,
     RESULTS,
@@ -44,6 +43,8 @@ from dpmjax.cli.run_folder import (
     load_options,
     lock_folder,
     make_latest,
+    write_json,
+    write_table,
 )
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError, Note

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -164,8 +164,8 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     if options.calibrate and not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
         run.write_numbers({**numbers, "status": "interrupted"})
-        drives = chosen_sources(options, sources)
-        model, numbers["calibration"] = calibrate_on_sources(trained.model, drives, options.seed, run.check_stop)
+        chosen = chosen_sources(options, sources)
+        model, numbers["calibration"] = calibrate_on_sources(trained.model, chosen, options.seed, run.check_stop)
         train_files.write_model(run / train_files.MODEL, model, numbers, origin=origin)
     return {"verdict": train_files.training_verdict(numbers), **numbers}
 
@@ -285,7 +285,7 @@ def training_settings(options: TrainOptions, first: deeppointmap.Model | None = 
         if "overlap" not in first.config.trained:  # this head begins, whatever is tuned
             rate_share = settings.overlap.rate_share / TUNING_SHARE
             settings = replace(settings, overlap=replace(settings.overlap, rate_share=rate_share))
-    given = {"num_variants": options.variants, "num_epochs": options.epochs}
+    given: dict[str, Any] = {"num_variants": options.variants, "num_epochs": options.epochs}
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     settings = replace(settings, stages=options.stages, refines_labels=options.refine_labels)
     if options.frame is not None:

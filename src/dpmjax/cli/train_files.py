@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
 from dpmjax import deeppointmap, viz, weights
@@ -28,6 +27,8 @@ def write_training(
     origin: str,
 ) -> None:
     """Writes all files of a run; numbers first, so that they are written even if a picture fails."""
+    from dpmjax.cli.train_run import with_params
+
     run, pairs = records.run, records.selection.pairs
     run.write_numbers(metrics)
     write_model(run / MODEL, trained.model, metrics, origin=origin)
@@ -39,11 +40,6 @@ def write_training(
     draw_curves(run)
     if evaluation is not None and pairs is not None:
         draw_matches(run, evaluation, pairs)
-
-
-def with_params(model: deeppointmap.Model, params: Any) -> deeppointmap.Model:
-    """Returns the model with the parameters of another step, which training gives back to the device."""
-    return model.replace(params=jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), params))
 
 
 def write_model(path: Path, model: deeppointmap.Model, metrics: Numbers, *, origin: str) -> None:

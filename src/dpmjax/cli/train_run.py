@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -16,7 +17,6 @@ from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.run import CHECKPOINTS, HISTORY, Run
-from dpmjax.cli.train_files import with_params
 from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.sequences import LidarSequence
 
@@ -284,6 +284,11 @@ def run_training(
         if records.takes_last:
             trained = trained._replace(model=with_params(trained.model, trained.progress.state.params))
         return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, stop, seed)
+
+
+def with_params(model: dpm.Model, params: Any) -> dpm.Model:
+    """Returns the model with the parameters of another step, which training gives back to the device."""
+    return model.replace(params=jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), params))
 
 
 def _stage_name(stage: dpm.CurriculumStage) -> str:
