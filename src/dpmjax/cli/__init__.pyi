@@ -50,15 +50,11 @@ from .run_folder import progress_bar as progress_bar
 from .run_folder import write_json as write_json
 from .run_folder import write_poses as write_poses
 from .slam_results import accepted_ends as accepted_ends
-from .slam_results import count_meetings as count_meetings
 from .slam_results import gather_map as gather_map
 from .slam_results import localization_errors as localization_errors
-from .slam_results import map_layers as map_layers
 from .slam_results import open_map as open_map
 from .slam_results import require_same_weights as require_same_weights
 from .slam_results import write_loops as write_loops
-from .slam_results import write_map_file as write_map_file
-from .slam_results import write_scans as write_scans
 from .slam_run import SlamRun as SlamRun
 from .slam_run import map_drive as map_drive
 from .table import Row as Row

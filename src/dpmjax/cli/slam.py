@@ -24,7 +24,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, io, slam, viz, weights
+from dpmjax import cli, io, saved_maps, slam, viz, weights
 from dpmjax.cli import slam_results as results
 from dpmjax.sequences import LidarSequence, counted, require
 
@@ -148,7 +148,11 @@ def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) ->
     results.write_graph(run.path, result)
     results.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
     results.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
-    sizes = results.write_map_file(run / "map.npz", slam_map) if len(slam_map) else {}
+    sizes: cli.Numbers = {}
+    if len(slam_map):
+        whole = saved_maps.save_map(run / "map.npz", slam_map)
+        small = saved_maps.map_bytes(slam_map, "int8")
+        sizes = {"map_bytes": whole.stat().st_size, "map_bytes_int8": len(small)}
     run.write_numbers({**numbers, **sizes})  # also where a picture fails
     cloud = results.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
     io.write_ply(run / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))

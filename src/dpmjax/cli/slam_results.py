@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +18,6 @@ from dpmjax.sequences import LidarSequence, counted
 
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
-# Points below this height above the lidar are the ground.
-GROUND_M = -1.0
 LOOP_COLUMNS = ("found_by", "status", "overlap", "probability", "rmse_m")
 SCAN_COLUMNS = (
     "scan", "status", "is_keyframe", "keyframe_scan", "score", "probability", "weak_sigma_m", "num_accepted", "reason",
@@ -77,19 +74,6 @@ def write_loops(path: Path, loops: Sequence[slam.Loop], ends: Sequence[Mapping[s
     write_table(path, [*names, *LOOP_COLUMNS], rows)
 
 
-def count_meetings(joined: slam.JoinedMaps) -> list[tuple[list[int], int]]:
-    """Returns the pairs of maps that have met, counted from 1, each with the number of its accepted loops."""
-    pairs = np.sort(joined.map_of_keyframe[accepted_ends(joined.loops)] + 1, axis=1)
-    return [(list(pair), number) for pair, number in sorted(Counter(map(tuple, pairs.tolist())).items())]
-
-
-def map_layers(label: str, number: int, T_world_scan: np.ndarray, cloud: Cloud) -> list[viz.Layer]:
-    """Returns the points above the ground and the trajectory of one of several maps in its colour."""
-    color = viz.AGENTS[number % len(viz.AGENTS)]
-    points = viz.Points(cloud.points[cloud.heights_m > GROUND_M], color)
-    return [points, viz.Track(T_world_scan[:, :3, 3], color, label)]
-
-
 def write_scans(
     path: Path, reports: Sequence[slam.ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
 ) -> None:
@@ -140,12 +124,6 @@ def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray])
             num_thinned = len(parts[0])
     whole = thinned()
     return Cloud(whole[:, :3], whole[:, 3], voxel_m)
-
-
-def write_map_file(path: Path, slam_map: slam.KeyframeMap) -> dict[str, int]:
-    """Writes the map for later runs and for localisation; returns its size at each precision."""
-    saved_maps.save_map(path, slam_map)
-    return {"map_bytes": path.stat().st_size, "map_bytes_int8": len(saved_maps.map_bytes(slam_map, "int8"))}
 
 
 def draw_pictures(
