@@ -17,8 +17,7 @@ from dpmjax import ScanSet, registration2d
 from dpmjax import deepmapping as dm
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES, PlanarScans
-from experiments._baselines import multiway, optimize_directly, swarm_poses
-from experiments._plain_icp import chain_icp
+from experiments._baselines import chain_icp, multiway, optimize_directly, swarm_poses
 
 Candidates = dict[str, np.ndarray]
 

@@ -27,7 +27,6 @@ from dpmjax import deepmapping as dm
 from dpmjax.registration_rgbd import as_depth_scans
 from experiments.deepmapping_rgbd import errors_of
 
-EXPERIMENT = "deepmapping_ablations"
 # Images of a walk, and pixels of each in a step.
 NUM_VIEWS, NUM_PIXELS = 8, 200
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -46,18 +45,18 @@ class AblationOptions(cli.RunOptions):
 
     may_change: ClassVar[frozenset[str]] = frozenset({"limit", "seeds", "only"})
 
-    limit: Annotated[int, arg(metavar="N")] = 10
+    limit: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 10
     """Walks a variant."""
-    seeds: Annotated[int, arg(metavar="N")] = 3
+    seeds: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """Seeds of the networks a walk."""
-    steps: Annotated[int, arg(metavar="N")] = 600
+    steps: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 600
     """Steps of each fit."""
     only: tuple[str, ...] = tuple(VARIANTS)
     """Which ablations."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, limit=1, seeds=1, steps=1)
+        """Checks bounds and names."""
+        super().__post_init__()
         cli.check_names("--only", self.only, VARIANTS)
 
 
@@ -113,4 +112,4 @@ def settings_of(ablation: str, variant: str, num_steps: int) -> dm.DeepMappingCo
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

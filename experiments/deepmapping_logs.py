@@ -23,7 +23,6 @@ from tyro.conf import Positional, arg
 from dpmjax import cli, io, metrics
 from dpmjax.registration2d import DEEPMAPPING, START_NAMES
 
-EXPERIMENT = "deepmapping_logs"
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
 RIGHT_M = 0.5
 # Columns of rows.csv that are numbers of the run; those of the table.
@@ -138,4 +137,4 @@ def row_of(numbers: cli.Row) -> cli.Row:
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

@@ -27,7 +27,6 @@ from dpmjax import deepmapping as dm
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 
-EXPERIMENT = "deepmapping_relocalize"
 NUM_SCANS = 256
 # A fit counts as a success below this error (section 4.1); so does a re-localisation.
 RIGHT_PX = 20.0
@@ -47,12 +46,8 @@ class RelocalizeOptions(cli.RunOptions):
     """Where the poses of the fit start."""
     preset: Literal["fast", "paper"] = "fast"
     """Settings of the fit."""
-    stride_px: Annotated[int, arg(metavar="PX")] = 6
+    stride_px: Annotated[int, arg(metavar="PX"), cli.Bound(1)] = 6
     """A scan is taken at the centre of every free square of this side."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, stride_px=1)
 
 
 def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
@@ -161,4 +156,4 @@ def errors_at(
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

@@ -34,7 +34,6 @@ from dpmjax import deepmapping as dm
 from dpmjax import registration_rgbd as rgbd
 from experiments._baselines import multiway_images
 
-EXPERIMENT = "deepmapping_rgbd"
 SUCCESS_M = 0.45
 RIGHT_SHARE, RIGHT_DEG, RIGHT_M = 0.1, 2.0, 0.1
 # Settings were chosen on apartments below 15; each hard walk has an apartment of its own.
@@ -57,17 +56,17 @@ class RgbdOptions(cli.RunOptions):
     """A scene of the Active Vision Dataset, or a folder of NAME.depth.png; without it, simulated apartments."""
     walks: Literal["paper", "hard"] = "paper"
     """Which simulated walks."""
-    limit: Annotated[int, arg(metavar="N")] = 105
+    limit: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 105
     """Number of walks."""
     methods: tuple[str, ...] = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct")
     """Methods to compare; also icp and multiway (Open3D, extra `baselines`)."""
 
-    window_step: Annotated[int, arg(metavar="N")] = WINDOW // 2
+    window_step: Annotated[int, arg(metavar="N"), cli.Bound(1)] = WINDOW // 2
     """Windows of 8 images of a folder begin so many images apart."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, limit=1, window_step=1)
+        """Checks bounds and names."""
+        super().__post_init__()
         cli.check_names("--methods", self.methods, METHODS)
 
 
@@ -152,4 +151,4 @@ METHODS: dict[str, Register] = {
 }
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

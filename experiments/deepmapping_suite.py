@@ -23,7 +23,6 @@ from tyro.conf import FlagCreatePairsOff, arg
 from dpmjax import cli, metrics, registration2d, simulation
 from experiments._deepmapping_methods import METHODS, PACKAGES, Task, make_task
 
-EXPERIMENT = "deepmapping_suite"
 NUM_WORLDS, NUM_SHORT, NUM_LONG = 3, 50, 25
 # ATE below which the paper calls a run a success (section 4.1).
 SUCCESS_PX = 20.0
@@ -38,23 +37,23 @@ class SuiteOptions(cli.RunOptions):
 
     methods: tuple[str, ...] = tuple(name for name in METHODS if name not in PACKAGES)
     """Methods to compare; also multiway, swarm-poses and direct-lbfgs (extra `baselines`)."""
-    limit: Annotated[int | None, arg(metavar="N")] = None
+    limit: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
     """Only the first N trajectories; they go through worlds and lengths in turn."""
     walks: tuple[int, ...] = ()
     """Only the trajectories of these numbers: 0 to 49 of 128 poses, 100 to 124 of 256; without it, all."""
-    stride: Annotated[int, arg(metavar="N")] = 1
+    stride: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1
     """Use every Nth scan."""
-    range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
+    range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise."""
     shuffled: FlagCreatePairsOff[bool] = False
     """Shuffle the scans: no method knows their order."""
-    steps: int | None = None
+    steps: Annotated[int | None, cli.Bound(2)] = None
     """Steps of the fit; without it, the preset decides."""
 
     def __post_init__(self) -> None:
-        """Checks names and ranges."""
+        """Checks bounds and names."""
+        super().__post_init__()
         cli.check_names("--methods", self.methods, METHODS)
-        cli.check_least(self, limit=1, range_noise_px=0, stride=1, steps=2)
         known = [entry["walk"] for entry in list_walks()]
         if unknown := set(self.walks) - set(known):
             raise ValueError(f"--walks: expected some of 0 to {NUM_SHORT - 1} and 100 to {max(known)}, got {unknown}")
@@ -126,4 +125,4 @@ def run_method(name: str, task: Task) -> cli.Row:
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

@@ -42,7 +42,6 @@ from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.weights import read_card
 
-EXPERIMENT = "dpm_calibrate"
 MODEL = "model.safetensors"
 AMBIGUOUS = ("corridor", "tunnel", "jam", "hall", "field")
 BEAMS = {16: simulation.VLP16, 32: simulation.HDL32E, 64: simulation.OS1_64}
@@ -88,8 +87,8 @@ class CalibrateOptions(cli.RunOptions):
     """Fit the weights by which `register` scores motions."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, seed=0)
+        """Checks options that do not go together."""
+        super().__post_init__()
         if bool(self.data) + self.check + self.evidence > 1:
             raise ValueError("--data, --check and --evidence: give one of them")
 
@@ -328,4 +327,4 @@ def share_right(scene: Mapping[str, np.ndarray], weights: np.ndarray | None) -> 
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

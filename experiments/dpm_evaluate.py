@@ -16,22 +16,20 @@ recorded drives together, and says which methods differ. reliability.png and fai
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import cli, encode, load_model, register
 from dpmjax import deeppointmap as dpm
 from dpmjax.metrics import mcnemar_p_value
 from dpmjax.scans import measure_scan
 
-EXPERIMENT = "dpm_evaluate"
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
@@ -39,31 +37,21 @@ VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
 # Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data.
 MONITORED = ("kitti_00_drive",)
 
-Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
 
 @dataclass(frozen=True, kw_only=True)
-class PairOptions(cli.ModelOptions, cli.RunOptions):
+class PairOptions(cli.EvaluateOptions):
     """Options of the run."""
 
-    paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
-    """Folders of scans with poses, files of poses along which a town is simulated, or towns of the seeds."""
-    pairs: Annotated[int, arg(metavar="N")] = 30
+    pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 30
     """Pairs for each distance."""
     clouds: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
     """Also register descriptor clouds, refined by N surface elements a scan."""
-    num_towns: Annotated[int, arg(metavar="N")] = 3
-    """Number of towns, where town is among the paths."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
+    """Number of towns, where town is among the data."""
+    town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
     """Length of the route of a town."""
     no_kiss: FlagCreatePairsOff[bool] = False
     """Leave KISS-Matcher out."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, pairs=1, num_towns=1, town_length_m=100, seed=0)
-        if not self.paths:
-            raise ValueError("give at least one folder of scans, or town")
 
 
 def main(options: PairOptions, run: cli.Run) -> cli.Row:
@@ -73,26 +61,16 @@ def main(options: PairOptions, run: cli.Run) -> cli.Row:
     if not all(low <= num <= high for num in options.clouds):
         raise ValueError(f"--clouds: expected from {low} to {high} elements a scan, got {options.clouds}")
     towns = cli.evaluation_towns(options.num_towns, options.town_length_m)
-    drives = cli.open_evaluation_drives(options.paths, towns)
+    drives = cli.open_evaluation_drives(options.data, towns)
     pairs = cli.PairReader(drives, options.pairs, options.seed)
     no_kiss = "left out by --no-kiss" if options.no_kiss else cli.why_not_importable("kiss_matcher")
-    matchers: dict[str, Matcher] = {"search": partial(search_alone, config=model.config.verification)}
+    matchers: dict[str, cli.Matcher] = {"search": partial(search_alone, config=model.config.verification)}
     matchers |= {} if no_kiss else {"kiss": kiss_matcher}
     matchers |= {f"clouds_{num}": partial(match_clouds, model=model, num_elements=num) for num in options.clouds}
     run.open()
-
-    def work(drive: str, band: str, pair: int) -> cli.Row:
-        scans = pairs.read(drive, band, pair)
-        row = cli.registration_row(model, scans)
-        for name, matcher in matchers.items() if band != "far" else ():
-            begun = time.perf_counter()
-            T_target_source = matcher(scans.source, scans.target)
-            row |= {f"{name}_s": time.perf_counter() - begun, **cli.motion_errors(name, T_target_source, scans)}
-        return row
-
-    rows = cli.fill_table(run, pairs.cases, work)
+    rows = cli.fill_pairs(run, model, pairs, matchers)
     overlap = cli.fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
-    methods = ("network", "verified", "refined", *matchers)
+    methods = (*cli.STAGES, *matchers)
     shares = tuple(f"{name}_right" for name in methods)
     others = (*(f"{name}_m" for name in methods), "pair_s", *(f"{name}_s" for name in matchers))
     notes = () if no_kiss is None else (f"KISS-Matcher was not run: {no_kiss}.",)
@@ -157,4 +135,4 @@ def compare_methods(pooled: Sequence[cli.Row], shares: Sequence[str]) -> list[st
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

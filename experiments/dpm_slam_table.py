@@ -39,7 +39,6 @@ from dpmjax.io import LidarSequence
 from experiments._slam_peers import PEERS, FoundLoop
 from experiments._slam_settings import NETWORK, SETTINGS, WHOLE, make_setting
 
-EXPERIMENT = "dpm_slam_table"
 AGENTS = "agents"
 # Parts of a drive that is cut, and the share of its length by which a part is longer at each end.
 NUM_AGENTS, OVERLAP = 3, 0.05
@@ -76,18 +75,17 @@ class SlamTableOptions(cli.DriveOptions):
     """Folders of scans, files of poses along which a town is simulated, or towns of the seeds."""
     methods: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = (WHOLE, NETWORK, "small_gicp")
     """Methods to compare: settings, agents, and KISS-ICP, KISS-SLAM, small_gicp."""
-    num_towns: Annotated[int, arg(metavar="N")] = 3
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """Number of towns, where town is among the paths."""
-    town_length_m: Annotated[tuple[float, ...], arg(metavar="M")] = (400.0,)
+    town_length_m: Annotated[tuple[float, ...], arg(metavar="M"), cli.Bound(100)] = (400.0,)
     """Length of the towns' routes; two numbers: from that of the first town to that of the last."""
-    localize: Annotated[int, arg(metavar="N")] = 0
+    localize: Annotated[int, arg(metavar="N"), cli.Bound(0)] = 0
     """Number of scans that are looked for in the map of the first half; needs the method whole."""
 
     def __post_init__(self) -> None:
-        """Checks names and ranges."""
+        """Checks bounds and names."""
         super().__post_init__()
         cli.check_names("--methods", self.methods, (*SETTINGS, AGENTS, *PEERS))
-        cli.check_least(self, num_towns=1, localize=0, town_length_m=100)
         if not self.paths:
             raise ValueError("give at least one folder of scans, or town")
         if not 1 <= len(self.town_length_m) <= 2:
@@ -194,7 +192,7 @@ def map_by_agents(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods)
     T_world_scan, num_maps = np.concatenate(found.T_world_scan), max(found.component) + 1
     for component in range(num_maps):
         save_map(run / f"map_{component + 1}.npz", slam.take_component(found.joined, component))
-    cli.write_trajectory(run.path, T_world_scan, None)
+    cli.write_poses(run.path, T_world_scan, frame="T_world_lidar")
     scans = np.concatenate([start + agent.keyframes for start, agent in zip(starts, agents, strict=False)])
     loops = found_loops(found.joined.loops, scans)
     row: cli.Row = {"num_scans": len(T_world_scan), "num_loops": len(loops), "num_keyframes": len(scans)}
@@ -264,7 +262,7 @@ def found_loops(loops: Sequence[slam.Loop], scans: np.ndarray) -> list[FoundLoop
 
 def measure_trajectory(run: cli.Run, drive: LidarSequence, T_world_scan: np.ndarray, loops: list[FoundLoop]) -> cli.Row:
     """Writes a trajectory; returns its errors, how many loops are wrong, and the recall of the right ones."""
-    cli.write_trajectory(run.path, T_world_scan, drive.times)
+    cli.write_poses(run.path, T_world_scan, times=drive.times, frame="T_world_lidar")
     reference, row = drive.T_world_lidar, {"num_scans": len(T_world_scan), "num_loops": len(loops)}
     if reference is None:
         return row | {"path_m": float(metrics.path_lengths(T_world_scan)[-1])}
@@ -336,4 +334,4 @@ def localize_scans(
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

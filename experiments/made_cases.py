@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 from dpmjax import cli, deeppointmap, metrics, simulation, slam, weights
 from dpmjax.geometry import rigid
 
-EXPERIMENT = "made_cases"
 NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M = 25, 0.12, 0.006, 0.9, 0.05
 COLUMNS = ("sure_and_wrong", "right_and_sure", "is_sure", "is_right", "error_m", "seconds")
 
@@ -34,13 +33,13 @@ class MadeOptions(cli.RunOptions, cli.ModelOptions):
 
     kinds: tuple[str, ...] = ("relief", "shell", "scale", "turn", "tunnel")
     """Kinds of cases."""
-    draws: int = 5
+    draws: Annotated[int, cli.Bound(1)] = 5
     """Draws of each kind."""
 
     def __post_init__(self) -> None:
-        """Checks names and ranges."""
+        """Checks bounds and names."""
+        super().__post_init__()
         cli.check_names("--kinds", self.kinds, KINDS)
-        cli.check_least(self, draws=1)
 
 
 def main(options: MadeOptions, run: cli.Run) -> cli.Row:
@@ -170,4 +169,4 @@ KINDS: dict[str, Callable[[deeppointmap.Model, np.random.Generator], Answer]] = 
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

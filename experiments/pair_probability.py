@@ -25,7 +25,6 @@ from dpmjax import deeppointmap as dpm
 from dpmjax.geometry import rigid, se2, se3
 from dpmjax.scans import PairEvidence
 
-EXPERIMENT = "pair_probability"
 NUM_SCANS, PLANAR_STEPS, DEPTH_STEPS = 160, (1, 4, 8, 16, 32, 64, 128), (1, 1, 2, 3)
 RIGHT_SHARE, RIGHT_M, RIGHT_RAD, SURE = 0.05, 0.1, np.radians(3.0), 0.9
 # No other setting was chosen on these worlds and apartments.
@@ -130,4 +129,4 @@ def is_right(options: PairOptions, sequence: Any, ends: tuple[Any, Any], T_targe
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

@@ -22,7 +22,6 @@ from tyro.conf import arg
 from dpmjax import cli, viz
 from dpmjax import deepmapping as dm
 
-EXPERIMENT = "toy_1d"
 FORMS = ("network", "direct")
 # Solvers of jaxopt with a line search.
 SOLVERS = {"gradient-descent": "GradientDescent", "lbfgs": "LBFGS", "bfgs": "BFGS"}
@@ -38,14 +37,10 @@ LEARNING_RATES = (1e-4, 2e-4, 5e-4, 1e-3)
 class ToyOptions(cli.RunOptions):
     """Options of the example."""
 
-    seeds: Annotated[int, arg(metavar="N")] = 1000
+    seeds: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1000
     """Starts, all in one vmap."""
-    steps: Annotated[int, arg(metavar="N")] = 1000
+    steps: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1000
     """Steps of descent; the paper's number."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, seeds=1, steps=1)
 
 
 def main(options: ToyOptions, run: cli.Run) -> cli.Row:
@@ -141,4 +136,4 @@ def share_at_minimum(x: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    cli.end_process(cli.run_command(main, name=EXPERIMENT, description=__doc__))
+    cli.run_experiment(main)

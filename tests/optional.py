@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from dpmjax.cli.machine import why_not_importable
+from dpmjax.cli.info import why_not_importable
 
 
 def import_or_skip(module: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""Results of readers and simulators: scans, depth images, worlds and drives, with their poses.
+"""Results of readers and simulators: scans, depth images and drives, with their poses.
 
 NumPy only, on the host. `dpmjax.io` and `dpmjax.simulation` make these records.
 """
@@ -214,47 +214,6 @@ def has_angular_order(points: NDArray[np.float32], mask: BoolArray) -> bool:
         same_way = max((turn > 0).mean(), (turn < 0).mean())
         is_ordered.append(same_way >= 0.95 and np.abs(turn).sum() <= 1.05 * 2 * np.pi)
     return bool(is_ordered) and float(np.mean(is_ordered)) >= 0.9
-
-
-@dataclass(frozen=True)
-class World:
-    """A planar world of unit pixels.
-
-    Attributes:
-        name: name for titles.
-        is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
-        num_people: people who walk about in it while a sequence of scans is taken.
-
-    Raises:
-        ValueError: another shape or dtype, or no free space.
-    """
-
-    name: str
-    is_obstacle: BoolArray = field(repr=False)
-    num_people: int = 0
-
-    def __post_init__(self) -> None:
-        if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
-            raise ValueError(f"is_obstacle must be (h, w) bool, got {self.is_obstacle.shape} {self.is_obstacle.dtype}")
-        if self.is_obstacle.all():
-            raise ValueError("is_obstacle must leave free space, got a solid world")
-
-
-def largest_region(is_free: BoolArray) -> BoolArray:
-    """Finds the largest connected region of a raster.
-
-    Args:
-        is_free: (h, w).
-
-    Returns:
-        (h, w) True where a pixel is free and of the largest region.
-    """
-    from scipy.ndimage import label
-
-    labels, _ = label(is_free)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return is_free & (labels == sizes.argmax())
 
 
 @dataclass(frozen=True)

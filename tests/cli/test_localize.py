@@ -12,9 +12,9 @@ import pytest
 import dpmjax
 from dpmjax.cli import localize
 from dpmjax.cli.program import main
-from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.cli.slam_numbers import localization_errors
+from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.slam_results import localization_errors
 from dpmjax.geometry import rigid
 from dpmjax.io import open_lidar_sequence, read_poses
 from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods
@@ -151,7 +151,7 @@ def test_errors_are_those_of_the_keyframes_frames(case) -> None:
     np.testing.assert_allclose(errors.translation_m[:3], [0, 3, 0.5], atol=1e-6)
     # The table of a run that goes on holds the same results.
     inputs = localize.Case(slam_map, drive, None, True)
-    rows = [localize.as_row(number, inputs, one, 0.1) for number, one in enumerate(found)]
+    rows = [localize.as_row(inputs, one, 0.1) for one in found]
     again = localization_errors(
         list(map(localize.as_localization, rows)), slam_map, reference, drive.T_world_lidar[[1, 1, 1, 1]]
     )

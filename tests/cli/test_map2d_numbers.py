@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.cli.map2d_results import spans_of, trust_verdict
+from dpmjax.cli.map2d import spans_of, trust_verdict
 from dpmjax.geometry import se2
 from dpmjax.metrics import corrected_ate, planar_errors
 from dpmjax.simulation import simulate_sequence

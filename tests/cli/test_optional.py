@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dpmjax.cli import program, slam
-from dpmjax.cli.machine import EXTRAS, require_importable, why_not_importable
+from dpmjax.cli.info import EXTRAS, require_importable, why_not_importable
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
 from tests.optional import import_or_skip

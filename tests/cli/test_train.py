@@ -348,7 +348,7 @@ def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
 def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=100_000))
     with pytest.raises(ValueError, match=r"^--cache .*: 24 scans of .* need .* --variants 1 needs") as refused:
-        train_preparation.prepare_sources([toy.drive], TRAINING, tmp_path / "new", seed=0)
+        train_preparation.check_space(24, TRAINING, tmp_path / "new")
     assert "\n" not in str(refused.value)
     assert not list(tmp_path.iterdir())
     (drive,) = train_preparation.prepare_sources([toy.drive], replace(TRAINING, num_variants=0), tmp_path, seed=0)
@@ -359,7 +359,7 @@ def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tm
 @pytest.mark.slow
 def test_a_long_drive_is_prepared_in_parts_as_in_one(tmp_path, monkeypatch, capsys) -> None:
     """Twice the same drive is one file; the bar counts scans, and a second call finds the file."""
-    monkeypatch.setattr(train_preparation, "MIN_PART", 7)
+    monkeypatch.setattr(train_preparation, "NUM_AT_ONCE", 7)
     alone = prepare_drive(toy.drive(), TRAINING)
     for _ in range(2):
         found = train_preparation.prepare_sources([toy.drive] * 2, TRAINING, tmp_path, seed=0)

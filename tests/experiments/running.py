@@ -11,8 +11,8 @@ from dpmjax.cli.run import run_command
 
 def run(module: ModuleType, *options: object) -> int:
     """Returns the exit code."""
-    name, description = module.EXPERIMENT, module.__doc__
-    return run_command(module.main, name=name, description=description, args=list(map(str, options)))
+    name = module.__name__.rpartition(".")[2]
+    return run_command(module.main, name=name, description=module.__doc__, args=list(map(str, options)))
 
 
 def read_rows(folder: Path, name: str = "rows.csv") -> list[dict[str, str]]:

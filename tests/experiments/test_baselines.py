@@ -15,8 +15,7 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments._baselines import Swarms, multiway, multiway_images, swarm_poses
-from experiments._plain_icp import align, chain_icp
+from experiments._baselines import Swarms, align, chain_icp, multiway, multiway_images, swarm_poses
 from tests.optional import import_or_skip
 
 QUICK = Swarms(num_particles=24, num_iterations=30, num_beams=64)

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run_folder import load_json
 from dpmjax.geometry import se2
 from dpmjax.registration2d import DEEPMAPPING
 from dpmjax.simulation import simulate_sequence

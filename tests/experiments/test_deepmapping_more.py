@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from dpmjax.cli.result_files import load_json
+from dpmjax.cli.run_folder import load_json
 from dpmjax.deepmapping import preset, with_steps
 from experiments import deepmapping_ablations, deepmapping_relocalize, deepmapping_rgbd, toy_1d
 from tests.experiments.running import read_rows, run

@@ -10,8 +10,8 @@ import pytest
 
 import dpmjax
 from dpmjax import deeppointmap, simulation
-from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.run_folder import load_json
 from dpmjax.deeppointmap import (
     CLOUD_FEATURES,
     ELEMENT_FEATURES,

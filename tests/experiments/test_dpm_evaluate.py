@@ -10,8 +10,8 @@ from scipy import stats
 import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli.evaluate import summarize_pairs
-from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.run_folder import load_json
 from experiments import dpm_evaluate
 from experiments.dpm_evaluate import MONITORED, compare_methods, pool_drives
 from tests.deeppointmap import toy
@@ -32,13 +32,13 @@ def test_evaluation_measures_every_pair_and_resumes(weights, tmp_path, monkeypat
     monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
     monkeypatch.setattr("dpmjax.cli.why_not_importable", lambda _: "it is not installed")
     out = tmp_path / "out"
-    arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "--clouds", 16, "-o", out]
+    arguments = ["town", "--weights", weights, "--pairs", 2, "--num-towns", 1, "--clouds", 32, "-o", out]
     assert run(dpm_evaluate, *arguments) == EXIT_OK
     assert "KISS-Matcher was not run: it is not installed." in capsys.readouterr().out
     rows, metrics = read_rows(out), load_json(out / "metrics.json")
     assert [row["band"] for row in rows] == [band for band in ("near", "middle", "far") for _ in range(2)]
     # Pairs far apart have no overlap: others are not asked.
-    assert [bool(row["search_right"] and row["clouds_16_right"]) for row in rows] == [True] * 4 + [False] * 2
+    assert [bool(row["search_right"] and row["clouds_32_right"]) for row in rows] == [True] * 4 + [False] * 2
     assert 0 <= metrics["brier"] <= 1
     assert {row["band"] for row in metrics["table"]} == {"near", "middle"}
     assert 0 <= float(read_rows(out, "overlap.csv")[0]["auc"]) <= 1

@@ -13,8 +13,8 @@ import pytest
 import dpmjax
 from dpmjax.cli import why_not_importable
 from dpmjax.cli.drives import DriveOptions
-from dpmjax.cli.result_files import load_json
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, Run
+from dpmjax.cli.run_folder import load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.slam import SlamConfig, SlamMethods

@@ -53,7 +53,7 @@ def test_loops_count_for_the_scans_around_their_newer_end() -> None:
     revisits = find_revisits(poses, distance_m=2.0, min_path_m=50.0)
     num = int(revisits.is_revisit.sum())
     none = loop_recall(poses, NONE, revisits)
-    assert (none.recall, none.num_revisits) == (0.0, num)
+    assert none.recall == 0.0
     one = loop_recall(poses, np.array([[300, 300]]), revisits, reach_m=10.0)
     assert one.recall * num == pytest.approx(21)
     # A loop on the first round is no answer to a revisit.
@@ -67,7 +67,6 @@ def test_without_revisits_there_is_no_recall() -> None:
     poses = there_and_back()[:90]
     found = loop_recall(poses, NONE, find_revisits(poses))
     assert np.isnan([found.recall, found.same_way, found.opposite]).all()
-    assert (found.num_revisits, found.num_opposite) == (0, 0)
 
 
 def test_ends_that_are_no_scans_are_refused(as_user) -> None:

@@ -41,10 +41,6 @@ class DepthOptions(cli.ScanOptions, cli.RunOptions):
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
 
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, n_scans=2, jump=1)
-
 
 def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
     """Registers depth images and writes the results."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
-from dpmjax.cli.options import ModelOptions, RunOptions, ScanOptions, check_least
+from dpmjax.cli.options import Bound, ModelOptions, RunOptions, ScanOptions
 from dpmjax.cli.run_folder import RESULTS
 from dpmjax.sequences import InputError, LidarSequence, Note
 
@@ -38,27 +38,24 @@ class DriveOptions(ScanOptions, ModelOptions, RunOptions):
 
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
     """Which clouds of a bag of ROS, where it holds several topics of them."""
-    columns: Annotated[int | None, arg(metavar="N")] = None
+    columns: Annotated[int | None, arg(metavar="N"), Bound(3)] = None
     """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        check_least(self, n_scans=1, jump=1, seed=0, columns=3)
 
     def check_data(self, data: object, sequence: str | None) -> None:
         """Raises a ValueError where options belong to files and no folder is given."""
         if data or self.resume:  # a resumed run has its own
             return
-        if sequence is not None:
-            raise ValueError("--sequence chooses a drive of DATA: give its folder too")
-        if self.topic is not None:
-            raise ValueError("--topic chooses clouds of a bag: give it too, DATA")
-        if self.columns is not None:
-            raise ValueError("--columns describes .bin files: give their folder too, DATA")
-        if self.kitti_angle_correction:
-            raise ValueError("--kitti-angle-correction is for the scans of KITTI's car: give their folder, DATA")
+        uses = {
+            "--sequence chooses a drive of DATA": sequence is not None,
+            "--topic chooses clouds of a bag": self.topic is not None,
+            "--columns describes .bin files": self.columns is not None,
+            "--kitti-angle-correction is for the scans of KITTI's car": self.kitti_angle_correction,
+        }
+        for use, is_given in uses.items():
+            if is_given:
+                raise ValueError(f"{use}: give DATA too")
 
 
 def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = None) -> LidarSequence:
@@ -171,7 +168,7 @@ def _read_kept(folder: Path, read_scan: Callable[[int], NDArray[np.float32]], in
 
 def _digest(drive: LidarSequence) -> str:
     """Hashes the poses, the times and two scans, which differ between towns, lidars and versions of the simulator."""
-    arrays = (drive.T_world_lidar, drive.times, drive.read_points(0), drive.read_points(len(drive) - 1))
+    arrays = (drive.T_world_lidar, drive.times, drive[0], drive[-1])
     parts = (b"" if array is None else np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(b"".join(parts)).hexdigest()[:8]
 

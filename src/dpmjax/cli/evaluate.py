@@ -16,10 +16,12 @@ with pairs more than 40 m apart; overlap.csv has that of the overlap head on the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import numpy as np
@@ -36,6 +38,7 @@ FIRST_TOWN = 5_000_000
 NUM_SHOWN, TOWN_LENGTH_M = 4, 400.0
 BANDS = ("near", "middle", "far")
 STAGES = ("network", "verified", "refined")
+Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
 COLUMNS = (*(f"{stage}_right" for stage in STAGES), "network_m", "refined_m", "pair_s")
 
 
@@ -44,15 +47,15 @@ class EvaluateOptions(cli.ModelOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = ("town",)
-    """Folders of scans with poses, or simulated towns."""
-    pairs: Annotated[int, arg(metavar="N")] = 15
+    """Folders of scans with poses, files of poses along which a town is simulated, or simulated towns."""
+    pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 15
     """Pairs for each distance."""
-    num_towns: Annotated[int, arg(metavar="N")] = 1
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1
     """Number of towns, where town is among the data; a suburb first, then other kinds of place."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, pairs=1, num_towns=1, seed=0)
+        """Checks bounds, and that there are data."""
+        super().__post_init__()
         if not self.data:
             raise ValueError("give at least one folder of scans, or town")
 
@@ -64,11 +67,7 @@ def main(options: EvaluateOptions, run: cli.Run) -> cli.Row:
     drives = open_evaluation_drives(options.data, evaluation_towns(options.num_towns, TOWN_LENGTH_M, kinds))
     pairs = PairReader(drives, options.pairs, options.seed)
     run.open()
-
-    def work(drive: str, band: str, pair: int) -> cli.Row:
-        return registration_row(model, pairs.read(drive, band, pair))
-
-    rows = cli.fill_table(run, pairs.cases, work)
+    rows = fill_pairs(run, model, pairs)
     overlap = fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
     summary = summarize_pairs(rows, overlap, STAGES, COLUMNS)
     numbers = {"weights": options.weights, **rate_confidence(model, rows), **cli.write_summary(run, summary)}
@@ -135,14 +134,35 @@ class PairReader:
         return self._read_band(drive, band)[pair]
 
 
-def registration_row(model: deeppointmap.Model, pair: deeppointmap.ScanPair) -> cli.Row:
-    """Returns errors after each stage, confidence and seconds of the registration of a pair."""
-    found = deeppointmap.register_in_stages(model, pair)
-    motions = found.descriptors, found.verified, found.refined
-    row: cli.Row = {"confidence": found.confidence}
-    for stage, T_target_source in zip(STAGES, motions, strict=True):
-        row |= motion_errors(stage, T_target_source, pair)
-    return row | {"pair_s": found.seconds}
+def fill_pairs(
+    run: cli.Run, model: deeppointmap.Model, pairs: PairReader, matchers: Mapping[str, Matcher] = MappingProxyType({})
+) -> list[cli.Row]:
+    """Fills rows.csv: errors of each pair after each stage, confidence and seconds, and those of further methods.
+
+    Args:
+        run: the open run.
+        model: a trained model.
+        pairs: pairs of all drives and bands.
+        matchers: further methods by name, for pairs that overlap: each makes `T_target_source` of source and target.
+
+    Returns:
+        The rows.
+    """
+
+    def work(drive: str, band: str, pair: int) -> cli.Row:
+        scans = pairs.read(drive, band, pair)
+        found = deeppointmap.register_in_stages(model, scans)
+        row: cli.Row = {"confidence": found.confidence}
+        for stage, T in zip(STAGES, (found.descriptors, found.verified, found.refined), strict=True):
+            row |= motion_errors(stage, T, scans)
+        row["pair_s"] = found.seconds
+        for name, matcher in matchers.items() if band != "far" else ():
+            begun = time.perf_counter()
+            T = matcher(scans.source, scans.target)
+            row |= {f"{name}_s": time.perf_counter() - begun, **motion_errors(name, T, scans)}
+        return row
+
+    return cli.fill_table(run, pairs.cases, work)
 
 
 def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.ScanPair) -> cli.Row:

@@ -31,18 +31,12 @@ class GraphOptions(cli.OutputOptions):
 
     graph: Annotated[Positional[Path], arg(metavar="GRAPH")]
     """Pose graph, a file of g2o or TORO."""
-    outlier_chi2: Annotated[float | None, arg(metavar="X")] = None
+    outlier_chi2: Annotated[float | None, arg(metavar="X"), cli.Bound(0, is_allowed=False)] = None
     """The most that a contradicted edge costs; without it, all edges count fully."""
     nearest_psd: FlagCreatePairsOff[bool] = False
     """Replace information matrices that are not positive semidefinite by the nearest ones that are."""
-    iterations: Annotated[int, arg(metavar="N")] = 100
+    iterations: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 100
     """At most N linear solves."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, iterations=1)
-        if self.outlier_chi2 is not None and not self.outlier_chi2 > 0.0:
-            raise ValueError(f"--outlier-chi2: expected more than 0, got {self.outlier_chi2}")
 
 
 def main(options: GraphOptions, run: cli.Run) -> cli.Numbers:

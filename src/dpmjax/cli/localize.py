@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, geometry, io, slam, viz, weights
@@ -26,7 +25,7 @@ from dpmjax.sequences import LidarSequence
 
 TABLE = "localizations.csv"
 POSE = [f"T_map_scan_{row}{column}" for row in range(3) for column in range(4)]
-COLUMNS = ("scan", "source", "status", "probability", "keyframe", "keyframe_scan", "part", "seconds", *POSE, "reason")
+COLUMNS = ("status", "probability", "keyframe", "keyframe_scan", "part", "seconds", *POSE, "reason")
 # Largest distance from a keyframe at which a scan is expected in the map.
 REACH_M = 15.0
 # Motions between keyframes differ by less than this share of their length from those of the right reference.
@@ -77,21 +76,20 @@ def main(options: LocalizeOptions, run: cli.Run) -> cli.Numbers:
     drive = cli.open_drive(options.scans, options, options.sequence)
     case = Case(slam_map, drive, reference_of(options, slam_map, drive), model.config.calibration is not None)
     run.open(drive.notes)
-    rows = run.continue_table(TABLE)
-    results = slam.localize_each(model, slam_map, (drive.read_points(i) for i in range(len(rows), len(drive))))
-    with tqdm(total=len(drive), initial=len(rows), unit=" scans", dynamic_ncols=True) as bar:
-        clock = time.perf_counter()
-        try:
-            while len(rows) < len(drive) and not run.is_stopped:
-                row = as_row(len(rows), case, next(results), time.perf_counter() - clock)
-                clock = time.perf_counter()
-                run.append_row(TABLE, **row)
-                rows.append(row)
-                bar.update(1)
-                bar.set_postfix(found=sum(row["status"] == "found" for row in rows))
-        except Exception:  # such as a scan that cannot be read
-            run.write_numbers({**write_found(run, options, case, rows), "status": "interrupted"})
-            raise
+    num_done = len(run.continue_table(TABLE))
+    results = slam.localize_each(model, slam_map, (drive.read_points(i) for i in range(num_done, len(drive))))
+
+    def work(scan: int, source: str) -> cli.Row:
+        begun = time.perf_counter()
+        return as_row(case, next(results), time.perf_counter() - begun)
+
+    cases = [{"scan": number, "source": source} for number, source in enumerate(drive.sources)]
+    try:
+        rows = cli.fill_table(run, cases, work, TABLE)
+    except Exception:  # such as a scan that cannot be read
+        rows = cli.fill_table(run, cases[: len(run.read_table(TABLE))], work, TABLE)
+        run.write_numbers({**write_found(run, options, case, rows), "status": "interrupted"})
+        raise
     return write_found(run, options, case, rows)
 
 
@@ -123,29 +121,27 @@ def _check_map_poses(path: Path, reference: np.ndarray, slam_map: slam.KeyframeM
         raise ValueError(f"--map-poses {path}: {found}; give T_world_lidar of each scan that the run has used (--jump)")
 
 
-def as_row(number: int, case: Case, result: slam.Localization, seconds: float) -> dict[str, str]:
-    """Returns the row of a scan as text."""
-    row = dict.fromkeys(COLUMNS, "") | {"scan": str(number), "source": case.drive.sources[number]}
-    row |= {"status": result.status, "reason": result.reason}
-    row |= {"probability": f"{result.probability:.4f}", "seconds": f"{seconds:.3f}"}
+def as_row(case: Case, result: slam.Localization, seconds: float) -> cli.Row:
+    """Returns the cells of a scan; those of a pose are empty where it was not found."""
+    row = dict.fromkeys(COLUMNS) | {name: getattr(result, name) for name in ("status", "probability", "reason")}
+    row["seconds"] = seconds
     if result.T_world_scan is None or result.keyframe is None:
         return row
-    row |= {"keyframe": str(result.keyframe), "keyframe_scan": str(case.slam_map.keyframes[result.keyframe].scan)}
-    row |= {"part": str(result.part)}
-    return row | dict(zip(POSE, (f"{value:.9f}" for value in result.T_world_scan[:3].ravel()), strict=True))
+    keyframe_scan = case.slam_map.keyframes[result.keyframe].scan
+    row |= {"keyframe": result.keyframe, "keyframe_scan": keyframe_scan, "part": result.part}
+    return row | dict(zip(POSE, result.T_world_scan[:3].ravel().tolist(), strict=True))
 
 
-def as_localization(row: dict[str, str]) -> slam.Localization:
+def as_localization(row: cli.Row) -> slam.Localization:
     """Returns the result of a row of the table."""
     if row["status"] != "found":
-        return slam.Localization("empty" if row["status"] == "empty" else "not in this map", None, 0.0, None, "")
+        return slam.Localization(row["status"], None, 0.0, None, "")
     T = np.eye(4)
-    T[:3] = np.reshape([float(row[name]) for name in POSE], (3, 4))
-    part = int(row["part"])
-    return slam.Localization("found", T, float(row["probability"]), int(row["keyframe"]), row["reason"], part=part)
+    T[:3] = np.reshape([row[name] for name in POSE], (3, 4))
+    return slam.Localization("found", T, row["probability"], row["keyframe"], row["reason"], part=row["part"])
 
 
-def write_found(run: cli.Run, options: LocalizeOptions, case: Case, rows: list[dict[str, str]]) -> cli.Numbers:
+def write_found(run: cli.Run, options: LocalizeOptions, case: Case, rows: list[cli.Row]) -> cli.Numbers:
     """Writes trajectory and picture; returns the numbers."""
     results = [as_localization(row) for row in rows]
     rows_found = [number for number, result in enumerate(results) if result.is_in_map]
@@ -172,7 +168,7 @@ def write_found(run: cli.Run, options: LocalizeOptions, case: Case, rows: list[d
         "num_keyframes": len(case.slam_map),
         "is_calibrated": case.is_calibrated,
         "map_bytes": options.map.stat().st_size,
-        "scan_s": float(np.median([float(row["seconds"]) for row in rows])) if rows else None,
+        "scan_s": float(np.median([row["seconds"] for row in rows])) if rows else None,
         **errors,
     }
     run.write_numbers(numbers)  # also where a picture fails

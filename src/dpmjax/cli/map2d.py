@@ -18,22 +18,29 @@ recording, scans half a metre or 20 degrees apart are registered, and all others
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation
-from dpmjax.cli import map2d_results as results
+from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation, viz
+from dpmjax.cli.run import Run
 from dpmjax.sequences import FloatArray, ScanSequence
+
+if TYPE_CHECKING:
+    from dpmjax.types import ScanSet
 
 # Scans of a recording in metres that lie this far apart are registered.
 _MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
+
+
+# Largest number of printed spans of uncertain scans.
+_NUM_SPANS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,21 +63,19 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
     refine: bool = True
     """Also align all scans together, point to line, from the start and from the fit."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
     """Stop after N steps, rounded up to whole calls of the compiled program; without it, the preset decides."""
-    seconds: Annotated[float | None, arg(metavar="S")] = None
+    seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
     """Stop the fit after S seconds of run time, compile time not counted."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
     """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
     crowd: an office in which people walk about."""
-    range_noise_px: Annotated[float, arg(metavar="PX")] = 0.0
+    range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, steps=1, n_scans=1, jump=1, range_noise_px=0)
-        if self.seconds is not None and not self.seconds > 0.0:
-            raise ValueError(f"--seconds: expected a positive time, got {self.seconds}")
+        """Checks bounds, and options that do not go together."""
+        super().__post_init__()
         if not self.ordered and self.init != "global" and not self.resume:
             raise ValueError(f"--no-ordered: only --init global needs no order, got --init {self.init}")
         if self.topic is not None and self.data is None and not self.resume:
@@ -95,11 +100,11 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
     if sequence.unit == "m":
         io.write_grid_map(run / "map", result.poses, sequence.points, sequence.mask)
     registered = sequence.take(result.recording.chosen)
-    limits = results.draw_map(run, registered, result, numbers)
+    limits = draw_map(run, registered, result, numbers)
     if recorder.has_map:
-        results.draw_occupancy(run, registered, result, limits)
+        draw_occupancy(run, registered, result, limits)
     cli.draw_loss(run, sequence.unit)
-    run.say(results.report(sequence.unit, numbers))
+    run.say(report(sequence.unit, numbers))
     return numbers
 
 
@@ -120,7 +125,7 @@ def register_sequence(
             bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
         unit = fit_settings(options, sequence).unit or geometry.typical_range(fitted.points, fitted.mask)
-        return partial(recorder, measure=results.ate_of(fitted, unit))
+        return partial(recorder, measure=ate_of(fitted, unit))
 
     def advance(share: float) -> None:
         bar.update(share - bar.n)
@@ -128,7 +133,7 @@ def register_sequence(
     hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine, advance)
     with bar:
         return registration2d.register_scans(
-            results.scan_set_of(sequence),
+            scan_set_of(sequence),
             registration_settings(options, sequence),
             key=jax.random.key(options.seed),
             start=start,
@@ -147,10 +152,10 @@ def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, 
 
     return {
         "status": "done" if result.assessment.is_trusted else "uncertain",
-        "verdict": results.trust_verdict(result.assessment._asdict()),
+        "verdict": trust_verdict(result.assessment._asdict()),
         "num_scans": len(sequence),
         "num_registered": len(registered),
-        **results.before_and_after(registered, start, kept),
+        **before_and_after(registered, start, kept),
         "start": title(result.start),
         "kept": title(result.kept),
         "candidates": {
@@ -166,7 +171,7 @@ def read_scans(options: Map2dOptions) -> ScanSequence:
     chosen = options.selection
     if options.data is not None:
         sequence = io.read_sequence(options.data, selection=chosen, topic=options.topic)
-        if not registration2d.find_originals(results.scan_set_of(sequence)).any():
+        if not registration2d.find_originals(scan_set_of(sequence)).any():
             raise ValueError(f"{options.data}: all scans are equal beam by beam; give scans of a robot that moves")
         return sequence
     sequence = simulation.simulate_sequence(
@@ -208,3 +213,114 @@ def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.D
     if sequence.unit == "m":
         settings = replace(settings, unit=None)
     return settings if options.steps is None else deepmapping.with_steps(settings, options.steps)
+
+
+def ate_of(sequence: ScanSequence, unit: float) -> Callable[[FloatArray], float]:
+    """Returns a function to the ATE of poses whose lengths are multiples of `unit`; NaN without a reference."""
+    reference = sequence.reference_poses
+    if reference is None:
+        return lambda _: math.nan
+    return lambda poses: float(metrics.absolute_trajectory_error(unit * poses[:, :2], reference[:, :2]))
+
+
+def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArray) -> dict[str, Any]:
+    """Returns errors of the kept and of the initial poses; `success` is None without a reference."""
+    reference, unit = sequence.reference_poses, sequence.unit
+    if reference is None:
+        return {"success": None}
+    after, before = metrics.planar_errors(sequence, poses), metrics.planar_errors(sequence, start)
+    # The paper's threshold is 20 pixels, 2 % of its world. The threshold of a real place is 2 % of the span of its
+    # trajectory.
+    threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
+    return {
+        **after,
+        **named_initial(before),
+        f"success_threshold_{unit}": threshold,
+        "success": after[f"ate_{unit}"] < threshold,
+    }
+
+
+def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
+    """Returns errors under their names for the initial poses, such as ate_initial_m for ate_m; counts are left out."""
+    errors = {name: value for name, value in numbers.items() if not name.startswith("num_")}
+    return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
+
+
+def trust_verdict(assessment: Mapping[str, Any]) -> str:
+    """Returns whether the map can be trusted, why, the fault of the odometry, and the uncertain scans."""
+    trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
+    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
+    # Near zero the difference of two shares has either sign.
+    more = f"{max(contradiction, 0.0):.1%} more beams than between the best pairs"
+    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {more} end in the free space of another scan"
+    if assessment["fault"] is not None:
+        text += f"; {assessment['fault']}"
+    if count := len(assessment["uncertain_scans"]):
+        spans = spans_of(assessment["uncertain_scans"])
+        shown = ", ".join(spans[:_NUM_SPANS]) + (" ..." if len(spans) > _NUM_SPANS else "")
+        text += f"; uncertain where {count} scans are, which slide along a corridor or fit no other: {shown}"
+    return text
+
+
+def spans_of(rows: Sequence[int]) -> list[str]:
+    """Returns increasing numbers as spans, such as 3-5 and 9."""
+    parts = np.split(np.asarray(rows), np.flatnonzero(np.diff(rows) > 1) + 1)
+    return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts if len(part)]
+
+
+def report(unit: str, numbers: Mapping[str, Any]) -> str:
+    """Returns errors and scores of each candidate, which one was kept, and errors against further references."""
+    candidates = numbers["candidates"]
+    width = max(map(len, candidates))
+    has_ate = all(f"ate_{unit}" in found for found in candidates.values())
+    head = f"  {'ATE, ' + unit:>10}" if has_ate else ""
+    lines = [f"  {'candidate':{width}}{head}  nats a beam  beams off a surface"]
+    for name, found in candidates.items():
+        mark, ate = "*" if name == numbers["kept"] else " ", f"  {found[f'ate_{unit}']:10.3g}" if has_ate else ""
+        lines.append(f"{mark} {name:{width}}{ate}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
+    why = "chosen without the reference" if has_ate else "no reference was given"
+    lines.append(f"kept: {numbers['kept']} ({why}; docs/guides/scans_2d.md explains both scores)")
+    return "\n".join(lines)
+
+
+def scan_set_of(sequence: ScanSequence) -> ScanSet:
+    """Returns the scans without their name, unit and poses."""
+    import jax.numpy as jnp
+
+    from dpmjax.types import ScanSet
+
+    return ScanSet(jnp.asarray(sequence.points), jnp.asarray(sequence.mask))
+
+
+def draw_map(
+    run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
+) -> viz.Limits:
+    """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
+    scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
+    poses, anchor = {}, None
+    titles = dict(zip(result.candidates, numbers["candidates"], strict=True))
+    shown = dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept))
+    for name in [name for name in shown if name in result.candidates]:
+        title, found, is_kept = titles[name], numbers["candidates"][titles[name]], name == result.kept
+        ate, distance = found.get(f"ate_{unit}"), found.get(f"point_distance_{unit}")
+        title = title[0].upper() + title[1:] + (" (kept)" if is_kept else "") + "\n"
+        errors = {"ATE": ate, "points": distance}.items()
+        title += "   ".join(f"{name} {viz.format_length(e, unit)}" for name, e in errors if e is not None)
+        poses[title], anchor = result.candidates[name].poses, title if is_kept else anchor
+    if reference is not None:
+        poses["Reference\n"], anchor = reference, None
+    figure = viz.registered_scans_figure(scans, poses, unit, anchor=anchor)
+    viz.save_figure(figure, run / "map.png")
+    return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
+
+
+def draw_occupancy(
+    run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
+) -> None:
+    """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
+    picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)
+    kept, reference = result.candidates[result.kept].poses, registered.reference_poses
+    anchor, trajectory = kept if reference is None else reference, result.fitted.poses[:, :2]
+    T_view_fit = np.asarray(metrics.align_rigid(trajectory, anchor[:, :2]))
+    figure = viz.occupancy_figure(picture, trajectory, registered.unit, T_view_world=T_view_fit, limits=limits)
+    viz.save_figure(figure, run / "occupancy.png")

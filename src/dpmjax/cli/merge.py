@@ -15,6 +15,7 @@ map_2.npz and so on.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +25,11 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
-from dpmjax.cli import slam_numbers
+from dpmjax.cli import slam_results
 from dpmjax.sequences import counted
+
+# Points below this height above the lidar are the ground.
+GROUND_M = -1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +75,7 @@ def write_maps(run: cli.Run, maps: Sequence[slam.KeyframeMap], merged: slam.Merg
         for number, each in enumerate(maps, start=1)
         for keyframe in each.keyframes
     ]
-    columns = ("map", "scan", "other_map", "other_scan", *cli.LOOP_CELLS)
-    cli.write_table(run / "loops.csv", columns, cli.loop_rows(merged.loops, ends))
+    cli.write_loops(run / "loops.csv", merged.loops, ends)
 
 
 def map_name(part: int, num_parts: int) -> str:
@@ -92,16 +95,18 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
             "file": map_name(part, len(merged.maps)),
             "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
             "num_keyframes": len(slam_map),
-            "num_measured_parts": slam_numbers.count_parts(slam_map),
+            "num_measured_parts": slam_results.count_parts(slam_map),
         }
         for part, slam_map in enumerate(merged.maps, start=1)
     ]
     is_measured = all(part["num_measured_parts"] < 2 for part in parts)
+    ends = cli.accepted_ends(merged.loops)
+    meetings = Counter(map(tuple, np.sort(merged.joined.map_of_keyframe[ends] + 1, axis=1).tolist()))
     numbers = {
         "status": "done" if is_measured else "uncertain",
         "num_maps": len(maps),
         "num_parts": len(parts),
-        "num_loops": len(cli.accepted_ends(merged.loops)),
+        "num_loops": len(ends),
         "num_candidates": len(merged.loops),
         "num_keyframes": len(merged.joined.slam_map),
         "parts": parts,
@@ -109,7 +114,7 @@ def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merge
             {"map": number, "file": short_name(path), "num_keyframes": len(each)}
             for number, (path, each) in enumerate(zip(paths, maps, strict=True), start=1)
         ],
-        "loops_between": [{"maps": pair, "num_loops": number} for pair, number in cli.count_meetings(merged.joined)],
+        "loops_between": [{"maps": list(pair), "num_loops": number} for pair, number in sorted(meetings.items())],
     }
     return {"verdict": merge_text(numbers), **numbers}
 
@@ -132,7 +137,10 @@ def layers_of(path: Path, merged: slam.MergedMaps, number: int) -> list[viz.Laye
     rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
     T_world_keyframe = slam_map.T_world_keyframe[rows]
     cloud = cli.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
-    return cli.map_layers(f"{short_name(path)}, {counted(len(rows), 'keyframe')}", number, T_world_keyframe, cloud)
+    color = viz.AGENTS[number % len(viz.AGENTS)]
+    label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
+    surface = viz.Points(cloud.points[cloud.heights_m > GROUND_M], color)
+    return [surface, viz.Track(T_world_keyframe[:, :3, 3], color, label)]
 
 
 def merge_text(metrics: cli.Numbers) -> str:

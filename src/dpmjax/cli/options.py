@@ -11,10 +11,29 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, arg
+
+
+class Bound(NamedTuple):
+    """The least value of an option that is a number, or of each of its numbers; it stands in the option's type.
+
+    Attributes:
+        least: the value.
+        is_allowed: False where the option must be larger.
+    """
+
+    least: float
+    is_allowed: bool = True
+
+    def check(self, name: str, values: Any) -> None:
+        """Raises a ValueError for a value that is too small, or not finite; None passes."""
+        for value in values if isinstance(values, tuple) else (values,):
+            if value is not None and not (self.least < value < math.inf or (value == self.least and self.is_allowed)):
+                expected = "at least" if self.is_allowed else "more than"
+                raise ValueError(f"--{name.replace('_', '-')}: expected {expected} {self.least}, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +47,13 @@ class OutputOptions:
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
     """Where to compute; without it, JAX chooses."""
 
+    def __post_init__(self) -> None:
+        """Checks the bounds of all options."""
+        for name, kind in get_type_hints(type(self), include_extras=True).items():
+            for bound in getattr(kind, "__metadata__", ()):
+                if isinstance(bound, Bound):
+                    bound.check(name, getattr(self, name))
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(OutputOptions):
@@ -39,7 +65,7 @@ class RunOptions(OutputOptions):
 
     may_change: ClassVar[frozenset[str]] = frozenset()
 
-    seed: int = 0
+    seed: Annotated[int, Bound(0)] = 0
     """Seed of everything random."""
     resume: FlagCreatePairsOff[bool] = False
     """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
@@ -49,9 +75,9 @@ class RunOptions(OutputOptions):
 class ScanOptions:
     """Options of every command that reads scans or images in a row."""
 
-    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N")] = None
+    n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N"), Bound(1)] = None
     """Use the first N scans, after --jump; without it, all."""
-    jump: Annotated[int, arg(aliases=["-j"], metavar="N")] = 1
+    jump: Annotated[int, arg(aliases=["-j"], metavar="N"), Bound(1)] = 1
     """Use every Nth scan."""
 
     @property
@@ -102,23 +128,6 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
     if message.startswith(own):  # a check of the options themselves
         raise ValueError(message.removeprefix(own))
     raise ValueError(f"{message.rstrip('.') or 'wrong options'}; --help describes the options")
-
-
-def check_least(options: Any, **least: float) -> None:
-    """Checks the ranges of options that are numbers, tuples of numbers, or None.
-
-    Args:
-        options: the options.
-        **least: the smallest allowed value of each option.
-
-    Raises:
-        ValueError: an option is smaller, or not finite.
-    """
-    for name, smallest in least.items():
-        values = getattr(options, name)
-        for value in values if isinstance(values, tuple) else (values,):
-            if value is not None and not smallest <= value < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')}: expected at least {smallest}, got {value}")
 
 
 def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deeppointmap, io, viz, weights
+from dpmjax import cli, deeppointmap, geometry, io, metrics, viz, weights
 
 if TYPE_CHECKING:
     from dpmjax.types import Registration
@@ -37,14 +37,10 @@ class RegisterOptions(cli.ModelOptions, cli.OutputOptions):
     """Scan whose points are moved."""
     target: Annotated[Positional[Path], arg(metavar="B")]
     """Scan in whose frame they end."""
-    columns: Annotated[int | None, arg(metavar="N")] = None
-    """cli.Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    columns: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
+    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
     refine: bool = True
     """End with a fine point-to-plane alignment."""
-
-    def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, columns=3)
 
 
 def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
@@ -58,13 +54,18 @@ def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     print("registration ...", flush=True)
     found = deeppointmap.register(model, source, target, refine=options.refine)
     T = np.asarray(found.T_target_source, np.float64)
-    write_motion(run, T, source, target)
+    np.savetxt(run / "T_target_source.txt", T, "%.9f")
+    points = np.concatenate([geometry.rigid.transform_points(T, source), target])
+    colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
+    io.write_ply(run / "aligned.ply", points, colors=colors)
     # Files of the same name are told apart by their folders.
     num_parts = 1 if options.source.name != options.target.name else 2
     files = (str(Path(*options.source.parts[-num_parts:])), str(Path(*options.target.parts[-num_parts:])))
     is_calibrated = model.config.calibration is not None
-    named = {"source": files[0], "target": files[1], "weights": options.weights}
-    numbers = named | motion_numbers(T) | verdict_numbers(found, is_calibrated)
+    numbers: cli.Numbers = {"source": files[0], "target": files[1], "weights": options.weights, "T_target_source": T}
+    numbers["translation_m"] = np.linalg.norm(T[:3, 3])
+    numbers["rotation_deg"] = np.degrees(metrics.rotation_angle(T[None, :3, :3]))[0]
+    numbers |= verdict_numbers(found, is_calibrated)
     run.write_numbers(numbers)  # also where a picture fails
     motions = {"before registration": np.eye(4), f"registered, confidence {float(found.confidence):.2f}": T}
     pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
@@ -101,24 +102,3 @@ def verdict_numbers(found: Registration, is_calibrated: bool) -> cli.Numbers:
         **shares,
         "is_calibrated": is_calibrated,
     }
-
-
-def motion_numbers(T_target_source: np.ndarray) -> cli.Numbers:
-    """Returns the motion as a matrix, a distance and an angle."""
-    from scipy.spatial.transform import Rotation
-
-    angle = Rotation.from_matrix(T_target_source[:3, :3]).magnitude()
-    return {
-        "T_target_source": T_target_source,
-        "translation_m": float(np.linalg.norm(T_target_source[:3, 3])),
-        "rotation_deg": float(np.degrees(angle)),
-    }
-
-
-def write_motion(run: cli.Run, T_target_source: np.ndarray, source: np.ndarray, target: np.ndarray) -> None:
-    """Writes T_target_source.txt and aligned.ply."""
-    rows = (" ".join(f"{value:.9f}" for value in row) for row in T_target_source)
-    io.write_atomically(run / "T_target_source.txt", "\n".join(rows) + "\n")
-    moved = source @ T_target_source[:3, :3].T + T_target_source[:3, 3]
-    colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
-    io.write_ply(run / "aligned.ply", np.concatenate([moved, target]).astype(np.float32), colors=colors)

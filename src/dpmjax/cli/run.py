@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import inspect
 import logging
 import math
 import os
@@ -29,10 +30,9 @@ from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
 from dpmjax.cli import program
-from dpmjax.cli.machine import environment, select_device
+from dpmjax.cli.info import environment, select_device
 from dpmjax.cli.options import parse_options
 from dpmjax.cli.report import write_report
-from dpmjax.cli.result_files import write_json, write_table
 from dpmjax.cli.run_folder import (
     CONFIG,
     RESULTS,
@@ -43,6 +43,8 @@ from dpmjax.cli.run_folder import (
     load_options,
     lock_folder,
     make_latest,
+    write_json,
+    write_table,
 )
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError, Note
@@ -266,6 +268,12 @@ def run_command(
             signal.signal(number, handler)
         if run is not None:
             run.close()
+
+
+def run_experiment(main: Callable[[Any, Run], Numbers]) -> NoReturn:
+    """Runs the `main` of a module of `experiments`, and ends the process."""
+    description = sys.modules[main.__module__].__doc__
+    program.end_process(run_command(main, name=Path(inspect.getfile(main)).stem, description=description))
 
 
 def _finish(run: Run, numbers: Numbers) -> int:

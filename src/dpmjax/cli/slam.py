@@ -24,9 +24,8 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, io, slam, viz, weights
-from dpmjax.cli import slam_files as files
-from dpmjax.cli import slam_numbers as results
+from dpmjax import cli, io, saved_maps, slam, viz, weights
+from dpmjax.cli import slam_results as results
 from dpmjax.sequences import LidarSequence, counted, require
 
 
@@ -75,7 +74,7 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
         cli.require_importable("rerun", "-v")
     methods = slam_methods(options)
     # A map of other weights is refused here, before the scans are opened.
-    start = slam.init_slam(None if options.map is None else files.open_map(options.map, methods))
+    start = slam.init_slam(None if options.map is None else results.open_map(options.map, methods))
     sequence = cli.open_drive(options.data, options, options.sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
     beginning = find_beginning(cli.find_run("slam", options.output) if options.resume else None, methods, start)
@@ -144,14 +143,18 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
 def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) -> cli.Numbers:
     """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
     sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
-    files.write_trajectory(run.path, result.T_world_scan, sequence.times)
-    files.write_trajectory(run.path, result.T_odometry_scan, sequence.times, "odometry")
-    files.write_graph(run.path, result)
-    files.write_loops(run / "loops.csv", result.loops, result.keyframes)
-    files.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
-    sizes = files.write_map_file(run / "map.npz", slam_map) if len(slam_map) else {}
+    for name, poses in (("trajectory", result.T_world_scan), ("odometry", result.T_odometry_scan)):
+        cli.write_poses(run.path, poses, name, times=sequence.times, frame="T_world_lidar")
+    results.write_graph(run.path, result)
+    results.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
+    results.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
+    sizes: cli.Numbers = {}
+    if len(slam_map):
+        whole = saved_maps.save_map(run / "map.npz", slam_map)
+        small = saved_maps.map_bytes(slam_map, "int8")
+        sizes = {"map_bytes": whole.stat().st_size, "map_bytes_int8": len(small)}
     run.write_numbers({**numbers, **sizes})  # also where a picture fails
-    cloud = files.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
+    cloud = results.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
     io.write_ply(run / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
-    files.draw_pictures(run.path, sequence, result, cloud, len(drive.start.slam_map))
+    results.draw_pictures(run.path, sequence, result, cloud, len(drive.start.slam_map))
     return {**sizes, "map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}

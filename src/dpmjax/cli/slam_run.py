@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import slam, viz
-from dpmjax.cli import slam_files as files
+from dpmjax.cli import slam_results as results
 from dpmjax.cli.drives import ScanReader
 from dpmjax.cli.run import Run
 from dpmjax.saved_maps import RunState, load_state, save_state
@@ -67,7 +67,7 @@ def find_beginning(earlier: Path | None, methods: slam.SlamMethods, start: slam.
     if path is None or not path.is_file():
         return RunState(start, ())
     found = load_state(path)
-    files.require_same_weights(path, found.state.slam_map, methods, "give those, or start again")
+    results.require_same_weights(path, found.state.slam_map, methods, "give those, or start again")
     return found
 
 
@@ -155,7 +155,7 @@ def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -
 
 
 def _progress(state: slam.SlamState, report: slam.ScanReport, compile_s: float) -> str:
-    num_loops = len(files.accepted_ends(state.loops.loops))
+    num_loops = len(results.accepted_ends(state.loops.loops))
     parts = [counted(len(state.slam_map), "keyframe"), counted(num_loops, "loop"), f"score {report.score:.2f}"]
     if report.status not in ("first", "tracked"):
         parts.append(report.status)
@@ -172,4 +172,4 @@ def show_live(
     points = slam.corrected_points(scan, report.T_turn)
     viewer.show_scan(report.scan, points, T_world_keyframe[report.keyframe] @ report.T_keyframe_scan)
     if report.is_keyframe:
-        viewer.show_map(T_world_keyframe, points, T_world_keyframe[files.accepted_ends(state.loops.loops), :3, 3])
+        viewer.show_map(T_world_keyframe, points, T_world_keyframe[results.accepted_ends(state.loops.loops), :3, 3])

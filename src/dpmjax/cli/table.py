@@ -14,7 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from dpmjax import io, metrics
-from dpmjax.cli.machine import git_hash
+from dpmjax.cli.info import git_hash
 from dpmjax.cli.run import Run
 
 Row = dict[str, Any]

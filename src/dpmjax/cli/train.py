@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -67,23 +67,23 @@ class TrainOptions(RunOptions):
     """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
     frame: Literal["lidar", "local"] | None = None
     """Frame of the encoder's features: of the lidar, or of the wall at each point; without it, the preset decides."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
     """Train for about N steps in all, stages in proportion; without it, the preset decides."""
-    epochs: Annotated[float | None, arg(metavar="N")] = None
+    epochs: Annotated[float | None, arg(metavar="N"), cli.Bound(0, is_allowed=False)] = None
     """Train until each scan was N times the first of a group, instead of --steps; `paper` takes 12, as published."""
-    groups: Annotated[tuple[int, ...], arg(metavar="N ...")] = ()
+    groups: Annotated[tuple[int, ...], arg(metavar="N ..."), cli.Bound(2)] = ()
     """Largest group of scans of each stage of the curriculum, such as 8 16 8 16; without it, the preset decides."""
-    scans: Annotated[int | None, arg(metavar="N")] = None
+    scans: Annotated[int | None, arg(metavar="N"), cli.Bound(2)] = None
     """How many scans a step takes; more keep a GPU busy, which computes all of them at once. Without it, the preset
     decides."""
-    num_towns: Annotated[int, arg(metavar="N")] = 3
+    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """How many towns to train on, where town is among the data."""
-    town_length_m: Annotated[float, arg(metavar="M")] = 400.0
+    town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
     """Length of the drive through each town."""
     refine_labels: FlagCreatePairsOff[bool] = False
     """Align the scans of each group by point-to-plane ICP, from the given poses: for drives whose poses are decimetres
     off between neighbours."""
-    hours: Annotated[float | None, arg(metavar="H")] = None
+    hours: Annotated[float | None, arg(metavar="H"), cli.Bound(0, is_allowed=False)] = None
     """Train for about H hours, at most the steps of the preset: the learning rate falls until then. Without it, the
     steps decide."""
     finish: FlagCreatePairsOff[bool] = False
@@ -92,31 +92,25 @@ class TrainOptions(RunOptions):
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
     """Folder where prepared scans are kept between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The needed
     and the free space are printed first."""
-    variants: Annotated[int | None, arg(metavar="N")] = None
+    variants: Annotated[int | None, arg(metavar="N"), cli.Bound(0)] = None
     """Prepare each scan N times and choose among these; fewer need less disk, 0.8 MB for each of `paper`. 0: prepare it
     anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
-    held_out_pairs: Annotated[int, arg(metavar="N")] = 32
+    held_out_pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 32
     """Pairs of scans at each distance that choose the model, all drives together."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
     """Folders of scans with poses whose pairs choose the model, instead of held-out places of --data."""
-    recall_every: Annotated[int, arg(metavar="N")] = 100
+    recall_every: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 100
     """Measure recall every N steps, and at the end."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
     """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
-    num_processes: Annotated[int | None, arg(metavar="N")] = None
+    num_processes: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
     """How many processes there are."""
-    process_id: Annotated[int | None, arg(metavar="I")] = None
+    process_id: Annotated[int | None, arg(metavar="I"), cli.Bound(0)] = None
     """Which of them this one is, from 0; process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
-        """Checks ranges."""
-        cli.check_least(self, steps=3, num_towns=1, held_out_pairs=1, recall_every=1, seed=0, groups=2, scans=2)
-        cli.check_least(self, variants=0)
-        cli.check_least(self, town_length_m=100, num_processes=1, process_id=0)
-        if self.hours is not None and not 0 < self.hours < math.inf:
-            raise ValueError(f"--hours: expected more than 0, got {self.hours}")
-        if self.epochs is not None and not 0 < self.epochs < math.inf:
-            raise ValueError(f"--epochs: expected more than 0, got {self.epochs}")
+        """Checks bounds, and options that do not go together."""
+        super().__post_init__()
         if self.steps is not None and self.epochs is not None:
             raise ValueError("--epochs: expected without --steps; give one of the two")
         if not self.data:
@@ -160,13 +154,20 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     trained = run_training(records, store, settings, hooks, seed=options.seed, total_s=total_s)
     if records is None:
         return {}
-    numbers = {**training_numbers(trained, records), "num_scans": len(store.table), "bad_scans": store.bad}
-    numbers["seed"] = options.seed
-    ended = evaluate_and_calibrate(options, trained, records, numbers, chosen_sources(options, sources))
-    numbers |= ended.numbers
-    numbers = {"verdict": train_files.training_verdict(numbers), **numbers}
-    train_files.write_training(records, trained, ended, numbers, origin=origin_of(options))
-    return numbers
+    numbers = training_numbers(trained, records) | {"num_scans": len(store.table), "bad_scans": store.bad}
+    evaluation, origin = None, f"{options.preset}, trained on {', '.join(options.data)}"
+    if not run.is_stopped:  # this and the calibration take minutes, which a stopped run does not have
+        evaluation, measured = evaluate(trained, records)
+        numbers |= measured
+    train_files.write_training(records, trained, evaluation, numbers, origin=origin)
+    numbers["calibration"] = {}
+    if options.calibrate and not run.is_stopped:
+        # A signal that comes from here on loses the calibration alone.
+        run.write_numbers({**numbers, "status": "interrupted"})
+        chosen = chosen_sources(options, sources)
+        model, numbers["calibration"] = calibrate_on_sources(trained.model, chosen, options.seed, run.check_stop)
+        train_files.write_model(run / train_files.MODEL, model, numbers, origin=origin)
+    return {"verdict": train_files.training_verdict(numbers), **numbers}
 
 
 def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
@@ -174,11 +175,6 @@ def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
     steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
     of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
     return f"{num_scans} scans; at most {of_stages}"
-
-
-def origin_of(options: TrainOptions) -> str:
-    """Returns the beginning of the description of a model."""
-    return f"{options.preset}, trained on {', '.join(options.data)}"
 
 
 def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
@@ -289,49 +285,28 @@ def training_settings(options: TrainOptions, first: deeppointmap.Model | None = 
         if "overlap" not in first.config.trained:  # this head begins, whatever is tuned
             rate_share = settings.overlap.rate_share / TUNING_SHARE
             settings = replace(settings, overlap=replace(settings.overlap, rate_share=rate_share))
-    settings = replace(settings, stages=options.stages)
+    given: dict[str, Any] = {"num_variants": options.variants, "num_epochs": options.epochs}
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    settings = replace(settings, stages=options.stages, refines_labels=options.refine_labels)
     if options.frame is not None:
         encoder = replace(settings.model.encoder, frame=options.frame)
         settings = replace(settings, model=replace(settings.model, encoder=encoder))
-    settings = replace(settings, refines_labels=options.refine_labels)
-    if options.variants is not None:
-        settings = replace(settings, num_variants=options.variants)
-    stages = settings.curriculum
+    stages, num_scans = settings.curriculum, options.scans or settings.sampling.num_scans
     if options.groups:
         num_steps = max(1, settings.num_steps // len(options.groups))
         stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in options.groups)
-    num_scans = options.scans or settings.sampling.num_scans
     settings = replace(settings, curriculum=stages, sampling=replace(settings.sampling, num_scans=num_scans))
     if jax.default_backend() != "cpu":
         settings = replace(settings, scans_at_once=num_scans)
     for part in options.without:
         settings = deeppointmap.without(settings, part)
-    if options.epochs is not None:
-        return replace(settings, num_epochs=options.epochs)
     return settings if options.steps is None else settings.with_steps(options.steps)
-
-
-def evaluate_and_calibrate(
-    options: TrainOptions,
-    trained: deeppointmap.Trained,
-    records: Records,
-    numbers: Numbers,
-    sources: Sequence[cli.Source],
-) -> train_files.Ended:
-    """Evaluates and calibrates, unless a signal came: both take minutes, which a stopped run does not have."""
-    run, model, calibration = records.run, trained.model, Numbers()
-    evaluation, measured = (None, {}) if run.is_stopped else evaluate(trained, records)
-    if options.calibrate and not run.is_stopped:
-        # A signal that comes from here on loses the calibration alone.
-        run.write_numbers({**numbers, **measured, "status": "interrupted"})
-        train_files.write_model(run / train_files.MODEL, model, {**numbers, **measured}, origin=origin_of(options))
-        model, calibration = calibrate_on_sources(model, sources, options.seed, run.check_stop)
-    return train_files.Ended(model, evaluation, {**measured, "calibration": calibration})
 
 
 def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers:
     """Returns steps, selection score and seconds for `metrics.json`."""
     return {
+        "seed": records.seed,
         "steps": int(trained.progress.state.step),
         "best_step": int(trained.progress.best_step) or None,
         "selection_score": float(trained.progress.best_score),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,42 +18,28 @@ MODEL, LAST, BEST = "model.safetensors", "last.safetensors", "best.safetensors"
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "overlap_loss")
 
 
-class Ended(NamedTuple):
-    """A trained model at the end of a run.
-
-    Attributes:
-        model: the model, calibrated if `--calibrate` says so.
-        evaluation: its registrations of the pairs that chose it; None without such pairs, and after a stop.
-        numbers: numbers of the evaluation and of the calibration for `metrics.json`.
-    """
-
-    model: deeppointmap.Model
-    evaluation: deeppointmap.Evaluation | None
-    numbers: Numbers
-
-
 def write_training(
-    records: Records, trained: deeppointmap.Trained, ended: Ended, metrics: Numbers, *, origin: str
+    records: Records,
+    trained: deeppointmap.Trained,
+    evaluation: deeppointmap.Evaluation | None,
+    metrics: Numbers,
+    *,
+    origin: str,
 ) -> None:
     """Writes all files of a run; numbers first, so that they are written even if a picture fails."""
+    from dpmjax.cli.train_run import with_params
+
     run, pairs = records.run, records.selection.pairs
     run.write_numbers(metrics)
-    write_model(run / MODEL, ended.model, metrics, origin=origin)
-    write_other_model(run, trained, records, metrics, origin=origin)
-    draw_curves(run)
-    if ended.evaluation is not None and pairs is not None:
-        draw_matches(run, ended.evaluation, pairs)
-
-
-def write_other_model(
-    run: Run, trained: deeppointmap.Trained, records: Records, metrics: Numbers, *, origin: str
-) -> None:
-    """Writes the last model of the first stage beside the best, or the best beside the last."""
-    from dpmjax.cli.train_run import best_model, last_model
-
+    write_model(run / MODEL, trained.model, metrics, origin=origin)
     if metrics["best_step"] is not None and "registration" in metrics["trained"]:
-        name, other = (BEST, best_model) if records.takes_last else (LAST, last_model)
-        write_model(run / name, other(trained), metrics, origin=f"{name} of {origin}")
+        # The last model of the first stage stands beside the best, or the best beside the last.
+        progress = trained.progress
+        name, params = (BEST, progress.best_params) if records.takes_last else (LAST, progress.state.params)
+        write_model(run / name, with_params(trained.model, params), metrics, origin=f"{name} of {origin}")
+    draw_curves(run)
+    if evaluation is not None and pairs is not None:
+        draw_matches(run, evaluation, pairs)
 
 
 def write_model(path: Path, model: deeppointmap.Model, metrics: Numbers, *, origin: str) -> None:

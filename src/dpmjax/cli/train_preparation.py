@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import signal
-import uuid
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
-import numpy as np
 from tqdm import tqdm
 
 from dpmjax import cli
@@ -23,26 +21,10 @@ from dpmjax import deeppointmap as dpm
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.types import Poses
 
-# Least number of scans of a part of a drive; each part opens the drive again. A drive this short is prepared here.
-MIN_PART = 64
-# Parts for each processor, so that all end at about the same time.
-PARTS_EACH = 2
-
-
-class Preparation(NamedTuple):
-    """Settings of the preparation of all drives.
-
-    Attributes:
-        settings: settings of training.
-        folder: folder of prepared scans.
-        seed: seed of the variants.
-        run: part of the names of unfinished files.
-    """
-
-    settings: dpm.TrainingConfig
-    folder: Path
-    seed: int
-    run: str
+Result = TypeVar("Result")
+# Scans of a drive that a processor prepares at a time; with more the bar stands still, with fewer the drive is opened
+# more often.
+NUM_AT_ONCE = 16
 
 
 class PlannedDrive(NamedTuple):
@@ -87,38 +69,51 @@ def prepare_sources(
     if settings.num_variants == 0:
         print("each scan is prepared anew at each use; nothing is kept on disk")
         return [dpm.prepare_drive(source(), settings) for source in sources]
-    work = Preparation(settings, folder, seed, uuid.uuid4().hex)
-    if len(sources) == 1 and len(drive := sources[0]()) <= MIN_PART:
-        check_space(len(drive), work)
-        with tqdm(desc="prepare scans", total=len(drive), unit=" scans", dynamic_ncols=True) as bar:
-            on_scan = lambda: (bar.update(1), on_wait())  # noqa: E731
-            return [dpm.prepare_drive(drive, settings, folder=folder, seed=seed, on_scan=on_scan)]
-    with _workers(work) as pool:
-        return _prepare(pool, sources, work, on_wait)
+    with _workers() as pool:
+        begun = deque(pool.submit(_plan, source, settings, folder, seed) for source in sources)
+        opened = _results(begun, on_wait)
+        plans = list(tqdm(opened, "open drives", len(sources), unit=" drives", dynamic_ncols=True))
+        # The same drive may be given twice.
+        missing = {plan.path: plan for plan in plans if plan.found is None}
+        num_scans = sum(len(plan.T_world_lidar) for plan in missing.values())
+        check_space(num_scans, settings, folder)
+        parts = {path: _submit_parts(pool, plan, settings, seed) for path, plan in missing.items()}
+        with tqdm(desc="prepare scans", total=num_scans, unit=" scans", dynamic_ncols=True) as bar:
+
+            def scans_of(path: Path) -> Iterator[dpm.PreparedScan]:
+                for part in _results(parts[path], on_wait):
+                    yield from part
+                    bar.update(len(part))
+
+            made = {
+                path: dpm.store_scans(path, plan.T_world_lidar, scans_of(path), settings)
+                for path, plan in missing.items()
+            }
+    return [plan.found or made[plan.path] for plan in plans]
 
 
-def check_space(num_scans: int, work: Preparation) -> None:
+def check_space(num_scans: int, settings: dpm.TrainingConfig, folder: Path) -> None:
     """Prints the size of the prepared scans; raises a ValueError where the disk has less free space."""
-    each = dpm.stored_bytes(work.settings)
+    each = dpm.stored_bytes(settings)
     needed = num_scans * each
-    folder = next(path for path in (work.folder.absolute(), *work.folder.absolute().parents) if path.exists())
-    free = shutil.disk_usage(folder).free
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
     if needed > free:
-        one = needed / work.settings.num_variants
+        one = needed / settings.num_variants
         raise ValueError(
-            f"--cache {work.folder}: {num_scans} scans of {each / 1e6:.2f} MB need {needed / 1e9:.1f} GB, "
+            f"--cache {folder}: {num_scans} scans of {each / 1e6:.2f} MB need {needed / 1e9:.1f} GB, "
             f"{free / 1e9:.1f} GB are free; --variants 1 needs {one / 1e9:.1f} GB, --variants 0 nothing"
         )
     if num_scans > 0:
         print(
-            f"prepares {num_scans} scans of {each / 1e6:.2f} MB: {needed / 1e9:.1f} GB in {work.folder}, "
+            f"prepares {num_scans} scans of {each / 1e6:.2f} MB: {needed / 1e9:.1f} GB in {folder}, "
             f"{free / 1e9:.1f} GB are free"
         )
 
 
 @contextmanager
-def _workers(work: Preparation) -> Iterator[ProcessPoolExecutor]:
-    """Yields processes; after an error both they and their unfinished files are gone."""
+def _workers() -> Iterator[ProcessPoolExecutor]:
+    """Yields processes, which are gone after an error."""
     # A fresh interpreter: a fork of a process that runs JAX may hang.
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn"), initializer=_begin_worker) as pool:
         try:
@@ -128,9 +123,6 @@ def _workers(work: Preparation) -> Iterator[ProcessPoolExecutor]:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in processes:
                 process.kill()
-                process.join()
-            for unfinished in work.folder.glob(f".*.{work.run}.*"):
-                unfinished.unlink()
             raise
 
 
@@ -141,77 +133,30 @@ def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _prepare(
-    pool: ProcessPoolExecutor, sources: Sequence[cli.Source], work: Preparation, on_wait: Callable[[], object]
-) -> list[dpm.PreparedDrive]:
-    with tqdm(desc="open drives", total=len(sources), unit=" drives", dynamic_ncols=True) as bar:
-        begun = [pool.submit(_plan, source, work) for source in sources]
-        _wait_for(begun, on_wait, bar, lambda: sum(one.done() for one in begun))
-    plans = [one.result() for one in begun]
-    # The same drive may be given twice.
-    missing = {plan.path: plan for plan in plans if plan.found is None}
-    num_scans = sum(len(plan.T_world_lidar) for plan in missing.values())
-    check_space(num_scans, work)
-    made = _fill_all(pool, list(missing.values()), work, on_wait) if missing else {}
-    return [plan.found or made[plan.path] for plan in plans]
+def _results(begun: deque[Future[Result]], on_wait: Callable[[], object]) -> Iterator[Result]:
+    """Yields results in order, and forgets each: all scans together may not fit into the memory."""
+    while begun:
+        while not wait([begun[0]], timeout=1.0).done:
+            on_wait()
+        on_wait()
+        yield begun.popleft().result()
 
 
-def _plan(source: cli.Source, work: Preparation) -> PlannedDrive:
+def _plan(source: cli.Source, settings: dpm.TrainingConfig, folder: Path, seed: int) -> PlannedDrive:
     drive = source()
     if drive.T_world_lidar is None:
         raise ValueError(f"{drive.name}: expected a true pose for each scan, got a drive without poses")
-    path = dpm.prepared_path(drive, work.settings, work.folder, work.seed)
+    path = dpm.prepared_path(drive, settings, folder, seed)
     return PlannedDrive(source, drive.T_world_lidar, path, dpm.find_prepared(path, drive.T_world_lidar))
 
 
-def _fill_all(
-    pool: ProcessPoolExecutor, plans: Sequence[PlannedDrive], work: Preparation, on_wait: Callable[[], object]
-) -> dict[Path, dpm.PreparedDrive]:
-    """Prepares the scans of all drives, in parts; the bar counts scans."""
-    num_scans = sum(len(plan.T_world_lidar) for plan in plans)
-    part = max(MIN_PART, math.ceil(num_scans / (PARTS_EACH * (os.cpu_count() or 1))))
-    unfinished = [dpm.begin_file(plan.path, len(plan.T_world_lidar), work.settings, run=work.run) for plan in plans]
-    # Each worker appends a byte for each scan.
-    count = work.folder / f".count.{work.run}.txt"
-    count.touch()
-    begun = [
-        [
-            pool.submit(_fill, plan.source, file, range(first, min(first + part, len(plan.T_world_lidar))), work, count)
-            for first in range(0, len(plan.T_world_lidar), part)
-        ]
-        for plan, file in zip(plans, unfinished, strict=True)
-    ]
-    with tqdm(desc="prepare scans", total=num_scans, unit=" scans", dynamic_ncols=True) as bar:
-        _wait_for([part for parts in begun for part in parts], on_wait, bar, lambda: count.stat().st_size)
-    made = {}
-    for plan, file, parts in zip(plans, unfinished, begun, strict=True):
-        bad = {source: reason for one in parts for source, reason in one.result().items()}
-        made[plan.path] = dpm.end_file(file, plan.path, plan.T_world_lidar, bad)
-    count.unlink()
-    return made
+def _submit_parts(
+    pool: ProcessPoolExecutor, plan: PlannedDrive, settings: dpm.TrainingConfig, seed: int
+) -> deque[Future[list[dpm.PreparedScan]]]:
+    num = len(plan.T_world_lidar)
+    parts = (range(first, min(first + NUM_AT_ONCE, num)) for first in range(0, num, NUM_AT_ONCE))
+    return deque(pool.submit(_prepare, plan.source, numbers, settings, seed) for numbers in parts)
 
 
-def _fill(source: cli.Source, unfinished: Path, numbers: range, work: Preparation, count: Path) -> dict[str, str]:
-    pyramids = np.load(unfinished, mmap_mode="r+")
-    with count.open("ab", buffering=0) as file:
-        return dpm.fill_scans(
-            pyramids,
-            drive=source(),
-            numbers=numbers,
-            config=work.settings,
-            seed=work.seed,
-            on_scan=lambda: file.write(b"."),
-        )
-
-
-def _wait_for(
-    begun: Sequence[Future[Any]], on_wait: Callable[[], object], bar: tqdm[Any], num_done: Callable[[], int]
-) -> None:
-    """Waits for all, and raises the first error."""
-    remaining = set(begun)
-    while remaining:
-        done, remaining = wait(remaining, timeout=1.0, return_when=FIRST_EXCEPTION)
-        for one in done:
-            one.result()
-        bar.update(num_done() - bar.n)
-        on_wait()
+def _prepare(source: cli.Source, numbers: range, settings: dpm.TrainingConfig, seed: int) -> list[dpm.PreparedScan]:
+    return list(dpm.prepare_variants(source(), numbers, settings, seed))

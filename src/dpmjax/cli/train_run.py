@@ -147,7 +147,7 @@ class Records:
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
         self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
         self.run_s, self._pace_s = self.earlier_s, math.nan
-        self._seed, self._seen = seed, set[Layout]()
+        self.seed, self._seen = seed, set[Layout]()
         if total:
             self._tell_compilation(self.start.state)
 
@@ -240,7 +240,7 @@ class Records:
 
     def _tell_compilation(self, state: dpm.TrainingState) -> None:
         step = int(state.step)
-        capacity = layout_capacity(self._settings.layout_at(step, seed=self._seed), self._settings.sampling)
+        capacity = layout_capacity(self._settings.layout_at(step, seed=self.seed), self._settings.sampling)
         if step < int(state.end) and capacity not in self._seen:
             self._seen.add(capacity)
             maps = f"maps of {capacity.num_source} and {capacity.num_target} scans"
@@ -282,20 +282,13 @@ def run_training(
         trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
         records.save(trained.progress)
         if records.takes_last:
-            trained = trained._replace(model=last_model(trained))
+            trained = trained._replace(model=with_params(trained.model, trained.progress.state.params))
         return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, stop, seed)
 
 
-def last_model(trained: dpm.Trained) -> dpm.Model:
-    """Returns the model of the last step of the first stage."""
-    params = jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), trained.progress.state.params)
-    return dpm.Model(params, trained.model.config)
-
-
-def best_model(trained: dpm.Trained) -> dpm.Model:
-    """Returns the model of the best evaluation of the first stage."""
-    params = jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), trained.progress.best_params)
-    return dpm.Model(params, trained.model.config)
+def with_params(model: dpm.Model, params: Any) -> dpm.Model:
+    """Returns the model with the parameters of another step, which training gives back to the device."""
+    return model.replace(params=jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), params))
 
 
 def _stage_name(stage: dpm.CurriculumStage) -> str:

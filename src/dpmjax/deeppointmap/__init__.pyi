@@ -100,12 +100,12 @@ from .training.overlap_stage import init_overlap as init_overlap
 from .training.overlap_stage import train_overlap as train_overlap
 from .training.overlap_stage import why_no_overlap as why_no_overlap
 from .training.preparation import PreparedDrive as PreparedDrive
-from .training.preparation import begin_file as begin_file
-from .training.preparation import end_file as end_file
-from .training.preparation import fill_scans as fill_scans
+from .training.preparation import PreparedScan as PreparedScan
 from .training.preparation import find_prepared as find_prepared
 from .training.preparation import prepare_drive as prepare_drive
+from .training.preparation import prepare_variants as prepare_variants
 from .training.preparation import prepared_path as prepared_path
+from .training.preparation import store_scans as store_scans
 from .training.preparation import stored_bytes as stored_bytes
 from .training.preparation import why_useless as why_useless
 from .training.processes import join_processes as join_processes

@@ -15,6 +15,7 @@ from .poses import align_rigid as align_rigid
 from .poses import point_distance as point_distance
 from .poses import registration_recall as registration_recall
 from .poses import relative_pose_error as relative_pose_error
+from .poses import rotation_angle as rotation_angle
 from .sequences import corrected_ate as corrected_ate
 from .sequences import depth_errors as depth_errors
 from .sequences import distances_to_reference as distances_to_reference

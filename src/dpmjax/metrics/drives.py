@@ -143,15 +143,11 @@ class LoopRecall(NamedTuple):
         recall: recall of all revisits.
         same_way: recall of revisits in the same direction, or across it.
         opposite: recall of revisits in the opposite direction.
-        num_revisits: number of all.
-        num_opposite: number of revisits in the opposite direction.
     """
 
     recall: float
     same_way: float
     opposite: float
-    num_revisits: int
-    num_opposite: int
 
 
 def find_revisits(
@@ -215,8 +211,7 @@ def loop_recall(
         has_loop |= (path >= path[first] - reach_m) & (path <= path[last] + reach_m)
     every, opposite = revisits
     groups = (every, every & ~opposite, opposite)
-    recall, same, turned = (float(has_loop[chosen].mean()) if chosen.any() else np.nan for chosen in groups)
-    return LoopRecall(recall, same, turned, int(every.sum()), int(opposite.sum()))
+    return LoopRecall(*(float(has_loop[chosen].mean()) if chosen.any() else np.nan for chosen in groups))
 
 
 def path_lengths(T_world_scan: Float[AnyArray, "n 4 4"]) -> Float[np.ndarray, " n"]:

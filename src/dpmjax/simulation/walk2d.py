@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import runs_on_host
 from dpmjax.geometry import se2
-from dpmjax.sequences import BoolArray, FloatArray, SimulatedScans, World, largest_region
-from dpmjax.simulation.world2d import beam_angles, cast_scans, make_world
+from dpmjax.sequences import BoolArray, FloatArray, SimulatedScans
+from dpmjax.simulation.world2d import World, beam_angles, cast_scans, largest_region, make_world
 
 # Section 4.1: headings of consecutive scans differ by a uniform angle within plus or minus this, and translations have
 # this mean; steps are uniform between 0.6 and 1.4 of it.

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.sequences import BoolArray, FloatArray, World, largest_region
+from dpmjax.sequences import BoolArray, FloatArray
 
 SIZE_PX = 1024
 _WALL_PX = 10
@@ -33,6 +34,47 @@ _EDGE_WAVES = 0.08 / np.arange(2, 60) ** 0.8
 _NUM_PEOPLE = 15
 
 _Painter = Callable[[BoolArray, FloatArray, FloatArray, float], None]
+
+
+@dataclass(frozen=True)
+class World:
+    """A planar world of unit pixels.
+
+    Attributes:
+        name: name for titles.
+        is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
+        num_people: people who walk about in it while a sequence of scans is taken.
+
+    Raises:
+        ValueError: another shape or dtype, or no free space.
+    """
+
+    name: str
+    is_obstacle: BoolArray = field(repr=False)
+    num_people: int = 0
+
+    def __post_init__(self) -> None:
+        if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
+            raise ValueError(f"is_obstacle must be (h, w) bool, got {self.is_obstacle.shape} {self.is_obstacle.dtype}")
+        if self.is_obstacle.all():
+            raise ValueError("is_obstacle must leave free space, got a solid world")
+
+
+def largest_region(is_free: BoolArray) -> BoolArray:
+    """Finds the largest connected region of a raster.
+
+    Args:
+        is_free: (h, w).
+
+    Returns:
+        (h, w) True where a pixel is free and of the largest region.
+    """
+    from scipy.ndimage import label
+
+    labels, _ = label(is_free)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return is_free & (labels == sizes.argmax())
 
 
 def make_world(world: int | str) -> World:

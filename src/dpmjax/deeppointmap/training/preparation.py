@@ -11,7 +11,7 @@ import hashlib
 import json
 import logging
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -53,6 +53,18 @@ class PreparedDrive(NamedTuple):
     bad: dict[str, str]
 
 
+class PreparedScan(NamedTuple):
+    """All variants of one scan.
+
+    Attributes:
+        records: (num_variants,) records of `record_type`.
+        bad: reason by the source of the scan where it is bad; else empty.
+    """
+
+    records: np.ndarray
+    bad: dict[str, str]
+
+
 def stored_bytes(config: TrainingConfig) -> int:
     """Computes the size of one prepared scan, in memory or on disk.
 
@@ -66,12 +78,7 @@ def stored_bytes(config: TrainingConfig) -> int:
 
 
 def prepare_drive(
-    drive: LidarSequence,
-    config: TrainingConfig,
-    *,
-    folder: Path | None = None,
-    seed: int = 0,
-    on_scan: Callable[[], object] | None = None,
+    drive: LidarSequence, config: TrainingConfig, *, folder: Path | None = None, seed: int = 0
 ) -> PreparedDrive:
     """Makes the pyramids of all variants of all scans, or finds the file that an earlier call has made.
 
@@ -83,7 +90,6 @@ def prepare_drive(
         config: settings of training.
         folder: folder of the files; None keeps the pyramids in memory.
         seed: seed of the variants.
-        on_scan: called after each scan, to show progress.
 
     Returns:
         The drive.
@@ -96,22 +102,12 @@ def prepare_drive(
         raise ValueError("drives: expected a true pose for each scan, got a drive without poses")
     if config.num_variants == 0:
         return PreparedDrive(poses, drive, {})
-    fill = functools.partial(
-        fill_scans, drive=drive, numbers=range(len(drive)), config=config, seed=seed, on_scan=on_scan or (lambda: None)
-    )
+    scans = prepare_variants(drive, range(len(drive)), config, seed)
     if folder is None:
         pyramids = np.zeros((len(drive), config.num_variants), _record_type(config))
-        return PreparedDrive(poses, pyramids, fill(pyramids))
+        return PreparedDrive(poses, pyramids, _fill(pyramids, scans))
     path = prepared_path(drive, config, folder, seed)
-    if (found := find_prepared(path, poses)) is not None:
-        return found
-    unfinished = begin_file(path, len(drive), config)
-    try:
-        bad = fill(np.load(unfinished, mmap_mode="r+"))
-    except BaseException:
-        unfinished.unlink()
-        raise
-    return end_file(unfinished, path, poses, bad)
+    return find_prepared(path, poses) or store_scans(path, poses, scans, config)
 
 
 def prepared_path(drive: LidarSequence, config: TrainingConfig, folder: Path, seed: int) -> Path:
@@ -145,73 +141,59 @@ def find_prepared(path: Path, T_world_lidar: Poses) -> PreparedDrive | None:
     return PreparedDrive(T_world_lidar, path, json.loads(reasons.read_text(encoding="utf-8")))
 
 
-def begin_file(path: Path, num_scans: int, config: TrainingConfig, *, run: str | None = None) -> Path:
-    """Makes the file of a drive under another name, without scans.
+def prepare_variants(
+    drive: LidarSequence, numbers: Iterable[int], config: TrainingConfig, seed: int
+) -> Iterator[PreparedScan]:
+    """Prepares some scans of a drive, one after the other.
 
     Args:
-        path: path from `prepared_path`; its folder is made.
-        num_scans: number of scans of the drive.
-        config: settings of training.
-        run: part of the name, by which the files of one run are found; None draws one. Process numbers would not do:
-            two containers that share a folder may have the same.
-
-    Returns:
-        The path of the unfinished file.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.stem}.{run or uuid.uuid4().hex}.npy")
-    shape = (num_scans, config.num_variants)
-    np.lib.format.open_memmap(unfinished, mode="w+", dtype=_record_type(config), shape=shape).flush()
-    return unfinished
-
-
-def end_file(unfinished: Path, path: Path, T_world_lidar: Poses, bad: dict[str, str]) -> PreparedDrive:
-    """Gives a whole file its name.
-
-    Args:
-        unfinished: path from `begin_file`, all of whose scans are filled.
-        path: path from `prepared_path`.
-        T_world_lidar: true poses of the drive, metres.
-        bad: reason for each bad scan.
-
-    Returns:
-        The drive.
-    """
-    partial = unfinished.with_suffix(".json")
-    partial.write_text(json.dumps(bad), encoding="utf-8")
-    partial.replace(path.with_suffix(".json"))
-    unfinished.replace(path)
-    return PreparedDrive(T_world_lidar, path, bad)
-
-
-def fill_scans(
-    pyramids: np.ndarray,
-    *,
-    drive: LidarSequence,
-    numbers: Iterable[int],
-    config: TrainingConfig,
-    seed: int,
-    on_scan: Callable[[], object],
-) -> dict[str, str]:
-    """Prepares some scans of a drive.
-
-    Args:
-        pyramids: (n, num_variants) records of all scans of the drive, which are written.
         drive: the drive.
         numbers: numbers of the scans.
         config: settings of training.
         seed: seed of the variants.
-        on_scan: called after each scan.
+
+    Yields:
+        Each scan.
+    """
+    for number in numbers:
+        bad: dict[str, str] = {}
+        points = read_or_note(drive, number, bad)
+        yield PreparedScan(_packed(points, config, (seed, number)), bad)
+
+
+def store_scans(
+    path: Path, T_world_lidar: Poses, scans: Iterable[PreparedScan], config: TrainingConfig
+) -> PreparedDrive:
+    """Writes the file of a drive under another name, which it keeps until it is whole.
+
+    Args:
+        path: path from `prepared_path`; its folder is made.
+        T_world_lidar: true poses of the drive, metres.
+        scans: all scans in their order.
+        config: settings of training.
 
     Returns:
-        Reason for each bad scan.
+        The drive.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Process numbers would not do: two containers that share a folder may have the same.
+    unfinished = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.npy")
+    shape = len(T_world_lidar), config.num_variants
+    try:
+        bad = _fill(np.lib.format.open_memmap(unfinished, "w+", _record_type(config), shape), scans)
+        path.with_suffix(".json").write_text(json.dumps(bad), encoding="utf-8")
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return PreparedDrive(T_world_lidar, path, bad)
+
+
+def _fill(pyramids: np.ndarray, scans: Iterable[PreparedScan]) -> dict[str, str]:
+    """Copies the records of all scans; returns the reason for each bad scan."""
     bad: dict[str, str] = {}
-    for number in numbers:
-        points = read_or_note(drive, number, bad)
-        for variant, cloud in enumerate(_variants(points, config, (seed, number))):
-            pack_pyramid(pyramid_of_cloud(cloud, config.model, num_threads=1), pyramids[number, variant])
-        on_scan()
+    for number, scan in enumerate(scans):
+        pyramids[number] = scan.records
+        bad |= scan.bad
     return bad
 
 
@@ -247,10 +229,16 @@ def varied_record(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seed
     Returns:
         A record of `record_type`.
     """
-    record: np.void = np.zeros(1, _record_type(config))[0]
-    (cloud,) = _variants(points, replace(config, num_variants=1), seeds)
-    pack_pyramid(pyramid_of_cloud(cloud, config.model, num_threads=1), record)
+    record: np.void = _packed(points, replace(config, num_variants=1), seeds)[0]
     return record
+
+
+def _packed(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seeds: tuple[int, int]) -> np.ndarray:
+    """Returns the records of all variants of a scan."""
+    records = np.zeros(config.num_variants, _record_type(config))
+    for record, cloud in zip(records, _variants(points, config, seeds), strict=True):
+        pack_pyramid(pyramid_of_cloud(cloud, config.model, num_threads=1), record)
+    return records
 
 
 def _record_type(config: TrainingConfig) -> np.dtype:
