@@ -110,3 +110,21 @@ def test_one_scan_decides_for_its_drive(tmp_path: Path, table: np.ndarray) -> No
     (tmp_path / "2.bin").write_bytes(table[:, :5].tobytes()[:-8])
     with pytest.raises(InputError, match=r"2\.bin.*of 5 float32"):
         require_whole_files(drive)
+
+
+def test_points_of_nclt_are_metres_with_z_up(tmp_path: Path, table: np.ndarray, caplog) -> None:
+    record = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+    rows = np.zeros(NUM, record)
+    rows["xyz"] = np.round((table[:, :3] * [1, -1, -1] + 100.0) / 0.005)
+    rows["intensity"], rows["laser"] = table[:, 3], table[:, 4]
+    for name in ("0.bin", "1.bin"):
+        rows.tofile(tmp_path / name)
+    caplog.set_level(logging.INFO, logger="dpmjax")
+    np.testing.assert_allclose(read_lidar_file(tmp_path / "0.bin"), table[:, :3], atol=0.003)
+    assert "as of NCLT" in caplog.text
+    drive = open_lidar_sequence(tmp_path)
+    np.testing.assert_allclose(drive.read_points(1), table[:, :3], atol=0.003)
+    require_whole_files(drive)
+    (tmp_path / "1.bin").write_bytes(rows.tobytes()[:-3])
+    with pytest.raises(InputError, match="no whole number of points"):
+        read_lidar_file(tmp_path / "1.bin")

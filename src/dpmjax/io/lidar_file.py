@@ -52,6 +52,8 @@ _MAP_RATIO = 5.0
 _MOST_POINTS_PER_BYTE, _RECORD_BYTES = 100, 54
 _COLUMN_COUNTS, _USUAL_COLUMNS = (3, 4, 5, 6, 7, 8), 4
 _NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
+# NCLT packs a point to the 8 bytes of two float32: 5 mm from -100 m as uint16, intensity, and one of 32 lasers.
+_NCLT_COLUMNS, _NCLT_RECORD, _NCLT_LASERS = 2, np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]), 32
 # Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
 _MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
 # Mutual information of column and value: least value of the best layout, bits, and least ratio to the next layout.
@@ -68,7 +70,7 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
     A scan with hardly any point within 120 m, or with an unclear number of columns, is read with a warning.
 
     Args:
-        path: `.bin` (float32 rows of x, y, z and more, as of KITTI), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
+        path: `.bin` (float32 rows of x, y, z and more, as of KITTI; or NCLT's), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
             `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las`, `.laz`, or columns of text (`.xyz`, `.csv`, `.txt`).
             All but `.npy` and `.npz` may be packed (`.gz`).
         bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None
@@ -144,7 +146,9 @@ def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
     if suffix == ".bin":
         columns = bin_columns or find_columns(path, content)[0]
         check_size(path, len(content), columns)
-        cloud = TimedCloud(np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3], None)
+        is_nclt = columns == _NCLT_COLUMNS
+        points = _nclt_points(content) if is_nclt else np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3]
+        cloud = TimedCloud(points, None)
     else:
         cloud = {".pcd": parse_pcd, ".ply": parse_ply}.get(suffix, _parse_las)(content, str(path))
     return check_scan(cloud, path)
@@ -302,6 +306,8 @@ def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[
         Float64Error: the file holds float64, and no layout is given.
         InputError: the file has no whole number of points of the layout, or of any.
     """
+    if given is None and _is_nclt(content):
+        return _NCLT_COLUMNS, Note(f"{path}: points of 8 bytes, as of NCLT; y and z are turned, so that z is up")
     values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")[:_MOST_VALUES]
     inferred = _columns_by_values(values)
     if given is not None:
@@ -320,6 +326,18 @@ def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[
     others = " or ".join(str(n) for n in fitting if n != _USUAL_COLUMNS)
     text = f"{path}: 4 columns a point are assumed, {others} would fit as well; --columns decides"
     return _USUAL_COLUMNS, Note(text, is_doubt=True) if others and content else None
+
+
+def _is_nclt(content: bytes) -> bool:
+    """Returns True for points of 8 bytes; as float32, the last of them is a sign and most of an exponent."""
+    lasers = np.frombuffer(content[: len(content) // 8 * 8], _NCLT_RECORD)["laser"]
+    return len(lasers) > 0 and bool((lasers < _NCLT_LASERS).all()) and len(np.unique(lasers)) > _NCLT_LASERS // 4
+
+
+def _nclt_points(content: bytes) -> NDArray[np.float32]:
+    """Returns points with z up; those of NCLT have y to the right and z down."""
+    points = 0.005 * np.frombuffer(content, _NCLT_RECORD)["xyz"].astype(np.float32) - 100.0
+    return points * np.array([1, -1, -1], np.float32)
 
 
 def check_size(path: str | Path, size: int, columns: int) -> None:
