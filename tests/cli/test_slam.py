@@ -100,6 +100,8 @@ def table(path: Path) -> list[dict[str, str]]:
         (["--sequence", "00"], "--sequence"),
         (["--topic", "/points"], "--topic"),
         (["--columns", 4], "--columns"),
+        (["--base-from-lidar", *range(6)], "--base-from-lidar"),
+        (["--base-from-lidar", 0, 0, 1, 0, 0, 1, 1], "--base-from-lidar"),
         (["/no/such/folder"], "no such file or folder"),
         (["--weights", "no_such_model"], "no_such_model"),
         (["--resume", "-o", "/no/such/run"], "it is no run of slam"),
@@ -155,6 +157,17 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert metrics["num_parts"] == 1
     for name in ("config.json", "log.txt", "trajectory.png", "map.png", "map.ply", "map.npz", "run_state.npz"):
         assert (whole / name).stat().st_size > 0
+
+
+def test_trajectory_of_the_robot_is_that_of_the_lidar_in_another_frame(with_truth, tmp_path) -> None:
+    # The lidar stands 2 m ahead and 1 m up, turned by 90 degrees.
+    options = ("--base-from-lidar", 2, 0, 1, 0, 0, np.sqrt(0.5), np.sqrt(0.5))
+    drive = write_drive(tmp_path / "drive", with_poses=False)
+    assert run(drive, "-n", 12, "-o", tmp_path / "out", *options) == EXIT_OK
+    lidar, base = (np.load(tmp_path / "out" / f"{name}.npy") for name in ("trajectory", "trajectory_base"))
+    T_base_lidar = np.array([[0.0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
+    np.testing.assert_allclose(base[0], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(base @ T_base_lidar, T_base_lidar @ lidar, atol=1e-9)
 
 
 def test_plyfile_reads_the_map(whole) -> None:

@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from dpmjax import cli, io, saved_maps, slam, viz, weights
+from dpmjax import cli, geometry, io, saved_maps, slam, viz, weights
 from dpmjax.cli import slam_results as results
-from dpmjax.sequences import LidarSequence, counted, require
+from dpmjax.sequences import LidarSequence, counted, homogeneous, require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +54,9 @@ class SlamOptions(cli.DriveOptions):
     """No loop closure: odometry alone."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
+    base_from_lidar: Annotated[tuple[float, ...], arg(metavar="X Y Z QX QY QZ QW")] = ()
+    """Pose of the lidar in the frame of the robot, metres and a quaternion, as of ROS: the trajectory of the robot is
+    written too, as trajectory_base."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
     """Show the run in the live viewer (extra viewer); without a screen, OUT gets a recording, slam.rrd."""
 
@@ -62,8 +66,22 @@ class SlamOptions(cli.DriveOptions):
         self.check_data(self.data, self.sequence)
         if self.preset == "paper" and self.odometry is not None:
             raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
+        if self.base_from_lidar and (
+            len(self.base_from_lidar) != 7 or abs(np.linalg.norm(self.base_from_lidar[3:]) - 1.0) > 0.01
+        ):
+            raise ValueError(
+                f"--base-from-lidar: expected 3 + 4 numbers, a unit quaternion, got {self.base_from_lidar}"
+            )
         if self.preset != "paper" and self.max_rmse is not None:
             raise ValueError("--max-rmse: give it with --preset paper")
+
+    @property
+    def T_base_lidar(self) -> np.ndarray | None:
+        """Pose of the lidar in the frame of the robot; None where it was not given."""
+        if not self.base_from_lidar:
+            return None
+        turn = Rotation.from_quat(self.base_from_lidar[3:]).as_matrix()
+        return homogeneous(turn, np.array(self.base_from_lidar[:3]))
 
 
 def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
@@ -87,7 +105,8 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     with nullcontext() if viewer is None else closing(viewer):
         mapped = run_scans(run, reader, methods, beginning, viewer)
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
-    drive = MappedDrive(sequence.take(slice(0, len(result.reports))), start, result)
+    placed = sequence.take(slice(0, len(result.reports)))
+    drive = MappedDrive(placed, start, result, options.T_base_lidar)
     num_new = len(mapped.scan_s)
     numbers = {
         "weights": options.weights,
@@ -115,11 +134,13 @@ class MappedDrive(NamedTuple):
         sequence: the scans that were placed.
         start: state before the first scan, with the map that the run extends.
         result: trajectory and map.
+        T_base_lidar: pose of the lidar in the frame of the robot; None where it was not given.
     """
 
     sequence: LidarSequence
     start: slam.SlamState
     result: slam.SlamResult
+    T_base_lidar: np.ndarray | None
 
     def read_keyframe(self, row: int) -> np.ndarray:
         """Reads the points of a keyframe; those of the extended map are the points of its surface."""
@@ -145,6 +166,9 @@ def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) ->
     sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
     for name, poses in (("trajectory", result.T_world_scan), ("odometry", result.T_odometry_scan)):
         cli.write_poses(run.path, poses, name, times=sequence.times, frame="T_world_lidar")
+    if drive.T_base_lidar is not None:
+        poses = drive.T_base_lidar @ result.T_world_scan @ geometry.rigid.inverse(drive.T_base_lidar)
+        cli.write_poses(run.path, poses, "trajectory_base", times=sequence.times, frame="T_world_base")
     results.write_graph(run.path, result)
     results.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
     results.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)

@@ -70,9 +70,9 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
     A scan with hardly any point within 120 m, or with an unclear number of columns, is read with a warning.
 
     Args:
-        path: `.bin` (float32 rows of x, y, z and more, as of KITTI; or NCLT's), `.npy` (n, 3 or more), `.npz` (key `lidar_pcd`,
-            `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las`, `.laz`, or columns of text (`.xyz`, `.csv`, `.txt`).
-            All but `.npy` and `.npz` may be packed (`.gz`).
+        path: `.bin` (float32 rows of x, y, z and more, as of KITTI; or NCLT's), `.npy` (n, 3 or more), `.npz` (key
+            `lidar_pcd`, `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las`, `.laz`, or columns of text (`.xyz`,
+            `.csv`, `.txt`). All but `.npy` and `.npz` may be packed (`.gz`).
         bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None
             infers it from the values.
 
