@@ -170,6 +170,18 @@ def test_trajectory_of_the_robot_is_that_of_the_lidar_in_another_frame(with_trut
     np.testing.assert_allclose(base @ T_base_lidar, T_base_lidar @ lidar, atol=1e-9)
 
 
+def test_late_odometry_is_named_and_does_no_harm(with_truth, tmp_path, capsys) -> None:
+    drive = write_drive(tmp_path / "drive", with_poses=False)
+    write_tum(tmp_path / "late.txt", TRUTH[np.clip(np.arange(60) - 2, 0, 59)])
+    assert run(drive, "-n", 60, "-o", tmp_path / "out", "--odometry", tmp_path / "late.txt") == EXIT_OK
+    numbers = load_json(tmp_path / "out" / "metrics.json")
+    assert numbers["odometry_step_m"] >= 0.0
+    assert "odometry: " in capsys.readouterr().out
+    assert run(drive, "-n", 50, "-o", tmp_path / "other", "--odometry", tmp_path / "late.txt") == EXIT_BAD_INPUT
+    assert "60 poses for 50 scans" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
 def test_plyfile_reads_the_map(whole) -> None:
     plyfile = import_or_skip("plyfile")
     vertices = plyfile.PlyData.read(str(whole / "map.ply"))["vertex"]

@@ -223,6 +223,20 @@ def test_in_a_corridor_without_an_end_the_last_speed_goes_on() -> None:
     assert max(sigmas_m) == pytest.approx(10, rel=0.01)
 
 
+def test_in_a_corridor_odometry_knows_the_way() -> None:
+    # The robot slows down to a quarter, which the last motion does not know.
+    steps = np.full(60, 1.0)
+    steps[20:40] = 0.25
+    truth = np.array([pose(x, 0.0, 0.0) for x in np.cumsum(steps)])
+    geometry = CorridorGeometry(truth, sigma_m=1e-4, sigma_rad=1e-5, corridor=range(20, 40))
+    methods = SlamMethods(TruthMatcher(truth), geometry, without_loops())
+    ways_m = [
+        run_slam(methods, scans_of(range(60)), odometry=odometry).T_world_scan[39, 0, 3]
+        for odometry in (pose(5.0, 3.0, 1.0) @ truth, None)
+    ]
+    np.testing.assert_allclose(ways_m, [24.0, 39.0], atol=0.5)
+
+
 def test_the_network_helps_where_geometry_fails() -> None:
     # Of each ten scans nine are dropped for a while: the prediction is wrong by more than geometry can do.
     truth = laps(1, side_m=60.0)

@@ -27,7 +27,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, geometry, io, saved_maps, slam, viz, weights
 from dpmjax.cli import slam_results as results
-from dpmjax.sequences import LidarSequence, counted, homogeneous, require
+from dpmjax.sequences import LidarSequence, Note, counted, homogeneous, require
+
+PROPOSERS = ("prediction", "network")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +46,10 @@ class SlamOptions(cli.DriveOptions):
     """A saved map (map.npz of an earlier run) that this drive extends."""
     preset: Literal["default", "paper"] = "default"
     """Settings of SLAM: the default ones, or the paper's own method, by the decoder alone."""
-    odometry: Literal["prediction", "network"] | None = None
-    """Source of the first guess of a pose: the motion of before, or the network for every scan; without it, the preset
-    decides."""
+    odometry: Annotated[str | None, arg(metavar="prediction|network|FILE")] = None
+    """Source of the first guess of a pose: the motion of before, the network for every scan, or the robot's own
+    odometry, poses by time (TUM) or one a scan; those of the robot's frame with --base-from-lidar. Without it, the
+    preset decides."""
     max_rmse: float | None = None
     """With --preset paper: largest error of an accepted registration, metres. The published 0.5 needs a decoder with
     exact offsets; 2.5 suits dpm_small."""
@@ -64,7 +67,7 @@ class SlamOptions(cli.DriveOptions):
         """Checks ranges."""
         super().__post_init__()
         self.check_data(self.data, self.sequence)
-        if self.preset == "paper" and self.odometry is not None:
+        if self.preset == "paper" and self.odometry in PROPOSERS:
             raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
         if self.base_from_lidar and (
             len(self.base_from_lidar) != 7 or abs(np.linalg.norm(self.base_from_lidar[3:]) - 1.0) > 0.01
@@ -94,16 +97,17 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     # A map of other weights is refused here, before the scans are opened.
     start = slam.init_slam(None if options.map is None else results.open_map(options.map, methods))
     sequence = cli.open_drive(options.data, options, options.sequence)
+    odometry, notes = read_odometry(options, sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
     beginning = find_beginning(cli.find_run("slam", options.output) if options.resume else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{counted(num_done, 'scan')} done, {len(sequence)} wanted"
     require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
-    run.open(sequence.notes)
+    run.open((*sequence.notes, *notes))
     run.say(f"{sequence.name}: {counted(len(sequence), 'scan')}" + (f", {num_done} done before" if num_done else ""))
     viewer = viz.LiveViewer(sequence.name, run / "slam.rrd") if options.visualize else None
     with nullcontext() if viewer is None else closing(viewer):
-        mapped = run_scans(run, reader, methods, beginning, viewer)
+        mapped = run_scans(run, reader, methods, beginning, viewer=viewer, odometry=odometry)
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
     placed = sequence.take(slice(0, len(result.reports)))
     drive = MappedDrive(placed, start, result, options.T_base_lidar)
@@ -122,6 +126,8 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
         raise mapped.failure
     if errors := results.error_text(numbers):
         run.say(errors)
+    if odometry is not None and len(result.reports) > 2:
+        numbers |= results.odometry_numbers(odometry[: len(result.reports)], drive.sequence, result, run)
     if num_new:
         run.say(f"{numbers['scans_per_s']:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
     return numbers
@@ -152,13 +158,21 @@ class MappedDrive(NamedTuple):
 def slam_methods(options: SlamOptions) -> slam.SlamMethods:
     """Returns the methods of the model."""
     settings = slam.slam_preset(options.preset)
-    if options.odometry is not None:
-        settings = replace(settings, odometry=replace(settings.odometry, proposer=options.odometry))
+    if options.odometry == "network":
+        settings = replace(settings, odometry=replace(settings.odometry, proposer="network"))
     if options.max_rmse is not None:
         settings = replace(settings, descriptors=replace(settings.descriptors, max_rmse_m=options.max_rmse))
     if options.no_loop:
         settings = replace(settings, loops=replace(settings.loops, is_on=False))
     return slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
+
+
+def read_odometry(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarray | None, tuple[Note, ...]]:
+    """Returns poses of the lidar by the odometry of --odometry FILE, None without a file; and notes."""
+    if options.odometry is None or options.odometry in PROPOSERS:
+        return None, ()
+    poses, notes = io.read_odometry(options.odometry, sequence)
+    return poses if options.T_base_lidar is None else poses @ options.T_base_lidar, notes
 
 
 def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) -> cli.Numbers:

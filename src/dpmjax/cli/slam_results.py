@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
-from dpmjax.cli.run import Numbers
+from dpmjax.cli.run import Numbers, Run
 from dpmjax.cli.run_folder import write_table
 from dpmjax.sequences import LidarSequence, counted
 
@@ -59,6 +59,21 @@ def write_graph(folder: Path, result: slam.SlamResult) -> None:
         np.save(folder / "covariances.npy", result.covariances)
     poses, frame = result.map.T_world_keyframe, "T_map_keyframe; stamps are numbers of scans"
     io.write_tum(folder / "keyframes.txt", poses, times=result.keyframes, frame=frame)
+
+
+def odometry_numbers(odometry: np.ndarray, sequence: LidarSequence, result: slam.SlamResult, run: Run) -> Numbers:
+    """Returns how far the given odometry is from the result, and says it; stamps that are late or early are named."""
+    found = slam.compare_odometry(odometry, result.T_world_scan)
+    text = f"odometry: {found.step_m:.2g} m off a step in the median"
+    if found.delay_scans:
+        step_s = 1.0 if sequence.times is None else float(np.median(np.diff(sequence.times)))
+        unit = "scans" if sequence.times is None else "s"
+        late = "late" if found.delay_scans > 0 else "early"
+        text += (
+            f"; its stamps are {abs(found.delay_scans) * step_s:.2g} {unit} {late} ({found.undelayed_step_m:.2g} m off)"
+        )
+    run.say(text)
+    return {"odometry_step_m": found.step_m, "odometry_delay_scans": found.delay_scans}
 
 
 def write_loops(path: Path, loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> None:

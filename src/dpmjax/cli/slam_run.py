@@ -97,7 +97,9 @@ def run_scans(
     reader: ScanReader,
     methods: slam.SlamMethods,
     beginning: RunState,
+    *,
     viewer: viz.LiveViewer | None = None,
+    odometry: np.ndarray | None = None,
 ) -> SlamRun:
     """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
 
@@ -107,6 +109,7 @@ def run_scans(
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
         viewer: shows the run.
+        odometry: (n, 4, 4) poses of the lidar, the first guesses; None without them.
 
     Returns:
         The run.
@@ -119,12 +122,13 @@ def run_scans(
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
     with progress as bar, closing(_prepared_scans(reader, methods, first)) as scans:
         try:
-            for _ in range(first, len(sequence)):
+            for row in range(first, len(sequence)):
                 if run.is_stopped:
                     break
                 before = clock.now_s()
                 scan, prepared = next(scans)
-                state, report = slam.step_slam(methods, state, prepared)
+                guessed = slam.with_guess(state.front_end, odometry, row)
+                state, report = slam.step_slam(methods, state._replace(front_end=guessed), prepared)
                 scan_s.append(clock.now_s() - before)
                 reports.append(report)
                 if report.is_keyframe:

@@ -11,6 +11,7 @@ from .grid_map import write_grid_map as write_grid_map
 from .lidar import LidarSequence as LidarSequence
 from .lidar import list_lidar_sequences as list_lidar_sequences
 from .lidar import open_lidar_sequence as open_lidar_sequence
+from .lidar import read_odometry as read_odometry
 from .lidar import require_whole_files as require_whole_files
 from .lidar_file import read_lidar_file as read_lidar_file
 from .lidar_file import scan_notes as scan_notes

@@ -16,7 +16,7 @@ from dpmjax.io.lidar_file import check_size, columns_of_drive, unit_note
 from dpmjax.io.poses import read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, order_note
 from dpmjax.io.scan_bags import is_bag, open_lidar_bag
-from dpmjax.sequences import InputError, LidarSequence, Note, require
+from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
 
 _CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
 
@@ -91,6 +91,23 @@ def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequenc
         note = Note(f"{beside}: {error.found}; these poses are not used", is_doubt=True)
         return replace(sequence, notes=(*sequence.notes, note))
     return replace(sequence, T_world_lidar=T, notes=(*sequence.notes, *notes))
+
+
+def read_odometry(path: str | Path, sequence: LidarSequence) -> tuple[FloatArray, tuple[Note, ...]]:
+    """Reads poses of the robot by its own odometry, at the times of the scans.
+
+    Args:
+        path: poses as TUM, matched by time; or as TUM, KITTI or matrices, one a scan.
+        sequence: the scans.
+
+    Returns:
+        (n, 4, 4) poses in the world of the file, NaN for scans without one; and notes on the matching.
+
+    Raises:
+        InputError: no poses, or no times in common and another number of poses than of scans.
+    """
+    path = Path(path)
+    return match_reference(read_stamped_poses(path), sequence.times, len(sequence), path)
 
 
 def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = None) -> None:

@@ -29,6 +29,7 @@ from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
 from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted
 from dpmjax.slam.map_optimization import optimize_map
 from dpmjax.slam.model_methods import as_methods
+from dpmjax.slam.odometry_prior import with_guess
 from dpmjax.slam.procedure import procedure_of
 from dpmjax.types import Pose, Poses, with_short_repr
 
@@ -208,6 +209,7 @@ def run_slam(
     config: SlamConfig | None = None,
     *,
     slam_map: KeyframeMap | str | Path | None = None,
+    odometry: Poses | None = None,
     progress: bool = True,
 ) -> SlamResult:
     """Makes one map of a drive by odometry, loop closure and optimisation of the pose graph (DeepPointMap section 4).
@@ -220,6 +222,8 @@ def run_slam(
             files, or the folder or bag of a drive (`io.open_lidar_sequence`). `TimedScan`s are deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
         slam_map: map from `load_map`, or its file, to be extended; None begins an empty one.
+        odometry: (n, 4, 4) poses of the lidar at each scan by wheels or an IMU, in any world, NaN where there is none:
+            the first guess of each motion, in place of the motion before.
         progress: False shows no bar.
 
     Returns:
@@ -229,14 +233,15 @@ def run_slam(
         ValueError: if a scan is not (n, 3), if an argument is of another type, if methods come with a configuration, or
             if the map was made with other weights.
     """
-    methods, reports = as_methods(model, config), []
+    methods, reports = as_methods(model, config), list[ScanReport]()
     state = init_slam(read_path(slam_map, "saved_maps.load_map"))
     drive: Iterable[AnyScan] = read_path(scans, "io.open_lidar_sequence")
     total = len(drive) if isinstance(drive, Sized) else None
     prepared = in_advance(partial(prepare_ahead, methods), drive)
     with progress_bar("SLAM", prepared, total=total, unit="scans", is_shown=progress) as bar:
         for scan in bar:
-            state, report = step_slam(methods, state, scan)
+            guessed = with_guess(state.front_end, odometry, len(reports))
+            state, report = step_slam(methods, state._replace(front_end=guessed), scan)
             reports.append(report)
     return finish_slam(state, reports, methods.config)
 
