@@ -143,7 +143,10 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     records = None
     if run.is_open:
         settings = without_impossible_stage(settings, store)
-        run.say(f"{options.preset}: {describe_plan(settings, len(store.table))}")
+        num_scans = len(store.table)
+        num_steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
+        plan = ", ".join(f"{num_steps[stage]} steps of {stage}" for stage in settings.stages)
+        run.say(f"{options.preset}: {num_scans} scans; at most {plan}")
         selection = select_pairs(options, settings, sources, run.check_stop)
         is_last = options.preset == "paper"
         records = Records(run, settings, selection, seed=options.seed, weights=first, takes_last=is_last)
@@ -162,17 +165,10 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     if not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
         run.write_numbers({**numbers, "status": "interrupted"})
-        chosen = chosen_sources(options, sources)
+        chosen = chosen_sources(sources)
         model, numbers["calibration"] = calibrate_on_sources(trained.model, chosen, options.seed, run.check_stop)
         train_files.write_model(run / train_files.MODEL, model, numbers, origin=origin)
     return {"verdict": train_files.training_verdict(numbers), **numbers}
-
-
-def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
-    """Returns the number of scans, and the largest number of steps of each stage."""
-    steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
-    of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
-    return f"{num_scans} scans; at most {of_stages}"
 
 
 def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
@@ -201,10 +197,9 @@ def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppo
     return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
-def chosen_sources(options: TrainOptions, sources: Sequence[cli.Source]) -> list[cli.Source]:
+def chosen_sources(sources: Sequence[cli.Source]) -> list[cli.Source]:
     """Returns the drives by which models are chosen and calibrated: those of the user, or else the towns."""
-    own = [source for source in sources if not is_town(source)]
-    return own or list(sources)
+    return [source for source in sources if not is_town(source)] or list(sources)
 
 
 def is_town(source: cli.Source) -> bool:
@@ -227,7 +222,7 @@ def select_pairs(
         drives: list[cli.Source] = [partial(io.open_lidar_sequence, path) for path in options.validate]
         name = "drives of --validate"
     else:
-        chosen = chosen_sources(options, sources)
+        chosen = chosen_sources(sources)
         drives = [partial(part_of_drive, source, "held_out") for source in chosen]
         name = f"held-out places of the {'towns' if is_town(chosen[0]) else 'drives'}"
     return draw_selection(settings, options.held_out_pairs, drives, name, on_wait=on_wait)
