@@ -10,7 +10,7 @@ import importlib
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,8 +23,6 @@ from dpmjax.cli import environment
 
 # Folder of recorded data; without it the cases that need them are left out.
 DATA = Path(os.environ.get("DPMJAX_DATA", "../shared/data"))
-
-COLUMNS = ("name", "case", "metric", "value", "unit")
 
 
 class Row(NamedTuple):
@@ -41,15 +39,6 @@ class Row(NamedTuple):
     metric: str
     value: float
     unit: str
-
-
-def format_table(named_rows: Iterable[tuple[str, Row]]) -> str:
-    """Lays rows out under `COLUMNS`, numbers aligned to the right."""
-    cells = [COLUMNS, *((name, row.case, row.metric, f"{row.value:.4g}", row.unit) for name, row in named_rows)]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(COLUMNS))]
-    form = "  ".join(f"{{:{side}{width}}}" for side, width in zip("<<<><", widths, strict=True))
-    head, *lines = (form.format(*line).rstrip() for line in cells)
-    return "\n".join([head, "-" * len(head), *lines])
 
 
 def in_new_process(function: Callable[..., Any], *arguments: object, **environment: str) -> Any:

@@ -15,22 +15,24 @@ import sys
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from benchmarks import COLUMNS, Row, format_table, in_new_process, run_benchmark
+from benchmarks import in_new_process, run_benchmark
+from dpmjax.cli import format_table
+from dpmjax.cli.options import parse_options
 from dpmjax.io import write_atomically
 
 # Modules, each with a function `run`.
-BENCHMARKS = ("core", "deepmapping", "deeppointmap", "pose_graph", "toy")
+Benchmark = Literal["core", "deepmapping", "deeppointmap", "pose_graph", "toy"]
 
 
 @dataclass(frozen=True)
 class Config:
     """Options of the benchmarks."""
 
-    only: tuple[str, ...] = ()
+    only: tuple[Benchmark, ...] = ()
     """Names of the benchmarks to run; all of them if none is given."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """Smaller cases and fewer repeats: seconds instead of minutes."""
@@ -39,17 +41,11 @@ class Config:
 
 
 def main(config: Config) -> int:
-    """Runs the chosen benchmarks; returns 0, 1 after a failure, 2 for an unknown name."""
-    unknown = sorted(set(config.only) - set(BENCHMARKS))
-    if unknown:
-        print(
-            f"benchmarks: error: no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}", file=sys.stderr
-        )
-        return 2
-    named_rows: list[tuple[str, Row]] = []
+    """Runs the chosen benchmarks; returns 0, or 1 after a failure."""
+    records: list[dict[str, Any]] = []
     machine: dict[str, Any] = {}
     failed: list[str] = []
-    for name in config.only or BENCHMARKS:
+    for name in config.only or get_args(Benchmark):
         print(f"running {name} ...", file=sys.stderr, flush=True)
         try:
             rows, machine = in_new_process(run_benchmark, name, config.quick)
@@ -57,11 +53,10 @@ def main(config: Config) -> int:
             traceback.print_exc()
             failed.append(name)
             continue
-        named_rows += [(name, row) for row in rows]
-    if named_rows:
-        print(describe(machine), format_table(named_rows), sep="\n")
+        records += [{"name": name, **row._asdict()} for row in rows]
+    if records:
+        print(describe(machine), format_table(records), sep="\n")
     if config.output is not None:
-        records = [dict(zip(COLUMNS, (name, *row), strict=True)) for name, row in named_rows]
         report = {"environment": machine, "quick": config.quick, "failed": failed, "rows": records}
         write_atomically(config.output, json.dumps(report, indent=2) + "\n")
     if failed:
@@ -76,4 +71,9 @@ def describe(environment: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(tyro.cli(Config, prog="python -m benchmarks", description=__doc__)))
+    try:
+        config = parse_options(Config, sys.argv[1:], prog="python -m benchmarks", description=__doc__)
+    except ValueError as error:
+        print(f"benchmarks: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    raise SystemExit(main(config))

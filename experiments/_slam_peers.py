@@ -4,13 +4,17 @@ Each has its own default settings. Only the settings that must fit the place are
 outdoors and 30 m indoors, with voxels of a hundredth of it (KISS-ICP's own rule). The voxels of small_gicp are those of
 its documentation, and half as large indoors. None of them corrects scans for the motion of the lidar, as ours does not
 either.
+
+A program takes the scans in order by `step`, (n, 3) float64, not empty. `finish` returns (n, 4, 4) poses of all scans,
+and the loops. After it, `map_bytes` takes the scans again, because some drop far points on the way, and returns the
+bytes of the map of the whole way, with floats of 4 bytes.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,26 +38,6 @@ class FoundLoop(NamedTuple):
     newer: tuple[int, int]
     older: tuple[int, int]
     T_older_newer: np.ndarray
-
-
-class Peer(Protocol):
-    """A program that takes scans in their order."""
-
-    def __init__(self, *, is_indoors: bool) -> None:
-        """Chooses the settings that fit the place."""
-
-    def step(self, points: np.ndarray) -> None:
-        """Takes a scan, (n, 3) float64, not empty."""
-
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        """Returns (n, 4, 4) poses of all scans, and the loops."""
-
-    def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
-        """Returns the bytes of the map of the whole way, with floats of 4 bytes, after `finish`.
-
-        Args:
-            scans: the scans again, for programs that drop far points on the way.
-        """
 
 
 class KissIcp:
@@ -154,7 +138,7 @@ class SmallGicp:
 
 
 # The peers by name: the module that must be there, and the class.
-PEERS: dict[str, tuple[str, type[Peer]]] = {
+PEERS: dict[str, tuple[str, Any]] = {
     "KISS-ICP": ("kiss_icp.kiss_icp", KissIcp),
     "KISS-SLAM": ("kiss_slam.slam", KissSlam),
     "small_gicp": ("small_gicp", SmallGicp),

@@ -1,9 +1,8 @@
 """Calibrates a DeepPointMap model on towns that it was not trained on: its confidence, and its overlap probability.
 
     python -m experiments.dpm_calibrate results/train/latest/model.safetensors
-    python -m experiments.dpm_calibrate MODEL --data path/to/drive another/drive    on your drives, as dpmjax train does
-    python -m experiments.dpm_calibrate MODEL --check                               on places that no fit has seen
-    python -m experiments.dpm_calibrate --evidence                                  weights of register
+    python -m experiments.dpm_calibrate MODEL --check       on places that no fit has seen
+    python -m experiments.dpm_calibrate --evidence          weights of register
 
 Pairs of scans of held-out towns, overlapping and not, are registered. A logistic regression then predicts whether the
 motion is right within 2 m and 5 degrees. Its few features include the consensus support, the share of points that meet
@@ -13,8 +12,7 @@ corridors, tunnels, halls, open fields and streets with queues of moving cars, b
 is another regression, on the evidence of the match (similarities of descriptors, consensus support ...) of pairs of
 further towns, half of them less than 20 m apart. The file model.safetensors is the model with all regressions.
 metrics.json has the Brier scores, the calibration errors, and the AUC of overlap, of places that were left out of the
-fits; the reliability*.png show them. With --data, pairs of your drives take the place of simulated ones; the fits leave
-the last tenth of each drive out, which the numbers are of.
+fits; the reliability*.png show them. On drives of your own, `dpmjax train --stages overlap --weights MODEL` calibrates.
 
 With --check, the calibration of the model rates pairs of other ambiguous places. table.md has the shares of pairs that
 are right, sure (a confidence of 0.9 or more), and wrong though sure. With --evidence, all motions that `register` tries
@@ -79,8 +77,6 @@ class CalibrateOptions(cli.RunOptions):
 
     model: Annotated[Positional[str], arg(metavar="NAME|FILE")] = "dpm_small"
     """The model: a .safetensors file, or the name of a shipped one."""
-    data: Annotated[tuple[str, ...], arg(metavar="PATH")] = ()
-    """Folders of scans with poses to calibrate on, instead of simulated places."""
     check: FlagCreatePairsOff[bool] = False
     """Rate the calibration that the model has, on places that no fit has seen."""
     evidence: FlagCreatePairsOff[bool] = False
@@ -89,15 +85,13 @@ class CalibrateOptions(cli.RunOptions):
     def __post_init__(self) -> None:
         """Checks options that do not go together."""
         super().__post_init__()
-        if bool(self.data) + self.check + self.evidence > 1:
-            raise ValueError("--data, --check and --evidence: give one of them")
+        if self.check and self.evidence:
+            raise ValueError("--check and --evidence: give one of them")
 
 
 def main(options: CalibrateOptions, run: cli.Run) -> cli.Row:
     """Registers and compares the pairs, fits, and writes the model; or checks it."""
     model = load_model(options.model)
-    if options.data:
-        return calibrate_on_drives(options, run, model)
     if options.check:
         return check_calibration(options, run, model)
     run.open()
@@ -127,16 +121,6 @@ def main(options: CalibrateOptions, run: cli.Run) -> cli.Row:
 def card_of(model: str) -> str:
     """Returns the description of a model file; the name of a shipped model."""
     return read_card(Path(model)) if model.endswith(".safetensors") else model
-
-
-def calibrate_on_drives(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> cli.Row:
-    """Calibrates on the drives of the user."""
-    drives = [source() for source in cli.find_sources(options.data, [])]
-    run.open()
-    calibrated, numbers = dpm.calibrate(model, dpm.measure_drives(model, drives, options.seed, on_pair=run.check_stop))
-    note = f"Confidence and overlap calibrated on {', '.join(options.data)}"
-    save_model(calibrated, run / MODEL, card=f"{card_of(options.model)} {note}.".strip())
-    return {"model": options.model, **numbers, "verdict": note}
 
 
 def list_ambiguous(first: int, num: int) -> list[cli.Row]:

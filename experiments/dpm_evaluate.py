@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
 from dpmjax import cli, encode, load_model, register
 from dpmjax import deeppointmap as dpm
@@ -50,8 +50,6 @@ class PairOptions(cli.EvaluateOptions):
     """Number of towns, where town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
     """Length of the route of a town."""
-    no_kiss: FlagCreatePairsOff[bool] = False
-    """Leave KISS-Matcher out."""
 
 
 def main(options: PairOptions, run: cli.Run) -> cli.Row:
@@ -63,7 +61,7 @@ def main(options: PairOptions, run: cli.Run) -> cli.Row:
     towns = cli.evaluation_towns(options.num_towns, options.town_length_m)
     drives = cli.open_evaluation_drives(options.data, towns)
     pairs = cli.PairReader(drives, options.pairs, options.seed)
-    no_kiss = "left out by --no-kiss" if options.no_kiss else cli.why_not_importable("kiss_matcher")
+    no_kiss = cli.why_not_importable("kiss_matcher")
     matchers: dict[str, cli.Matcher] = {"search": partial(search_alone, config=model.config.verification)}
     matchers |= {} if no_kiss else {"kiss": kiss_matcher}
     matchers |= {f"clouds_{num}": partial(match_clouds, model=model, num_elements=num) for num in options.clouds}

@@ -75,37 +75,29 @@ class KeptProgram:
         shapes = tuple((jax.typeof(leaf), getattr(leaf, "weak_type", False)) for leaf in leaves)
         key = (*static.values(), tree, shapes, settings.jax_enable_x64)
         if key not in self._programs:
-            self._programs[key] = self._load(Path(folder), static, leaves, tree)
+            self._programs[key] = self._load(static, leaves, tree)
         return self._programs[key], leaves
 
-    def _load(self, folder: Path, static: dict[str, Any], leaves: list[Any], tree: Any) -> _Program | None:
+    def _load(self, static: dict[str, Any], leaves: list[Any], tree: Any) -> _Program | None:
         """Reads a program from its file, or makes the file; None for a function that cannot be exported."""
+
+        def trace() -> tuple[Any, bytearray]:
+            trees = []
+
+            def flat(*leaves: Any) -> list[Any]:
+                found, result = jax.tree.flatten(self._jitted(**jax.tree.unflatten(tree, leaves), **static))
+                trees.append(result)
+                return found
+
+            program = export.export(jax.jit(flat))(*leaves).serialize()
+            return trees[0], program
+
         shapes = [str(jax.typeof(leaf)) for leaf in leaves]
         try:
-            path = folder / _file_name(self._name, (static, tree, shapes, jax.default_backend()))
-        except (pickle.PicklingError, AttributeError, TypeError):
-            return None
-        try:
-            result, program = pickle.loads(path.read_bytes())
+            result, program = keep_result(self._name, (static, tree, shapes, jax.default_backend()), trace)
             return _Program(jax.jit(export.deserialize(program).call), result)
         except Exception:
-            return self._export(path, static, leaves, tree)
-
-    def _export(self, path: Path, static: dict[str, Any], leaves: list[Any], tree: Any) -> _Program | None:
-        trees = []
-
-        def flat(*leaves: Any) -> list[Any]:
-            found, result = jax.tree.flatten(self._jitted(**jax.tree.unflatten(tree, leaves), **static))
-            trees.append(result)
-            return found
-
-        try:
-            exported = export.export(jax.jit(flat))(*leaves)
-            content = pickle.dumps((trees[0], exported.serialize()))
-        except Exception:
             return None
-        _write(path, content)
-        return _Program(jax.jit(exported.call), trees[0])
 
 
 def kept_jit(*static_argnames: str) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
@@ -154,23 +146,18 @@ def keep_result(name: str, key: Any, compute: Callable[[], Result]) -> Result:
         return cast(Result, pickle.loads(path.read_bytes()))
     except Exception:
         result = compute()
-        _write(path, pickle.dumps(result))
-        return result
+    part = path.with_name(f"{path.name}.{os.getpid()}")
+    with contextlib.suppress(OSError):  # a full disk costs time, not results
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(pickle.dumps(result))
+        part.replace(path)
+    return result
 
 
 def _file_name(name: str, key: Any) -> str:
     settings: Any = jax.config
     identity = pickle.dumps((name, key, jax.__version__, settings.jax_enable_x64, source_version()))
     return f"{name.removeprefix('dpmjax.')}-{hashlib.sha256(identity).hexdigest()[:24]}"
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Writes a file at once; a full disk costs time, not results."""
-    part = path.with_name(f"{path.name}.{os.getpid()}")
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
 
 
 @functools.cache

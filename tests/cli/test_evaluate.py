@@ -14,7 +14,7 @@ import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli import drives
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
+from dpmjax.cli.run import EXIT_OK
 from dpmjax.cli.run_folder import load_json
 from dpmjax.deeppointmap import SamplingConfig
 from tests.data_sets import write_kitti_sequence
@@ -96,20 +96,8 @@ def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> N
         drives.find_sources([str(tmp_path / "kitti")], [], near)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere"], "nowhere"),
-        (["WITHOUT_POSES"], "no poses"),
-        (["--weights", "no_such_model"], "no_such_model"),
-        (["--pairs", "0"], "--pairs"),
-    ],
-)
-def test_bad_input_is_named_with_exit_code_2(as_user, tmp_path, capsys, arguments, message: str) -> None:
+def test_a_drive_without_poses_is_refused(tmp_path, refused) -> None:
     (tmp_path / "drive" / "velodyne").mkdir(parents=True)
     for number in range(3):
         np.ones((50, 4), "<f4").tofile(tmp_path / "drive" / "velodyne" / f"{number:06d}.bin")
-    given = [str(tmp_path / "drive") if argument == "WITHOUT_POSES" else argument for argument in arguments]
-    assert run([*given, "-o", str(tmp_path / "out")]) == EXIT_BAD_INPUT
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert "no poses" in refused("evaluate", tmp_path / "drive")

@@ -166,18 +166,6 @@ def test_a_global_start_finds_the_map_from_half_a_turn_of_view(tmp_path, is_orde
     assert metrics["assessment"]["is_trusted"]
 
 
-def refused(tmp_path: Path, capsys, *options: object) -> str:
-    """What stderr says to bad input; there must be one line, exit code 2, and nothing written."""
-    out = tmp_path / "out"
-    arguments = [*map(str, options), "-o", str(out)]
-    code = run_command(main, name="map2d", description=None, args=arguments)
-    error = capsys.readouterr().err.strip()
-    assert code == 2, error
-    assert not out.exists()
-    assert len(error.splitlines()) == 1, error
-    return error
-
-
 @pytest.mark.slow
 def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch) -> None:
     drive = simulate_sequence(0, 24, num_beams=128, with_odometry=True)
@@ -196,7 +184,7 @@ def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch)
     ("spoil", "found"),
     [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan"), ("all_equal", "all scans are equal")],
 )
-def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_path, capsys, spoil, found) -> None:
+def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_path, refused, spoil, found) -> None:
     points = np.where(walk.mask[..., None], walk.points, 0.0)
     if spoil == "one_scan":
         points = points[:1]
@@ -205,30 +193,14 @@ def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_
     else:
         points[:] = np.nan if spoil == "all_nan" else 0.0
     np.save(tmp_path / "scans.npy", points)
-    assert found in refused(tmp_path, capsys, tmp_path / "scans.npy")
+    assert found in refused("map2d", tmp_path / "scans.npy")
 
 
 @pytest.mark.parametrize(
     ("init", "found"), [("odometry", "no odometry"), ("guess", "--init guess"), ("x.npy", "x.npy")]
 )
-def test_a_start_that_is_not_there_is_named(as_user, scans_npz, tmp_path, capsys, init, found) -> None:
-    assert found in refused(tmp_path, capsys, scans_npz, "--init", init)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"jump": 0}, "--jump"),
-        ({"n_scans": 0}, "--n-scans"),
-        ({"seconds": -1.0}, "--seconds"),
-        ({"steps": 0}, "--steps"),
-        ({"ordered": False, "init": "icp-plane"}, "--no-ordered"),
-        ({"topic": "/scan"}, "--topic"),
-    ],
-)
-def test_options_out_of_range_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        Map2dOptions(**options)
+def test_a_start_that_is_not_there_is_named(as_user, scans_npz, refused, init, found) -> None:
+    assert found in refused("map2d", scans_npz, "--init", init)
 
 
 def test_a_resumed_run_has_data_and_start_of_its_own() -> None:

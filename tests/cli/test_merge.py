@@ -111,8 +111,6 @@ def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None
 @pytest.mark.parametrize(
     ("maps", "weights", "message"),
     [
-        ((), "model.safetensors", "two or more maps"),
-        (("a.npz",), "model.safetensors", "two or more maps"),
         (("a.npz", "b.npz", "a.npz"), "model.safetensors", "a.npz is given twice"),
         (("a.npz", "none.npz"), "model.safetensors", "none.npz: no such file"),
         (("a.npz", "model.safetensors"), "model.safetensors", "model.safetensors"),
@@ -120,10 +118,5 @@ def test_maps_that_do_not_meet_stay_as_they_were(case, tmp_path, capsys) -> None
         (("a.npz", "b.npz"), "other.safetensors", "name the weights that made it with --weights"),
     ],
 )
-def test_bad_input_is_told_in_one_line(case, tmp_path, capsys, maps, weights, message) -> None:
-    given = [case / name for name in maps]
-    assert run(*given, "--weights", case / weights, "-o", tmp_path / "out") == EXIT_BAD_INPUT
-    errors = capsys.readouterr().err
-    assert message in errors
-    assert errors.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+def test_bad_input_is_told_in_one_line(case, refused, maps, weights, message) -> None:
+    assert message in refused("merge", *(case / name for name in maps), "--weights", case / weights)

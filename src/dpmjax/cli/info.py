@@ -90,7 +90,8 @@ def environment() -> dict[str, Any]:
         "git_hash": git_hash(),
         "platform": platform.platform(),
         "cpu": cpu_model(),
-        "num_cores": usable_cores(),
+        # A container may limit the cores of a process.
+        "num_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "peak_rss_gb": peak_rss_gb(),
     }
 
@@ -116,11 +117,6 @@ def git_hash() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()
-
-
-def usable_cores() -> int:
-    """Returns the number of cores that this process may use, which a container may limit."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def peak_rss_gb() -> float:

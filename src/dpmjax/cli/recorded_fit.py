@@ -46,7 +46,6 @@ class FitRecorder:
         """
         self._run, self._length, self._max_s = run, length, max_s
         self.steps, self.run_s, self.compile_s, self.has_map = 0, 0.0, 0.0, False
-        self._begun: tuple[float, float] | None = None
 
     def __call__(
         self,
@@ -65,7 +64,9 @@ class FitRecorder:
         state = checkpoints.restore_latest(state, fallback=state)
         earlier = self._run.continue_table(HISTORY, until=int(state.step))
         earlier_s = self.run_s = max((float(row["run_s"]) for row in earlier), default=0.0)
-        bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}{postfix}]", desc="fit")
+        bar = tqdm(
+            total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}{postfix}]", desc="fit"
+        )
         saved_at = time.perf_counter()
 
         def record(progress: Progress) -> None:
@@ -101,14 +102,10 @@ class FitRecorder:
         self._run.append_row(HISTORY, **row, **{f"ate_{self._length}": ate})
 
     def _show(self, progress: Progress, ate: float, bar: tqdm) -> None:
-        """Moves the bar to the share that is done; the remaining time is that of the last calls."""
-        seconds, share = progress.run_s, progress.share
-        self._begun = self._begun or (seconds, share)
-        pace_s = (seconds - self._begun[0]) / max(share - self._begun[1], 1e-9)
-        left = f", {pace_s * (1 - share):.0f} s left" if share > self._begun[1] else ""
+        """Moves the bar to the share that is done."""
         ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
-        bar.set_postfix_str(f"{progress.phase.name}, loss {progress.report.loss:.4f}{ate_text}{left}", refresh=False)
-        bar.update(share - bar.n)
+        bar.set_postfix_str(f"{progress.phase.name}, loss {progress.report.loss:.4f}{ate_text}", refresh=False)
+        bar.update(progress.share - bar.n)
 
 
 def draw_loss(run: Run, unit: str) -> None:

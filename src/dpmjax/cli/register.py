@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from tyro.conf import Positional, arg
 
-from dpmjax import cli, deeppointmap, geometry, io, metrics, viz, weights
+from dpmjax import cli, deeppointmap, io, metrics, viz, weights
 
 if TYPE_CHECKING:
     from dpmjax.types import Registration
@@ -55,7 +55,7 @@ def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     found = deeppointmap.register(model, source, target, refine=options.refine)
     T = np.asarray(found.T_target_source, np.float64)
     np.savetxt(run / "T_target_source.txt", T, "%.9f")
-    points = np.concatenate([geometry.rigid.transform_points(T, source), target])
+    points = np.concatenate([source @ T[:3, :3].T + T[:3, 3], target])
     colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
     io.write_ply(run / "aligned.ply", points, colors=colors)
     # Files of the same name are told apart by their folders.

@@ -53,7 +53,7 @@ EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPU
 METRICS, HISTORY, LOG, CHECKPOINTS = "metrics.json", "metrics.csv", "log.txt", "checkpoints"
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
-LOGGERS = ("dpmjax", "experiments", "__main__")
+LOGGER = logging.getLogger("dpmjax")
 
 Numbers = dict[str, Any]
 
@@ -141,25 +141,22 @@ class Run:
         except OSError as error:
             raise ValueError(cannot_write(self.path, error.strerror or str(error))) from error
         self._handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        for logger in map(logging.getLogger, LOGGERS):
-            logger.addHandler(self._handler)
-            logger.setLevel(logging.INFO)
+        LOGGER.addHandler(self._handler)
+        LOGGER.setLevel(logging.INFO)
         self.note(notes)
 
     def note(self, notes: Iterable[Note]) -> None:
         """Logs doubts and decisions on the input, and keeps them for `metrics.json`."""
         for note in notes:
             self._notes.append(note.text)
-            logging.getLogger("dpmjax").info("%s", note.text)
+            LOGGER.info("%s", note.text)
             if not note.is_doubt:  # the reader has warned of a doubt
                 print(note.text, flush=True)
 
     def close(self) -> None:
         """Ends the log, and lets other processes into the folder."""
-        for logger in map(logging.getLogger, LOGGERS):
-            if self._handler is not None:
-                logger.removeHandler(self._handler)
         if self._handler is not None:
+            LOGGER.removeHandler(self._handler)
             self._handler.close()
         if self._lock is not None:
             os.close(self._lock)
@@ -176,7 +173,7 @@ class Run:
     def say(self, text: str) -> None:
         """Prints a text, and writes it to the log."""
         print(text, flush=True)
-        logging.getLogger("dpmjax").info("%s", text)
+        LOGGER.info("%s", text)
 
     def write_numbers(self, numbers: Mapping[str, Any]) -> None:
         """Writes `metrics.json`: status and verdict, the numbers, then notes, seed, versions, device and machine."""
@@ -292,19 +289,20 @@ def _finish(run: Run, numbers: Numbers) -> int:
 
 def _explain(error: Exception, run: Run | None) -> int:
     """Says in one line what went wrong, after the traceback where the program is at fault."""
-    is_usual = isinstance(error, InputError | OSError)
+    text, code = f"{type(error).__name__}: {error}", EXIT_FAILED
     if run is not None and run.is_open:
-        logging.getLogger("__main__").info("failed", exc_info=error)
-        if not is_usual:
-            traceback.print_exception(error)
-        text = str(error).removesuffix(".") if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        return _say(f"error: {text}; what was finished is in {run.path}", EXIT_FAILED)
-    if isinstance(error, PermissionError):
-        return _say(f"error: {error.filename}: {error.strerror}", EXIT_BAD_INPUT)
-    if isinstance(error, ValueError):
-        return _say(f"error: {error}", EXIT_BAD_INPUT)
-    traceback.print_exception(error)
-    return _say(f"error: {type(error).__name__}: {error}", EXIT_FAILED)
+        LOGGER.info("failed", exc_info=error)
+        is_usual = isinstance(error, InputError | OSError)
+        text = str(error).removesuffix(".") if isinstance(error, InputError) else text
+        text += f"; what was finished is in {run.path}"
+    elif is_usual := isinstance(error, ValueError | PermissionError):
+        text, code = (
+            str(error) if isinstance(error, ValueError) else f"{error.filename}: {error.strerror}",
+            EXIT_BAD_INPUT,
+        )
+    if not is_usual:
+        traceback.print_exception(error)
+    return _say(f"error: {text}", code)
 
 
 def _end_at_once(number: int, _frame: object) -> NoReturn:

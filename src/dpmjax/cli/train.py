@@ -49,7 +49,7 @@ TUNING_SHARE = 0.2
 class TrainOptions(RunOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "calibrate"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache"})
 
     data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
     """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
@@ -61,8 +61,6 @@ class TrainOptions(RunOptions):
     stages: tuple[Literal["registration", "overlap"], ...] = ("registration", "overlap")
     """Stages of the training: all networks but the overlap head, then this head alone. overlap alone trains the head of
     --weights."""
-    calibrate: bool = True
-    """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
     frame: Literal["lidar", "local"] | None = None
@@ -131,21 +129,24 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     if options.coordinator is not None:  # not before the processes have found each other
         cli.select_device(options.device)
     from dpmjax.cli.train_preparation import prepare_sources
-    from dpmjax.cli.train_run import Records, run_training, training_part
+    from dpmjax.cli.train_run import Records, part_of_drive, run_training
 
     first = None if options.weights is None else weights.load_model(options.weights)
     settings = training_settings(options, first)
     sources = training_sources(options, settings)
     if is_first():
         run.open()
-    parts = [partial(training_part, source) for source in sources]
+    parts = [partial(part_of_drive, source, "training") for source in sources]
     drives = prepare_sources(parts, settings, options.cache, seed=options.seed, on_wait=run.check_stop)
     store = deeppointmap.ScanStore(drives)
     settings = for_devices(settings, len(store.table))
     records = None
     if run.is_open:
         settings = without_impossible_stage(settings, store)
-        run.say(f"{options.preset}: {describe_plan(settings, len(store.table))}")
+        num_scans = len(store.table)
+        num_steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
+        plan = ", ".join(f"{num_steps[stage]} steps of {stage}" for stage in settings.stages)
+        run.say(f"{options.preset}: {num_scans} scans; at most {plan}")
         selection = select_pairs(options, settings, sources, run.check_stop)
         is_last = options.preset == "paper"
         records = Records(run, settings, selection, seed=options.seed, weights=first, takes_last=is_last)
@@ -161,20 +162,13 @@ def main(options: TrainOptions, run: Run) -> Numbers:
         numbers |= measured
     train_files.write_training(records, trained, evaluation, numbers, origin=origin)
     numbers["calibration"] = {}
-    if options.calibrate and not run.is_stopped:
+    if not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
         run.write_numbers({**numbers, "status": "interrupted"})
-        chosen = chosen_sources(options, sources)
+        chosen = chosen_sources(sources)
         model, numbers["calibration"] = calibrate_on_sources(trained.model, chosen, options.seed, run.check_stop)
         train_files.write_model(run / train_files.MODEL, model, numbers, origin=origin)
     return {"verdict": train_files.training_verdict(numbers), **numbers}
-
-
-def describe_plan(settings: deeppointmap.TrainingConfig, num_scans: int) -> str:
-    """Returns the number of scans, and the largest number of steps of each stage."""
-    steps = {"registration": settings.num_steps, "overlap": settings.overlap.num_steps(num_scans)}
-    of_stages = ", ".join(f"{steps[stage]} steps of {stage}" for stage in settings.stages)
-    return f"{num_scans} scans; at most {of_stages}"
 
 
 def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
@@ -203,10 +197,9 @@ def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppo
     return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
-def chosen_sources(options: TrainOptions, sources: Sequence[cli.Source]) -> list[cli.Source]:
+def chosen_sources(sources: Sequence[cli.Source]) -> list[cli.Source]:
     """Returns the drives by which models are chosen and calibrated: those of the user, or else the towns."""
-    own = [source for source in sources if not is_town(source)]
-    return own or list(sources)
+    return [source for source in sources if not is_town(source)] or list(sources)
 
 
 def is_town(source: cli.Source) -> bool:
@@ -221,7 +214,7 @@ def select_pairs(
     on_wait: Callable[[], object],
 ) -> Selection:
     """Returns the pairs that choose the model: of --validate, else of held-out places of the drives or of the towns."""
-    from dpmjax.cli.train_run import Selection, draw_selection, held_out_part
+    from dpmjax.cli.train_run import Selection, draw_selection, part_of_drive
 
     if "registration" not in options.stages:
         return Selection(None, "given weights")
@@ -229,8 +222,8 @@ def select_pairs(
         drives: list[cli.Source] = [partial(io.open_lidar_sequence, path) for path in options.validate]
         name = "drives of --validate"
     else:
-        chosen = chosen_sources(options, sources)
-        drives = [partial(held_out_part, source) for source in chosen]
+        chosen = chosen_sources(sources)
+        drives = [partial(part_of_drive, source, "held_out") for source in chosen]
         name = f"held-out places of the {'towns' if is_town(chosen[0]) else 'drives'}"
     return draw_selection(settings, options.held_out_pairs, drives, name, on_wait=on_wait)
 

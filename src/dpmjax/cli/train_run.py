@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -58,16 +58,10 @@ class Selection(NamedTuple):
         return self.pairs._replace(pairs=tuple(some for some in self.pairs.pairs if some.kind.num_scans == 1))
 
 
-def training_part(source: cli.Source) -> LidarSequence:
-    """Opens a drive without its held-out places, and without the scans near them."""
+def part_of_drive(source: cli.Source, part: Literal["training", "held_out"]) -> LidarSequence:
+    """Opens the held-out places of a drive, or the remaining scans without those near them."""
     drive = source()
-    return drive.take(dpm.split_places(drive).training)
-
-
-def held_out_part(source: cli.Source) -> LidarSequence:
-    """Opens the held-out places of a drive."""
-    drive = source()
-    return drive.take(dpm.split_places(drive).held_out)
+    return drive.take(getattr(dpm.split_places(drive), part))
 
 
 def draw_selection(

@@ -18,8 +18,6 @@ from dpmjax.io.references import camera_note, match_reference, order_note
 from dpmjax.io.scan_bags import is_bag, open_lidar_bag
 from dpmjax.sequences import FloatArray, InputError, LidarSequence, Note, require
 
-_CAPTURES = {".pcap": "packets", ".pcapng": "packets", ".osf": "an Ouster"}
-
 
 def open_lidar_sequence(
     path: str | Path,
@@ -143,9 +141,9 @@ def list_lidar_sequences(path: str | Path) -> list[str]:
 def _choose(path: Path, sequence: str | None) -> Path:
     """Returns the folder of the selected drive."""
     require(path.exists(), path, "no such file or folder", "check the path")
-    capture = _CAPTURES.get(path.suffix.lower())
     converter = "convert it to a bag or to .pcd files with ouster-cli (Ouster) or velodyne-decoder (Velodyne)"
-    require(capture is None, path, f"a capture of {capture}, which is not read", converter)
+    is_capture = path.suffix.lower() in (".pcap", ".pcapng", ".osf")
+    require(not is_capture, path, "a capture of packets, which is not read", converter)
     require(not path.is_file(), path, "a single file", "give the folder that holds all scans of the drive")
     if is_drive(path) and sequence in (None, path.resolve().name):
         return path
