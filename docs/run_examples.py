@@ -1,4 +1,4 @@
-"""Runs examples and keeps what they print, for the page of the examples: python docs/run_examples.py [NUMBER ...]."""
+"""Runs examples and keeps their output for the page of the examples: python docs/run_examples.py [NUMBER ...]."""
 
 from __future__ import annotations
 

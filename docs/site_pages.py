@@ -1,8 +1,8 @@
 """Pages of the site that are made from other files, and links that leave the site.
 
 index.md is README.md, reference.md has the docstring of each name of api.md, and examples.md has the examples and
-what they printed. Each guide ends with what the examples printed that it links to.
-Links to files outside docs/ lead to the repository, where its address is known.
+their output. Each guide ends with the output of its linked examples. Links to files outside docs/ lead to the
+repository if its address is known.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def reference() -> str:
 
 
 def examples() -> str:
-    """Returns the page of the examples: the code of each, and what it printed."""
+    """Returns the page of the examples: code and output of each."""
     parts = ["# Examples\n\nEach is a file in `examples/`, which the tests run.\n"]
     for path in MADE["EXAMPLES"]:
         title = path.stem[3:].replace("_", " ").capitalize()
@@ -66,5 +66,5 @@ def examples() -> str:
 
 
 def printed(name: str) -> str:
-    """Returns what an example printed when it was run."""
+    """Returns the recorded output of an example."""
     return f"`examples/{name}.py` prints:\n\n```\n{MADE['outputs']()[name + '.py']['output']}```\n"
