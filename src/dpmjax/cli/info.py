@@ -25,6 +25,7 @@ from dpmjax.compile_cache import cpu_model, enable_compile_cache
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "scipy")
 EXTRAS = {
+    "cluster": ("distributed",),
     "baselines": ("evosax", "jaxopt", "open3d"),
     "gtsam": ("gtsam",),
     "kiss": ("kiss_matcher",),

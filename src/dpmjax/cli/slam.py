@@ -6,6 +6,7 @@
     dpmjax slam drive.bag --topic /points               a bag of ROS 1 or 2 (.bag, .mcap, a folder; extra ros)
     dpmjax slam kitti/dataset --sequence 07 -n 500      the first 500 scans of a sequence
     dpmjax slam day2 --map results/slam/latest/map.npz  extend the map of an earlier run
+    dpmjax slam monday tuesday --cluster local          several drives or agents at once, their maps merged
     dpmjax slam --resume                                continue the latest run
 
 Results go to results/slam/<time>/ (latest links to the newest): trajectories of every scan as TUM, KITTI and npy,
@@ -38,8 +39,9 @@ class SlamOptions(cli.DriveOptions):
 
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans"})
 
-    data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town."""
+    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="[DATA ...]")] = ()
+    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town. Several
+    with --cluster."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Which drive, where DATA holds several."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
@@ -60,6 +62,9 @@ class SlamOptions(cli.DriveOptions):
     base_from_lidar: Annotated[tuple[float, ...], arg(metavar="X Y Z QX QY QZ QW")] = ()
     """Pose of the lidar in the frame of the robot, metres and a quaternion, as of ROS: the trajectory of the robot is
     written too, as trajectory_base."""
+    cluster: Annotated[str | None, arg(metavar="local|HOST:PORT")] = None
+    """Map each of several drives on a worker of this Dask cluster (extra cluster), and merge their maps; local: as many
+    processes here as there are drives, at most one a core."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
     """Show the run in the live viewer (extra viewer); without a screen, OUT gets a recording, slam.rrd."""
 
@@ -67,6 +72,8 @@ class SlamOptions(cli.DriveOptions):
         """Checks ranges."""
         super().__post_init__()
         self.check_data(self.data, self.sequence)
+        if (len(self.data) > 1) != (self.cluster is not None):
+            raise ValueError(f"--cluster: give it with two or more DATA, got {len(self.data)}")
         if self.preset == "paper" and self.odometry in PROPOSERS:
             raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
         if self.base_from_lidar and (
@@ -91,12 +98,14 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     """Maps a drive and writes the results."""
     from dpmjax.cli.slam_run import find_beginning, run_scans
 
+    if options.cluster is not None:
+        return map_on_cluster(options, run)
     if options.visualize:
         cli.require_importable("rerun", "-v")
     methods = slam_methods(options)
     # A map of other weights is refused here, before the scans are opened.
     start = slam.init_slam(None if options.map is None else results.open_map(options.map, methods))
-    sequence = cli.open_drive(options.data, options, options.sequence)
+    sequence = cli.open_drive(next(iter(options.data), None), options, options.sequence)
     odometry, notes = read_odometry(options, sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
     beginning = find_beginning(cli.find_run("slam", options.output) if options.resume else None, methods, start)
@@ -131,6 +140,28 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     if num_new:
         run.say(f"{numbers['scans_per_s']:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
     return numbers
+
+
+def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
+    """Maps several drives on a cluster, and merges their maps."""
+    cli.require_importable("distributed", "--cluster")
+    from distributed import Client, LocalCluster
+
+    from dpmjax.cli.fleet import map_drives
+
+    for data in options.data:  # bad input is refused here, before any work
+        cli.open_drive(data, options)
+    slam_methods(options)
+    run.open()
+    if options.cluster != "local":
+        with Client(options.cluster) as client:
+            return map_drives(client, options, run)
+    num_workers = min(len(options.data), cli.environment()["num_cores"])
+    with (
+        LocalCluster(n_workers=num_workers, threads_per_worker=1, memory_limit=None, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        return map_drives(client, options, run)
 
 
 class MappedDrive(NamedTuple):

@@ -26,6 +26,16 @@ SAVE_EVERY_S = 10.0
 _Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
 
 
+class DriveFolder(NamedTuple):
+    """Folder of a drive that is mapped without a run of its own; no signal stops it."""
+
+    path: Path
+    is_stopped: bool = False
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+
 class SlamRun(NamedTuple):
     """A run until its end or its stop.
 
@@ -93,7 +103,7 @@ def map_drive(run: Run, sequence: LidarSequence, methods: slam.SlamMethods) -> t
 
 
 def run_scans(
-    run: Run,
+    run: Run | DriveFolder,
     reader: ScanReader,
     methods: slam.SlamMethods,
     beginning: RunState,

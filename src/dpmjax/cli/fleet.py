@@ -1,0 +1,109 @@
+"""Several drives or agents at once: processes of a cluster map them, and their maps are merged two by two.
+
+Dask gives the tasks of a worker that dies to another one, which goes on from the saved state of the drive. Ray would
+do so, too, but needs a running service on each machine, and is ten times as large.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from dpmjax import saved_maps, slam, weights
+from dpmjax.cli.drives import ScanReader, open_drive
+from dpmjax.cli.run import Numbers, Run
+from dpmjax.cli.run_folder import write_poses
+from dpmjax.cli.slam_run import DriveFolder, find_beginning, run_scans
+from dpmjax.sequences import counted
+
+if TYPE_CHECKING:
+    from dpmjax.cli.slam import SlamOptions
+
+
+class MappedAway(NamedTuple):
+    """A drive that a worker has mapped.
+
+    Attributes:
+        T_world_scan: (n, 4, 4) poses of its scans.
+        content: its map as an int8 file, as it travels.
+        seconds: time of the worker.
+    """
+
+    T_world_scan: np.ndarray
+    content: bytes
+    seconds: float
+
+
+def map_drives(client: Any, options: SlamOptions, run: Run) -> Numbers:
+    """Maps the drives of the options, each on a worker, and merges their maps as a tree.
+
+    Args:
+        client: of `distributed`.
+        options: options of `slam`; its drives are folders that every worker sees.
+        run: folder of the results, that every worker sees, too.
+
+    Returns:
+        Numbers of the run.
+    """
+    from distributed import as_completed
+
+    began = time.perf_counter()
+    folders = [run / f"drive_{number}" for number in range(1, len(options.data) + 1)]
+    begun = [client.submit(map_away, each, options, pure=False) for each in zip(options.data, folders, strict=True)]
+    with tqdm(total=len(begun), unit=" drives", dynamic_ncols=True) as bar:
+        for _ in as_completed(begun):
+            run.check_stop()
+            bar.update()
+    drives: list[MappedAway] = client.gather(begun)
+    for folder, drive in zip(folders, drives, strict=True):
+        write_poses(folder, drive.T_world_scan, frame="T_world_lidar")
+    level = [client.submit(list, [drive.content]) for drive in drives]
+    while len(level) > 1:
+        pairs = [level[first : first + 2] for first in range(0, len(level), 2)]
+        level = [client.submit(merge_away, *pair, options.weights) if len(pair) > 1 else pair[0] for pair in pairs]
+    merged: list[bytes] = level[0].result()
+    names = ["map.npz"] if len(merged) == 1 else [f"map_{part}.npz" for part in range(1, len(merged) + 1)]
+    for name, content in zip(names, merged, strict=True):
+        (run / name).write_bytes(content)
+    return {
+        "verdict": f"{counted(len(drives), 'drive')} in {counted(len(merged), 'map')}",
+        "status": "done",
+        "weights": options.weights,
+        "num_drives": len(drives),
+        "num_maps": len(merged),
+        "num_scans": sum(len(drive.T_world_scan) for drive in drives),
+        "sent_bytes": sum(len(drive.content) for drive in drives),
+        "map_bytes": sum(map(len, merged)),
+        "drive_s": [drive.seconds for drive in drives],
+        "run_s": time.perf_counter() - began,
+    }
+
+
+def map_away(place: tuple[Path, Path], options: SlamOptions) -> MappedAway:
+    """Maps a drive in its folder, from the state there where an earlier worker has left one."""
+    from dpmjax.cli.slam import slam_methods
+
+    began, (data, folder) = time.perf_counter(), place
+    folder.mkdir(parents=True, exist_ok=True)
+    methods, drive = slam_methods(options), open_drive(data, options)
+    reader = ScanReader(drive, is_deskewed=options.deskew, jump=options.jump)
+    mapped = run_scans(DriveFolder(folder), reader, methods, find_beginning(folder, methods, slam.init_slam()))
+    if mapped.failure is not None:
+        raise mapped.failure
+    result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
+    return MappedAway(result.T_world_scan, saved_maps.map_bytes(result.map, "int8"), time.perf_counter() - began)
+
+
+def merge_away(first: list[bytes], second: list[bytes], name: str) -> list[bytes]:
+    """Merges two sets of maps; maps that show no common place stay apart."""
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder, f"{number}.npz") for number in range(len(first) + len(second))]
+        for path, content in zip(paths, [*first, *second], strict=True):
+            path.write_bytes(content)
+        merged = slam.merge_maps(slam.make_methods(weights.load_model(name), weights=name), *paths)
+    return [saved_maps.map_bytes(slam_map, "int8") for slam_map in merged.maps]
