@@ -32,8 +32,13 @@ _FIRST_WIDENING, _NARROWING = 1000.0, 1.6
 # Levenberg-Marquardt damping at the start, as a share of the diagonal.
 _FIRST_DAMPING = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
-# Below this share of the stiffest diagonal entry, damping goes by the stiffest entry.
-_LEAST_STIFFNESS = 1e-6
+# Diagonal entries that damping goes by, in medians of all. By a larger one, an edge a billion times stiffer than the
+# others would hold both of its nodes; by a smaller one, nodes that nothing holds would leave with the rounding.
+_STIFFNESSES = 1e-3, 1e3
+
+
+# From a higher cost, each step must arrive at less than this share of it; else the optimisation returns.
+_DETOUR = 0.1
 
 
 @dataclass(frozen=True)
@@ -89,12 +94,26 @@ class OptimizedPoseGraph(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The optimisation between two solves; `widening` is the width of the kernel in final widths."""
+    """The optimisation between two solves.
+
+    Attributes:
+        at: the poses from which the next step begins.
+        damping: the damping of the next step.
+        widening: the width of the kernel in final widths.
+        is_converged: True at a minimum.
+        before: the poses of lower cost from which steps have led here; None where `at` has the lowest cost.
+    """
 
     at: Linearisation
     damping: float
     widening: float
     is_converged: bool = False
+    before: Linearisation | None = None
+
+    @property
+    def best(self) -> Linearisation:
+        """The poses of the lowest cost."""
+        return self.before or self.at
 
 
 @runs_on_host("call pose_graph.solve_dense there")
@@ -137,8 +156,8 @@ def optimize_pose_graph(
     while iterations < config.max_iterations and not state.is_converged and state.damping < _MOST_DAMPING:
         state = _iterate(state, graph, pattern, width, config)
         iterations += 1
-    weights, moved = _weights(state.at.chi2, width), replace(graph, poses=state.at.poses)
-    chi2 = float((weights * state.at.chi2).sum())
+    weights, moved = _weights(state.best.chi2, width), replace(graph, poses=state.best.poses)
+    chi2 = float((weights * state.best.chi2).sum())
     free = find_free_nodes(moved)
     if free:
         LOGGER.warning("%s; they stay near their given poses", describe_free_nodes(free))
@@ -146,27 +165,35 @@ def optimize_pose_graph(
 
 
 def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig) -> _State:
-    """Returns the state after one damped solve, whose step is taken where it lowers the cost."""
+    """Returns the state after one damped solve, whose step is taken where it lowers the cost.
+
+    From a step that raises the cost, further ones are tried as long as they lower it fast, and all are taken where the
+    last one arrives below. Where one edge is far stiffer than the others, the first step follows it along a tangent,
+    and the others return to it.
+    """
     at, is_narrow = state.at, state.widening <= 1.0
     width = width * state.widening
     weights = _weights(at.chi2, width)
     matrix = pattern.matrix(at.blocks * weights[:, None, None, None, None])
     right = -pattern.vector(at.gradient * weights[:, None, None])
     diagonal = matrix.diagonal()
-    extra = state.damping * np.maximum(diagonal, max(_LEAST_STIFFNESS * diagonal.max(initial=0.0), 1e-300))
+    typical = max(np.median(diagonal[diagonal > 0]), 1e-300) if diagonal.any() else 1e-300
+    extra = state.damping * np.clip(diagonal, *(share * typical for share in _STIFFNESSES))
     step = solve_symmetric(matrix, right, extra)
-    cost = _cost(at.chi2, width)
+    cost = _cost(state.best.chi2, width)
     small = config.tolerance * cost + 1e-12
     widening = max(1.0, state.widening / _NARROWING)
     trial, decrease = at, -np.inf
     if np.isfinite(step).all():
-        if is_narrow and step @ right + step @ (extra * step) <= small:
+        if is_narrow and state.before is None and step @ right + step @ (extra * step) <= small:
             return state._replace(is_converged=True)
         trial = linearise(at.poses, pattern.to_nodes(step, graph.tangent_size), graph.edges)
         decrease = cost - _cost(trial.chi2, width)
-    if not decrease >= 0:
-        return state._replace(damping=10.0 * state.damping, widening=widening)
-    return _State(trial, max(0.1 * state.damping, _LEAST_DAMPING), widening, is_narrow and decrease <= small)
+    if decrease >= 0:
+        return _State(trial, max(0.1 * state.damping, _LEAST_DAMPING), widening, is_narrow and decrease <= small)
+    if np.isfinite(decrease) and (state.before is None or _cost(trial.chi2, width) < _DETOUR * _cost(at.chi2, width)):
+        return state._replace(at=trial, before=state.best, widening=widening)
+    return _State(state.best, 10.0 * state.damping, widening)
 
 
 def _weights(chi2: Floats, width: Floats) -> Floats:
