@@ -196,7 +196,7 @@ class SampleMaker:
         layout = self._config.layout_at(step, seed=self._seed)
         capacity = layout_capacity(layout, sampling)
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
-        rows = np.concatenate([group.rows for group in groups if group is not None])
+        rows = np.concatenate([group.rows for group in groups])
         # The number of scans is always that of the capacity: another number would be compiled again.
         num_spare = capacity.num_scans - len(rows)
         padded = np.concatenate([rows, np.full(num_spare, rows[0])])
