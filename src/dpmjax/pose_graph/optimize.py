@@ -21,7 +21,7 @@ from jaxtyping import Float
 from dpmjax.checks import require_count, require_positive, runs_on_host
 from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
-from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph
+from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph, label_parts
 from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
 from dpmjax.types import with_short_repr
 
@@ -218,25 +218,19 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
     """
     is_planar = edges.measurements.ndim == 2
     T_target_source = se2.to_matrix(edges.measurements) if is_planar else edges.measurements
-    T_source_target = rigid.inverse(T_target_source)
-    size = T_target_source.shape[-1]
-    T = np.tile(np.eye(size), (num_nodes, 1, 1))
-    # Of several edges between two nodes, the first one counts; a number above 0 is an edge in its direction.
-    first: dict[tuple[int, int], Floats] = {}
-    for row, (source, target) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
-        first.setdefault((target, source), T_target_source[row])
-        first.setdefault((source, target), T_source_target[row])
-    ends = np.array(list(first), np.int64).reshape(-1, 2)
-    joined = sp.csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (num_nodes, num_nodes))
-    is_placed = np.zeros(num_nodes, bool)
-    for root in range(num_nodes):
-        if is_placed[root]:
-            continue
-        order, before = sp.csgraph.breadth_first_order(joined, root, directed=True)
-        is_placed[order] = True
-        for node in order[1:].tolist():
-            parent = int(before[node])
-            T[node] = T[parent] @ first[parent, node]
+    # Each edge in both directions, one after the other; of several edges between two nodes, the first one counts.
+    ends = np.stack([edges.target, edges.source, edges.source, edges.target], axis=1).reshape(-1, 2)
+    motions = np.stack([T_target_source, rigid.inverse(T_target_source)], axis=1).reshape(
+        -1, *T_target_source.shape[1:]
+    )
+    ends, first = np.unique(ends, axis=0, return_index=True)
+    numbers = sp.csr_matrix((first + 1, ends.T), (num_nodes, num_nodes))
+    T = np.tile(np.eye(motions.shape[-1]), (num_nodes, 1, 1))
+    for root in np.unique(label_parts(num_nodes, edges.source, edges.target), return_index=True)[1]:
+        order, before = sp.csgraph.breadth_first_order(numbers, root, directed=True)
+        nodes, parents = order[1:], before[order[1:]]
+        for node, parent, number in zip(nodes, parents, np.ravel(numbers[parents, nodes]), strict=True):
+            T[node] = T[parent] @ motions[number - 1]
     return np.asarray(se2.from_matrix(T)) if is_planar else T
 
 

@@ -12,7 +12,7 @@ from dpmjax.checks import require_positive_fields
 from dpmjax.sequences import FloatArray, homogeneous
 from dpmjax.simulation.building import Building
 from dpmjax.simulation.town.make import Town
-from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, on_path, smooth, tangents
+from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, on_path, smooth, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
@@ -67,29 +67,6 @@ class TimedPoses(NamedTuple):
 
     T_world_lidar: FloatArray
     times: FloatArray
-
-
-def route_poses(
-    rng: np.random.Generator, kind: str, length_m: float, *, block_m: float = 100.0, step_m: float = 1.0
-) -> FloatArray:
-    """Draws a route through streets, and returns poses on its lane at equal steps.
-
-    Args:
-        rng: source of all choices.
-        kind: kind of the route, see `make_streets`.
-        length_m: wanted length of the route; met within a block or two.
-        block_m: side of a block.
-        step_m: distance between two poses.
-
-    Returns:
-        (n, 4, 4) poses on the ground, x forward, y left, z up.
-    """
-    lane = lane_of(make_streets(rng, kind, length_m, block_m), is_reversed=False)
-    way = np.arange(0.0, arc_lengths(lane)[-1], step_m)
-    cos, sin = _directions(lane, way).T
-    T = homogeneous(np.eye(3), np.pad(at_way(lane, way), ((0, 0), (0, 1))))
-    T[:, :2, :2] = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
-    return T
 
 
 def turn_motions(way: TimedPoses) -> FloatArray:
