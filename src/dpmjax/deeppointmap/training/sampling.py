@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from dpmjax.checks import require, require_shape
 from dpmjax.deeppointmap.matching import thinned_mask
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, Layout, SamplingConfig
 from dpmjax.geometry import rigid
@@ -39,11 +40,9 @@ class ScanTable:
     scene: Int[np.ndarray, " n"]
 
     def __post_init__(self) -> None:
-        if self.T_world_lidar.shape != (len(self.scene), 4, 4) or len(self.scene) < 2:
-            found = f"got {self.T_world_lidar.shape} and {self.scene.shape}"
-            raise ValueError(f"T_world_lidar, scene: expected (n, 4, 4) and (n,) with n >= 2, {found}")
-        if not np.isfinite(self.T_world_lidar).all():
-            raise ValueError("T_world_lidar: expected finite poses")
+        require(len(self.scene) >= 2, "scene", "at least two scans", len(self.scene))
+        require_shape("T_world_lidar", self.T_world_lidar, (len(self.scene), 4, 4))
+        require(np.isfinite(self.T_world_lidar).all(), "T_world_lidar", "finite poses", "others")
 
     def __len__(self) -> int:
         return len(self.scene)
