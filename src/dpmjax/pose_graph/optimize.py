@@ -34,7 +34,7 @@ _FIRST_DAMPING = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
 # Diagonal entries that damping goes by, in medians of all. By a larger one, an edge a billion times stiffer than the
 # others would hold both of its nodes; by a smaller one, nodes that nothing holds would leave with the rounding.
-_STIFFNESSES = 1e-3, 1e3
+_LEAST_STIFFNESS, _MOST_STIFFNESS = 1e-3, 1e3
 
 
 # From a higher cost, each step must arrive at less than this share of it; else the optimisation returns.
@@ -176,7 +176,7 @@ def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floa
     right = -pattern.vector(at.gradient * weights[:, None, None])
     diagonal = matrix.diagonal()
     typical = max(np.median(diagonal[diagonal > 0]), 1e-300) if diagonal.any() else 1e-300
-    extra = state.damping * np.clip(diagonal, *(share * typical for share in _STIFFNESSES))
+    extra = state.damping * np.clip(diagonal, _LEAST_STIFFNESS * typical, _MOST_STIFFNESS * typical)
     step = solve_symmetric(matrix, right, extra)
     cost = _cost(state.best.chi2, width)
     small = config.tolerance * cost + 1e-12
@@ -227,8 +227,9 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
     for root in np.unique(label_parts(num_nodes, edges.source, edges.target), return_index=True)[1]:
         order, before = sp.csgraph.breadth_first_order(numbers, root, directed=True)
         nodes, parents = order[1:], before[order[1:]]
-        for node, parent, number in zip(nodes, parents, np.ravel(numbers[parents, nodes]), strict=True):
-            T[node] = T[parent] @ motions[number - 1]
+        rows = np.ravel(numbers[parents, nodes]).astype(np.int64) - 1
+        for node, parent, row in zip(nodes, parents, rows, strict=True):
+            T[node] = T[parent] @ motions[row]
     return np.asarray(se2.from_matrix(T)) if is_planar else T
 
 

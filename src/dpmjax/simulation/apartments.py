@@ -263,7 +263,7 @@ def simulate_depth_sequence(
     config = config or DepthWalkConfig()
     home = apartment if isinstance(apartment, Apartment) else make_apartment(apartment)
     rng = np.random.default_rng([seed, 11])
-    T_world_camera = motion_matrices(_wide_walk(home, num_views, config, rng))
+    T_world_camera = np.asarray(motion_matrices(_wide_walk(home, num_views, config, rng)))
     rows, columns = ACTIVE_VISION.sample_pixels(config.height, config.width)
     rays = ACTIVE_VISION.rays(columns, rows)
     # One capacity for all apartments, so that the caster compiles once.

@@ -109,7 +109,10 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     way = way % whole if is_closed else way
     along = _directions(lane, way)
     left = np.column_stack([-along[:, 1], along[:, 0]])
-    places = at_way(lane, way) + (_SWAY_M * _slow_noise(rng, way))[:, None] * left
+    # Of unit variance, and changing over tens of metres.
+    phases, waves = rng.uniform(0, 2 * np.pi, 3), 2 * np.pi / np.array([31.0, 53.0, 97.0])
+    sway = np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
+    places = at_way(lane, way) + (_SWAY_M * sway)[:, None] * left
     return TimedPoses(_poses(town, places, along, left, config, rng), times)
 
 
@@ -134,13 +137,6 @@ def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
 def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
     found = on_path(lane, way)[:, 2:]
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
-
-
-def _slow_noise(rng: np.random.Generator, way: FloatArray) -> FloatArray:
-    """Draws noise of unit variance that changes over tens of metres."""
-    phases = rng.uniform(0, 2 * np.pi, 3)
-    waves = 2 * np.pi / np.array([31.0, 53.0, 97.0])
-    return np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
 
 
 def _poses(

@@ -85,7 +85,7 @@ class OverlapHooks:
         stop: called before each step; any number but 0 ends the stage.
     """
 
-    on_report: Callable[[OverlapRecord, OverlapState], None] | None = None
+    on_report: Callable[[OverlapRecord, OverlapState], object] = lambda _record, _state: None
     # int() is 0: by default nothing ends the stage.
     stop: Callable[[], int] = int
 
@@ -149,8 +149,7 @@ def train_overlap(
         batch = PairFeatures(pairs.features[:, sides], pairs.mask[:, sides], pairs.is_overlap)
         rate = _learning_rate(config, step, num_steps)
         state, loss, accuracy = _step(state, frozen, batch, rate, settings.rate_share * WEIGHT_DECAY)
-        if hooks.on_report is not None:
-            hooks.on_report(OverlapRecord(step + 1, num_steps, float(loss), float(accuracy), rate), state)
+        hooks.on_report(OverlapRecord(step + 1, num_steps, float(loss), float(accuracy), rate), state)
     is_trained = int(state.step) >= num_steps
     return with_head(model, state.head, is_trained=is_trained), state
 
