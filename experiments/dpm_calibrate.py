@@ -165,20 +165,18 @@ def measure_towns(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
     """Matches pairs of a few scans of each town, and of fewer ones of the next town; a row for each pair."""
 
     @lru_cache(maxsize=1)
-    def measure(place: int) -> cli.Row:
+    def measure(place: int) -> list[cli.Row]:
         drives = []
         for number, num in ((place, NUM_SCANS), (place + 1, NUM_OTHER_SCANS)):
             drive = simulation.simulate_drive(number, length_m=TOWN_LENGTH_M)
             drives.append(drive.take(np.unique(np.linspace(0, len(drive) - 1, num).astype(int))))
         found = dpm.measure_overlap(model, drives, NUM_OVERLAP_PAIRS, seed)
-        if found is None:
+        if not found:
             raise ValueError(f"{drives[0].name}: no pairs of scans with overlap, or none without")
         return found
 
     def work(place: int, pair: int) -> cli.Row:
-        found = measure(place)
-        features = dict(zip(dpm.OVERLAP_FEATURES, found["evidence"][pair], strict=True))
-        return {"is_overlap": found["is_overlap"][pair], **features}
+        return measure(place)[pair]
 
     towns = range(FIRST_OVERLAP_TOWN, FIRST_OVERLAP_TOWN + NUM_OVERLAP_TOWNS)
     cases = [{"place": town, "pair": pair} for town in towns for pair in range(NUM_OVERLAP_PAIRS)]

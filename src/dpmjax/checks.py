@@ -210,6 +210,22 @@ def require_shape(name: str, array: AnyArray, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
 
 
+def require(is_right: Any, name: str, expected: str, got: Any) -> None:
+    """Checks that an argument is as expected.
+
+    Args:
+        is_right: True where it is.
+        name: name of the argument, for the message.
+        expected: the expected values, for the message.
+        got: the given value.
+
+    Raises:
+        ValueError: it is not; the message names all three.
+    """
+    if not is_right:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
+
+
 def require_positive(name: str, value: Any) -> None:
     """Checks that a number is above zero; a traced number passes.
 

@@ -24,14 +24,17 @@ def registrations(num: int, place: int, *, is_right: bool | None = None) -> list
     return rows
 
 
-def matches(num: int, seed: int) -> dict:
+def matches(num: int, seed: int) -> list[dict]:
     """Matches whose first number tells overlap, and a head that knows less."""
     rng = np.random.default_rng(seed)
     is_overlap = np.arange(num) % 2 == 0
     evidence = rng.normal(size=(num, len(OVERLAP_FEATURES)))
     evidence[:, 0] += 3 * is_overlap
     head = 1 / (1 + np.exp(-rng.normal(size=num) - 0.5 * is_overlap))
-    return {"evidence": evidence.tolist(), "is_overlap": is_overlap.tolist(), "head": head.tolist()}
+    return [
+        {**dict(zip(OVERLAP_FEATURES, row, strict=True)), "is_overlap": label, "head": probability}
+        for row, label, probability in zip(evidence, is_overlap, head, strict=True)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +56,7 @@ def test_fits_are_measured_on_held_out_places(model) -> None:
 
 
 def test_what_the_pairs_cannot_fix_is_left_out(model) -> None:
-    measured = MeasuredDrives(registrations(20, 0, is_right=True), [], None, None)
+    measured = MeasuredDrives(registrations(20, 0, is_right=True), [], [], [])
     calibrated, numbers = calibrate(model, measured)
     assert (calibrated.config.calibration, calibrated.config.overlap) == (None, None)
     assert numbers == {"num_pairs": 20}
@@ -68,17 +71,19 @@ def test_without_other_places_each_one_is_left_out_in_turn() -> None:
 
 @pytest.mark.slow
 def test_tested_pairs_hold_a_scan_of_the_held_out_places(model, monkeypatch) -> None:
-    from dpmjax import deeppointmap
+    from dpmjax.deeppointmap import calibration
 
     drives, drawn = [toy.drive(1), toy.drive(2)], []
-    draw = deeppointmap.draw_overlap_pairs
+    draw = calibration.draw_overlap_pairs
 
     def recorded(*args, **options):
         drawn.append(draw(*args, **options))
         return drawn[-1]
 
-    monkeypatch.setattr(deeppointmap, "draw_overlap_pairs", recorded)
+    monkeypatch.setattr(calibration, "draw_overlap_pairs", recorded)
     found = measure_overlap(model, drives, 16, 0, anchors=[np.array([22, 23]), np.array([20])])
     assert {22, 23, 44} >= set(drawn[0][:, 0].tolist())
-    assert (sum(found["is_overlap"]), len(found["head"]), np.shape(found["evidence"])) == (8, 16, (16, 16))
-    assert measure_overlap(model, [toy.drive(1, num_scans=3)], 8, 0) is None
+    assert len(found) == 16
+    assert sum(row["is_overlap"] for row in found) == 8
+    assert {*OVERLAP_FEATURES, "is_overlap", "head"} == found[0].keys()
+    assert measure_overlap(model, [toy.drive(1, num_scans=3)], 8, 0) == []

@@ -118,6 +118,24 @@ def test_minimum_is_that_of_dense_least_squares(tangent: int) -> None:
 
 
 @KINDS
+def test_edge_a_billion_times_stiffer_than_the_others_costs_few_steps(tangent: int) -> None:
+    graph = random_graph(9, tangent, count=30, start=0.0)
+    information = graph.edges.information.copy()
+    information[11] *= 1e9
+    stiff = PoseGraph.create(graph.poses, graph.edges._replace(information=information))
+    solved = optimize_pose_graph(stiff, PoseGraphConfig(tolerance=1e-9))
+    assert solved.is_converged
+    assert solved.iterations <= 15
+    # An edge that is a hundred times stiffer again changes nothing.
+    information[11] *= 100
+    np.testing.assert_allclose(
+        optimize_pose_graph(PoseGraph.create(graph.poses, graph.edges._replace(information=information))).chi2,
+        solved.chi2,
+        rtol=1e-4,
+    )
+
+
+@KINDS
 def test_derivatives_are_those_of_finite_differences(tangent: int) -> None:
     # Large residuals: there the derivative of the logarithm is far from the identity.
     graph = random_graph(1, tangent, start=0.4)

@@ -15,7 +15,6 @@ from dpmjax.simulation import (
     TownConfig,
     drive,
     make_town,
-    route_poses,
     scan_town,
 )
 from dpmjax.simulation.town.terrain import with_equal_passes
@@ -83,19 +82,6 @@ def test_routes_close_and_have_the_wanted_length(kind):
     assert np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]) < 1.5
     assert steps.max() < 1.0
     assert steps.sum() == pytest.approx(1200, rel=0.35)
-
-
-def test_poses_of_a_route_look_along_it_at_equal_steps():
-    T = route_poses(np.random.default_rng(2), "loop", 600.0, block_m=80.0, step_m=2.0)
-    moves = np.diff(T[:, :3, 3], axis=0)
-    lengths = np.linalg.norm(moves, axis=1)
-    # A chord of a corner is shorter than its arc.
-    assert np.median(lengths) == pytest.approx(2.0, abs=1e-3)
-    assert lengths.max() < 2.0 + 1e-6
-    assert np.einsum("ni,ni->n", moves, T[:-1, :3, 0]).min() > 0.8 * lengths.min()
-    R = T[:, :3, :3]
-    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(T), 1, 1)), atol=1e-9)
-    np.testing.assert_allclose(T[:, 2, 2], np.linalg.det(R), atol=1e-9)
 
 
 def test_reverse_drives_the_other_lane(town, way):

@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from dpmjax.checks import require_count
+from dpmjax.checks import require, require_count
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.engine import solve
 from dpmjax.deepmapping.mapping import Fitted
@@ -197,8 +197,8 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
     """
     require_count("num_steps", num_steps)
     scans = as_scan_set(scans)
-    if len(scans.points) != len(fitted.poses):
-        raise ValueError(f"scans: expected the {len(fitted.poses)} scans of the fit, got {len(scans.points)}")
+    num, num_given = len(fitted.poses), len(scans.points)
+    require(num_given == num, "scans", f"the {num} scans of the fit", num_given)
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
     measured = replace(scans, points=scans.points / fitted.unit)
     render_key, train_key, net_key = jax.random.split(key, 3)
@@ -211,9 +211,7 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
     shares = [np.full(len(some), 1.0 / len(some)) for some in (poses, places) if len(some)]
     both, labels = jax.tree.map(lambda *parts: jnp.concatenate(parts), (measured, poses), (rendered, places))
     phase = replace(fitted.config.cold_phases[0], num_steps=num_steps, num_epochs=0)
-    problem = Problem(
-        fitted.config, (phase,), _init, _optimizer, _loss, _no_poses, _next_phase, fitted.config.steps_per_call
-    )
+    problem = Problem(fitted.config, (phase,), _init, _optimizer, _loss, fitted.config.steps_per_call)
     state, _ = solve(problem, TrainingScans(begin, both, labels, jnp.asarray(np.concatenate(shares))), key=train_key)
     params = replace(fitted.params, localization=state.params, start=jnp.zeros_like(fitted.params.start))
     return fitted._replace(params=params)
@@ -241,14 +239,6 @@ def _init(config: DeepMappingConfig, key: jax.Array, data: TrainingScans) -> Any
 
 def _optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
     return optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, phase.num_steps, 0.01))
-
-
-def _no_poses(config: DeepMappingConfig, phase: PhaseConfig, params: Any, data: TrainingScans) -> None:
-    return None
-
-
-def _next_phase(config: DeepMappingConfig, phase: PhaseConfig, params: Any, data: TrainingScans) -> Any:
-    return params
 
 
 def _loss(

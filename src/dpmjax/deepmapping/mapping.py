@@ -19,7 +19,7 @@ from dpmjax.checks import Beams, require_type, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Progress, Report, fit
 from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
-from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set
+from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set, positions_of, scale_start
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.progress import progress_bar
@@ -111,14 +111,14 @@ def mapping_data(
             is more than ten times smaller or larger than the typical range.
     """
     checked = scans if isinstance(scans, DepthScans) else as_scan_set(scans)
-    reach, sensor = typical_range(checked.points, checked.mask), _SENSORS[type(checked)]
+    reach = typical_range(checked.points, checked.mask)
     unit = reach if unit is None else unit
     if not _UNIT_SHARES[0] * reach <= unit <= _UNIT_SHARES[1] * reach:
         raise ValueError(
             f"unit: expected a length like the ranges of the scans, of which nine in ten are below {reach:.4g}, got "
             f"{unit:.4g}; dataclasses.replace(config, unit=None) takes the ranges as unit"
         )
-    T_start = None if start is None else sensor.scaled_start(start, len(checked.points), unit)
+    T_start = None if start is None else scale_start(start, checked, unit)
     points = jax.device_put(np.asarray(checked.points) / np.float32(unit))
     return MappingData(replace(checked, points=points), T_start), unit
 
@@ -133,11 +133,9 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
     Returns:
         The problem; poses are as in `Fitted`, in units of the fit.
     """
-    sensor = _SENSORS[type(data.scans)]
-    return Problem(
-        config, phases_of(config, data), sensor.init, make_optimizer, sensor.loss, sensor.poses, sensor.next_phase,
-        config.steps_per_call,
-    )  # fmt: skip
+    of_sensor = _SENSORS[type(data.scans)]._asdict()
+    phases, steps = phases_of(config, data), config.steps_per_call
+    return Problem(config, phases, optimizer=make_optimizer, steps_per_call=steps, **of_sensor)
 
 
 @runs_on_host("call deepmapping.solve there")
@@ -180,7 +178,8 @@ def fit_deepmapping(
             bar.update(report.share - bar.n)
 
         done = (engine or partial(fit, on_report=show))(problem, data, key=key)
-    poses = _SENSORS[type(data.scans)].unscaled(done.poses, unit)
+    poses = np.array(done.poses, np.float64)
+    positions_of(poses)[...] *= unit
     return Fitted(poses, done.state.params, done.report, unit, config, int(done.state.step))
 
 

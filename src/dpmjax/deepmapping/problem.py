@@ -9,10 +9,8 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
 
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.objective import MapLogits, Terms, WorldBatch, free_factors, num_batches, occupancy_term
@@ -31,6 +29,15 @@ _GRID_DECAY = 1e-3
 _ANNEAL_UNTIL = 0.7
 
 
+def no_poses(config: Any, phase: Any, params: Any, data: Any) -> None:
+    """Returns no poses, for problems without any."""
+
+
+def keep_params(config: Any, phase: Any, params: Any, data: Any) -> Any:
+    """Begins a phase with the parameters of the phase before it."""
+    return params
+
+
 @dataclass(frozen=True)
 class Problem:
     """Functions and settings of an optimisation of parameters on one data set.
@@ -44,9 +51,10 @@ class Problem:
         init: (config, key, data) -> Params; the data have the initial poses where there are some.
         optimizer: (config, phase) -> optax optimiser, whose state has the same structure in all phases.
         loss: (config, phase, params, data, step, key) -> (scalar, terms); `step` counts from 0 within the phase.
-        poses: (config, phase, params, data) -> poses of the whole data set.
-        next_phase: (config, phase, params, data) -> Params at the start of the phase after `phase`.
         steps_per_call: the largest number of steps that are compiled into one call.
+        poses: (config, phase, params, data) -> poses of the whole data set; None by default.
+        next_phase: (config, phase, params, data) -> Params at the start of the phase after `phase`; the same Params by
+            default.
     """
 
     config: Any
@@ -54,9 +62,9 @@ class Problem:
     init: Callable[..., Any]
     optimizer: Callable[..., optax.GradientTransformation]
     loss: Callable[..., tuple[Float[Array, ""], Any]]
-    poses: Callable[..., Any]
-    next_phase: Callable[..., Any]
     steps_per_call: int
+    poses: Callable[..., Any] = no_poses
+    next_phase: Callable[..., Any] = keep_params
 
 
 class MappingData(NamedTuple):
@@ -72,19 +80,15 @@ class MappingData(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """Functions of DeepMapping that depend on the sensor: poses, and comparison of pairs of scans.
+    """Functions of `Problem` that depend on the sensor: poses, and comparison of pairs of scans.
 
     Attributes:
-        scaled_start: (start, number of scans, unit) -> checked poses in units of the fit.
-        unscaled: (poses, unit) -> float64 poses in the unit of the points.
         init: function of `Problem`.
         loss: function of `Problem`.
         poses: function of `Problem`.
         next_phase: function of `Problem`.
     """
 
-    scaled_start: Callable[..., Array]
-    unscaled: Callable[..., NDArray[np.float64]]
     init: Callable[..., Params]
     loss: Callable[..., tuple[Float[Array, ""], Terms]]
     poses: Callable[..., Array]

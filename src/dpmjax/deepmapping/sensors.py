@@ -69,6 +69,36 @@ def as_scan_set(scans: Beams, *, min_scans: int = 2, may_be_blind: bool = False)
     return beams
 
 
+def positions_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns a view of the positions of poses x, y, heading, or of matrices (..., 4, 4)."""
+    return poses[..., :2] if poses.shape[-1] == 3 else poses[..., :3, 3]
+
+
+def scale_start(start: ArrayLike, scans: ScanSet | DepthScans, unit: float) -> Float[Array, "n ..."]:
+    """Checks initial poses, and scales them from the unit of the points to that of the fit.
+
+    Args:
+        start: (n, 3) or (n, 3, 3) for planar scans, (n, 4, 4) for depth images.
+        scans: the n scans.
+        unit: unit of the fit, in that of the points.
+
+    Returns:
+        (n, 3) or (n, 4, 4) float32.
+
+    Raises:
+        ValueError: another shape, numbers that are not finite, or positions too far from the origin for float32.
+    """
+    count = len(scans.mask)
+    poses = np.array(se2.as_poses("start", start, count) if isinstance(scans, ScanSet) else start, np.float64)
+    if isinstance(scans, DepthScans) and (poses.shape != (count, 4, 4) or not np.isfinite(poses).all()):
+        raise ValueError(f"start: expected finite numbers of shape ({count}, 4, 4), got {poses.shape}")
+    positions = positions_of(poses)
+    positions /= unit
+    if np.abs(positions).max(initial=0.0) > _MAX_COORDINATE:
+        raise ValueError("start: the positions are too far from the origin for float32; subtract the first one")
+    return jax.device_put(poses.astype(np.float32))
+
+
 def localize_scans(
     params: Any, points: Float[Array, "m b 2"], mask: Bool[Array, "m b"], config: DeepMappingConfig
 ) -> Float[Array, "m 3"]:
@@ -202,43 +232,8 @@ def _planar_loss(
     return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.chamfer_limit), key=free_key)
 
 
-def _planar_start(start: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 3"]:
-    """Checks initial poses x, y, heading and scales them from the unit of the points to that of the fit."""
-    poses = se2.as_poses("start", start, num_scans) / [unit, unit, 1.0]
-    _require_near_origin(poses[:, :2])
-    return jax.device_put(poses.astype(np.float32))
-
-
-def _require_near_origin(positions: NDArray[np.float64]) -> None:
-    """Raises a ValueError for positions, in typical ranges, that float32 holds to less than a thousandth."""
-    if np.abs(positions).max(initial=0.0) > _MAX_COORDINATE:
-        raise ValueError("start: the positions are too far from the origin for float32; subtract the first one")
-
-
-def _planar_unscaled(poses: Float[Array, "n 3"], unit: float) -> NDArray[np.float64]:
-    """Scales poses x, y, heading from the unit of the fit to that of the points."""
-    return np.asarray(poses, np.float64) * [unit, unit, 1.0]
-
-
 # DeepMapping of planar scans; poses are (n, 3) x, y, heading.
-PLANAR = Sensor(_planar_start, _planar_unscaled, _planar_init, _planar_loss, _planar_poses, _planar_next_phase)
-
-
-def _scaled_start(poses: ArrayLike, num_scans: int, unit: float) -> Float[Array, "n 4 4"]:
-    """Checks initial poses and scales them from the unit of the points to that of the fit."""
-    T = np.array(poses, np.float64)
-    if T.shape != (num_scans, 4, 4) or not np.isfinite(T).all():
-        raise ValueError(f"start: expected finite numbers of shape ({num_scans}, 4, 4), got {T.shape}")
-    T[:, :3, 3] /= unit
-    _require_near_origin(T[:, :3, 3])
-    return jax.device_put(T.astype(np.float32))
-
-
-def _unscaled(poses: ArrayLike, unit: float) -> NDArray[np.float64]:
-    """Scales poses from the unit of the fit to that of the points."""
-    T = np.array(poses, np.float64)
-    T[..., :3, 3] *= unit
-    return T
+PLANAR = Sensor(_planar_init, _planar_loss, _planar_poses, _planar_next_phase)
 
 
 def _net(config: DeepMappingConfig) -> LocalizationNet:
@@ -342,4 +337,4 @@ def _depth_loss(
 
 
 # DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
-DEPTH = Sensor(_scaled_start, _unscaled, _init, _depth_loss, _poses, _next_phase)
+DEPTH = Sensor(_init, _depth_loss, _poses, _next_phase)

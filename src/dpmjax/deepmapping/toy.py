@@ -136,7 +136,7 @@ def toy_problem(config: ToyConfig) -> Problem:
     Returns:
         The problem.
     """
-    return Problem(config, (config,), _init, _optimizer, _loss, _poses, _next_phase, steps_per_call=config.num_steps)
+    return Problem(config, (config,), _init, _optimizer, _loss, config.num_steps, _poses)
 
 
 def network_value(config: ToyConfig, params: ToyParams) -> Float[Array, ""]:
@@ -172,7 +172,3 @@ def _loss(
 
 def _poses(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> Float[Array, ""]:
     return params.x if config.form == "direct" else network_value(config, params)
-
-
-def _next_phase(config: ToyConfig, phase: ToyConfig, params: ToyParams, data: None) -> ToyParams:
-    return params

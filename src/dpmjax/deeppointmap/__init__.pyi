@@ -64,7 +64,6 @@ from .registration import register_pairs as register_pairs
 from .scan_evaluation import NO_OVERLAP_M as NO_OVERLAP_M
 from .scan_evaluation import OverlapEvaluation as OverlapEvaluation
 from .scan_evaluation import StagedRegistration as StagedRegistration
-from .scan_evaluation import encode_turned as encode_turned
 from .scan_evaluation import evaluate_overlap as evaluate_overlap
 from .scan_evaluation import overlap_candidates as overlap_candidates
 from .scan_evaluation import register_in_stages as register_in_stages

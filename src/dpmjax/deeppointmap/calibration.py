@@ -37,10 +37,10 @@ from dpmjax.deeppointmap.evaluation_pairs import (
     split_places,
 )
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M, evidence_pairs, overlap_pairs
-from dpmjax.deeppointmap.scan_evaluation import encode_turned, register_in_stages
+from dpmjax.deeppointmap.overlap_prediction import evidence_pairs
+from dpmjax.deeppointmap.scan_evaluation import encode_pairs, head_overlap, register_in_stages
 from dpmjax.deeppointmap.scan_registration import register_clouds
-from dpmjax.deeppointmap.training.overlap_stage import draw_overlap_pairs, why_no_overlap
+from dpmjax.deeppointmap.training.overlap_stage import draw_overlap_pairs, overlap_labels, why_no_overlap
 from dpmjax.deeppointmap.training.sampling import ScanTable
 from dpmjax.sequences import LidarSequence
 
@@ -134,9 +134,8 @@ def measure_pair(model: Model, pair: ScanPair) -> Row:
         values = [None] * len(names) if features is None else np.asarray(features).tolist()
         row |= {column_of(kind, name): value for name, value in zip(names, values, strict=True)}
         if kind in HAVE_LOOKALIKES:
-            row[f"lookalike_gap_{kind}"] = (
-                float(evidence.lookalike_gap) if np.isfinite(evidence.lookalike_gap) else None
-            )
+            gap = float(evidence.lookalike_gap)
+            row[f"lookalike_gap_{kind}"] = gap if np.isfinite(gap) else None
     return row
 
 
@@ -158,7 +157,7 @@ def measure_overlap(
     seed: int,
     *,
     anchors: Sequence[Int[np.ndarray, " _"]] | None = None,
-) -> Row | None:
+) -> list[Row]:
     """Matches pairs of which half are less than 20 m apart, each scan turned by a random yaw.
 
     Args:
@@ -169,33 +168,26 @@ def measure_overlap(
         anchors: scans of each drive of which one must be in each pair; None for all.
 
     Returns:
-        The evidence and the label of each pair, and the probability of the head if it is trained; None if the drives
-        have no pairs with overlap, or none without.
+        The evidence and the label of each pair, and the probability of the head if it is trained. No pairs if the
+        drives have none with overlap, or none without.
     """
     starts = np.cumsum([0, *(len(drive) for drive in drives)])
     poses = np.concatenate([np.asarray(drive.T_world_lidar) for drive in drives])
     table = ScanTable(poses, np.repeat(np.arange(len(drives)), np.diff(starts)))
     allowed = None if anchors is None else np.concatenate([rows + s for rows, s in zip(anchors, starts, strict=False)])
     if why_no_overlap(table) is not None or (allowed is not None and len(allowed) == 0):
-        return None
+        return []
     rng = np.random.default_rng([OVERLAP_STREAM, seed])
     pairs = draw_overlap_pairs(table, num_pairs, rng, anchors=allowed)
-    rows, places = np.unique(pairs, return_inverse=True)
-    clouds = []
-    for number, drive in enumerate(drives):
-        own = rows[table.scene[rows] == number] - starts[number]
-        clouds += [cloud.described for cloud in encode_turned(model, drive, own, rng=rng)]
-    sides = [[clouds[place] for place in side] for side in places.reshape(pairs.shape).T]
-    apart_m = np.linalg.norm(np.diff(table.positions[pairs], axis=1)[:, 0], axis=1)
-    is_one_drive = table.scene[pairs[:, 0]] == table.scene[pairs[:, 1]]
-    found: Row = {
-        "evidence": np.asarray(evidence_pairs(model, *sides), float).tolist(),
-        "is_overlap": (is_one_drive & (apart_m < OVERLAP_M)).tolist(),
-    }
-    if "overlap" in model.config.trained:
-        by_head = replace(model, config=replace(model.config, overlap=None))
-        found["head"] = np.asarray(overlap_pairs(by_head, *sides), float).tolist()
-    return found
+    sides = encode_pairs(model, drives, pairs, rng=rng)
+    columns = dict(zip(OVERLAP_FEATURES, np.asarray(evidence_pairs(model, *sides), float).T, strict=True))
+    if (by_head := head_overlap(model, sides)) is not None:
+        columns["head"] = by_head
+    columns["is_overlap"] = overlap_labels(table, pairs)
+    return [
+        dict(zip(columns, values, strict=True))
+        for values in zip(*(column.tolist() for column in columns.values()), strict=True)
+    ]
 
 
 class MeasuredDrives(NamedTuple):
@@ -204,14 +196,14 @@ class MeasuredDrives(NamedTuple):
     Attributes:
         confidence: a row for each registration, with the number of its drive as `place`, of places that are trained on.
         tested_confidence: those of held-out places.
-        overlap: matches of the drives; None without pairs of both labels.
+        overlap: a row for each match; none without pairs of both labels.
         tested_overlap: those of held-out places.
     """
 
     confidence: list[Row]
     tested_confidence: list[Row]
-    overlap: Row | None
-    tested_overlap: Row | None
+    overlap: list[Row]
+    tested_overlap: list[Row]
 
 
 def measure_drives(
@@ -269,35 +261,10 @@ def calibrate(model: Model, measured: MeasuredDrives) -> tuple[Model, Row]:
     """
     calibration, numbers, _ = fit_confidence(measured.confidence, measured.tested_confidence)
     overlap = None
-    if measured.overlap is not None:
-        labels = np.asarray(measured.overlap["is_overlap"])
-        features = np.asarray(measured.overlap["evidence"])
-        overlap = fit_logistic(OVERLAP_FEATURES, features, labels)
-        numbers["num_overlap_pairs"] = len(labels)
-        if (tested := measured.tested_overlap) is not None:
-            numbers |= overlap_numbers(overlap, tested)
+    if measured.overlap:
+        overlap, overlap_numbers, _ = fit_overlap(measured.overlap, measured.tested_overlap)
+        numbers |= overlap_numbers
     return replace(model, config=replace(model.config, calibration=calibration, overlap=overlap)), numbers
-
-
-def overlap_numbers(fitted: LogisticModel, tested: Row) -> Row:
-    """Computes the AUC and the Brier score of the regression, and of the head where it is trained.
-
-    Args:
-        fitted: the regression.
-        tested: pairs from `measure_overlap`.
-
-    Returns:
-        The numbers.
-    """
-    labels = np.asarray(tested["is_overlap"])
-    found = {"overlap": logistic_probability(fitted, np.asarray(tested["evidence"]))}
-    if "head" in tested:
-        found["head"] = np.asarray(tested["head"])
-    numbers: Row = {"num_tested_overlap_pairs": len(labels)}
-    for name, probability in found.items():
-        numbers[f"auc_{name}"] = metrics.area_under_curve(probability, labels)
-        numbers[f"brier_{name}"] = metrics.brier_score(probability, labels)
-    return numbers
 
 
 def fit_confidence(
@@ -370,26 +337,34 @@ def rate_pair(calibration: Calibration, row: Row, *, of_clouds: bool) -> float:
     return float(calibrated_probability(calibration, evidence))
 
 
-def fit_overlap(rows: Sequence[Row]) -> tuple[LogisticModel, Row, HeldOut]:
+def fit_overlap(rows: Sequence[Row], tested: Sequence[Row] | None = None) -> tuple[LogisticModel, Row, HeldOut]:
     """Fits the regression of overlap.
 
     Args:
-        rows: pairs, each with its `place`, `is_overlap` and `OVERLAP_FEATURES`.
+        rows: pairs from `measure_overlap`, each with its `place` where no others are tested.
+        tested: pairs of other places, that the numbers are of; None takes each place by a fit without it.
 
     Returns:
-        The regression, its numbers, and the probability of the pairs of each place by a fit without it.
+        The regression; the AUC and the Brier score of it, and of the head where that was measured; and the probability
+        and the label of the tested pairs.
     """
-    features = np.array([[row[name] for name in OVERLAP_FEATURES] for row in rows], float)
-    places, is_overlap = (np.array([row[name] for row in rows]) for name in ("place", "is_overlap"))
-    examples = Examples(places, features, is_overlap, np.ones(len(places)))
-    fitted, found = fit_held_out(OVERLAP_FEATURES, examples)
-    numbers: Row = {
-        "num_overlap_pairs": len(places),
-        "auc_overlap": metrics.area_under_curve(*found),
-        "brier_overlap": metrics.brier_score(*found),
-        "brier_of_a_constant_overlap": float(is_overlap.var()),
-    }
+    examples = _matches(rows)
+    fitted, found = fit_held_out(OVERLAP_FEATURES, examples, None if tested is None else _matches(tested))
+    numbers: Row = {"num_overlap_pairs": len(rows), "num_tested_overlap_pairs": len(found[1])}
+    probabilities = {"overlap": found[0]}
+    if tested and "head" in tested[0]:
+        probabilities["head"] = np.array([row["head"] for row in tested])
+    for name, probability in probabilities.items() if len(found[1]) else ():
+        numbers[f"auc_{name}"] = metrics.area_under_curve(probability, found[1])
+        numbers[f"brier_{name}"] = metrics.brier_score(probability, found[1])
+        numbers["brier_of_a_constant_overlap"] = float(found[1].var())
     return fitted, numbers, found
+
+
+def _matches(rows: Sequence[Row]) -> Examples:
+    features = np.array([[row[name] for name in OVERLAP_FEATURES] for row in rows], float)
+    places, is_overlap = (np.array([row.get(name, 0) for row in rows]) for name in ("place", "is_overlap"))
+    return Examples(places, features.reshape(-1, len(OVERLAP_FEATURES)), is_overlap.astype(bool), np.ones(len(rows)))
 
 
 def fit_held_out(

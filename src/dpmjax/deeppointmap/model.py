@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.checks import require_shape, runs_on_host
+from dpmjax.checks import require, require_shape, runs_on_host
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
@@ -143,22 +143,19 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
         ValueError: if the pyramid has other stages than the model, or if `num_elements` is out of range.
     """
     stages = model.config.pyramid.stages
-    if len(pyramid.levels) != len(stages) + 1:
-        raise ValueError(f"pyramid: expected {len(stages) + 1} levels, got {len(pyramid.levels)}")
+    require(len(pyramid.levels) == len(stages) + 1, "pyramid", f"{len(stages) + 1} levels", len(pyramid.levels))
     for number, (stage, level) in enumerate(zip(stages, pyramid.levels[1:], strict=True), start=1):
-        if len(level.neighbours) != len(stage.radii):
-            expected = f"expected {len(stage.radii)} neighbourhoods"
-            raise ValueError(f"pyramid.levels[{number}]: {expected}, got {len(level.neighbours)}")
+        num_found, num = len(level.neighbours), len(stage.radii)
+        require(num_found == num, f"pyramid.levels[{number}]", f"{num} neighbourhoods", num_found)
     features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
     row = len(pyramid.levels) - 1 - len(pyramid.interpolation)
     finer, level = (without_masked(pyramid.levels[number]) for number in (row - 1, row))
     directions = frame_directions(model.config.encoder.frame, finer, level)
     if directions is None:
         directions = ray_directions(level.positions)
-    num_elements = model.config.num_descriptors if num_elements is None else num_elements
-    if num_elements < model.config.num_descriptors:
-        expected = f"expected at least the {model.config.num_descriptors} descriptors"
-        raise ValueError(f"num_elements: {expected}, got {num_elements}")
+    least = model.config.num_descriptors
+    num_elements = least if num_elements is None else num_elements
+    require(num_elements >= least, "num_elements", f"at least the {least} descriptors", num_elements)
     elements: Any = pyramid_elements(pyramid, num_elements)
     positions = elements.positions * model.config.scale_m
     return DescriptorCloud(positions, features, elements.mask, directions, elements.normals, elements.planarity)

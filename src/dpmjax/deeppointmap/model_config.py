@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from dpmjax.checks import require_one_of, require_positive
+from dpmjax.checks import require, require_one_of, require_positive
 from dpmjax.deeppointmap.confidence import Calibration, LogisticModel
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.verification import VerificationConfig
@@ -54,9 +54,8 @@ class ModelConfig:
         require_positive("scale_m", self.scale_m)
         for stage in self.trained:
             require_one_of("trained", stage, get_args(Stage))
-        if self.decoder.input_channels != self.encoder.output_channels:
-            expected = f"expected the encoder's output_channels {self.encoder.output_channels}"
-            raise ValueError(f"decoder.input_channels: {expected}, got {self.decoder.input_channels}")
+        inputs, outputs = self.decoder.input_channels, self.encoder.output_channels
+        require(inputs == outputs, "decoder.input_channels", f"the encoder's output_channels {outputs}", inputs)
 
     @property
     def num_descriptors(self) -> int:

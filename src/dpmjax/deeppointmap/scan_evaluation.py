@@ -8,7 +8,7 @@ evaluation.refined.recall
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -122,9 +122,7 @@ class OverlapEvaluation(NamedTuple):
         return brier_score(self.probability, self.is_overlap)
 
 
-def evaluate_overlap(
-    model: Model, drive: LidarSequence, num_pairs: int, *, seed: int = 0, on_scan: Callable[[], object] | None = None
-) -> OverlapEvaluation:
+def evaluate_overlap(model: Model, drive: LidarSequence, num_pairs: int, *, seed: int = 0) -> OverlapEvaluation:
     """Predicts the overlap of pairs nearer than 20 m, and of pairs farther than 40 m.
 
     The near pairs are revisits if the drive comes back to places. Each scan is turned by a random yaw.
@@ -134,7 +132,6 @@ def evaluate_overlap(
         drive: scans with true poses.
         num_pairs: pairs of each of the two kinds; fewer where the drive has fewer.
         seed: seed of the draws.
-        on_scan: called after each scan that is encoded, to show progress.
 
     Returns:
         The probabilities; none where the drive lacks pairs of one kind.
@@ -148,43 +145,48 @@ def evaluate_overlap(
         return OverlapEvaluation(np.zeros(0), np.zeros(0, bool), has_revisits)
     near, far = draw_rows(near, num_pairs, rng), draw_rows(far, num_pairs, rng)
     pairs = np.concatenate([near, far])
-    rows, places = np.unique(pairs, return_inverse=True)
-    clouds = encode_turned(model, drive, rows, rng=rng, on_scan=on_scan)
-    sides = [[clouds[place] for place in side] for side in places.reshape(pairs.shape).T]
-    probability, by_head = np.asarray(overlap_pairs(model, *sides), float), None
-    if model.config.overlap is not None and "overlap" in model.config.trained:
-        head = replace(model, config=replace(model.config, overlap=None))
-        by_head = np.asarray(overlap_pairs(head, *sides), float)
+    sides = encode_pairs(model, [drive], pairs, rng=rng)
+    by_head = None if model.config.overlap is None else head_overlap(model, sides)
+    probability = np.asarray(overlap_pairs(model, *sides), float)
     return OverlapEvaluation(probability, np.arange(len(pairs)) < len(near), has_revisits, by_head)
 
 
-def encode_turned(
-    model: Model,
-    drive: LidarSequence,
-    rows: Int[np.ndarray, " s"],
-    *,
-    rng: np.random.Generator,
-    on_scan: Callable[[], object] | None = None,
-) -> list[DescriptorCloud]:
-    """Encodes scans of a drive, each turned by a random yaw.
+def encode_pairs(
+    model: Model, drives: Sequence[LidarSequence], pairs: Int[np.ndarray, "p 2"], *, rng: np.random.Generator
+) -> tuple[list[DescriptorCloud], ...]:
+    """Encodes the scans of pairs, each turned by a random yaw.
 
     Args:
         model: encoder.
-        drive: scans.
-        rows: numbers of the scans.
+        drives: drives with scans.
+        pairs: scans of each pair, counted through all drives.
         rng: source of the yaws.
-        on_scan: called after each scan, to show progress.
 
     Returns:
-        Descriptors of each scan, as arrays of NumPy.
+        Descriptors of the first scans, and of the second ones, as arrays of NumPy.
     """
-    clouds = []
-    for row in rows:
-        points, _ = turn_scan(drive.read_scan(int(row)), np.eye(4), rng)
-        clouds.append(jax.device_get(encode(model, points)))
-        if on_scan is not None:
-            on_scan()
-    return clouds
+    scans = [(drive, number) for drive in drives for number in range(len(drive))]
+    clouds = {}
+    for row in np.unique(pairs).tolist():
+        drive, number = scans[row]
+        points, _ = turn_scan(drive.read_scan(number), np.eye(4), rng)
+        clouds[row] = jax.device_get(encode(model, points))
+    return tuple([clouds[row] for row in side] for side in pairs.T.tolist())
+
+
+def head_overlap(model: Model, sides: tuple[list[DescriptorCloud], ...]) -> Float[np.ndarray, " p"] | None:
+    """Computes the overlap probabilities of pairs by the head of a model that may have a regression, too.
+
+    Args:
+        model: encoder and decoder.
+        sides: descriptors from `encode_pairs`.
+
+    Returns:
+        The probabilities; None where the head is not trained.
+    """
+    if "overlap" not in model.config.trained:
+        return None
+    return np.asarray(overlap_pairs(replace(model, config=replace(model.config, overlap=None)), *sides), float)
 
 
 def overlap_candidates(drive: LidarSequence) -> tuple[Int[np.ndarray, "k 2"], Int[np.ndarray, "l 2"], bool]:

@@ -89,7 +89,7 @@ def adjoint(T_a_b: Any) -> Any:
     return xp.concatenate([top, xp.concatenate([xp.zeros_like(R), R], axis=-1)], axis=-2)
 
 
-def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
+def motion_matrices(values: Float[AnyArray, "n k"]) -> Float[AnyArray, "n 4 4"]:
     """Makes motions in space from the numbers that a fit adjusts.
 
     Args:
@@ -100,10 +100,11 @@ def motion_matrices(values: Float[Array, "n k"]) -> Float[Array, "n 4 4"]:
     """
     if values.shape[-1] == 6:
         return rigid.exp(values)
-    x, z, cos, sin = values[:, 0], values[:, 1], jnp.cos(values[:, 2]), jnp.sin(values[:, 2])
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    xp = rigid.namespace_of(values)
+    x, z, cos, sin = values[:, 0], values[:, 1], xp.cos(values[:, 2]), xp.sin(values[:, 2])
+    zero, one = xp.zeros_like(x), xp.ones_like(x)
     rows = ((cos, zero, sin, x), (zero, one, zero, zero), (-sin, zero, cos, z), (zero, zero, zero, one))
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def turn_rad(T_a_b: Float[np.ndarray, "4 4"]) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -61,69 +60,32 @@ def attend(
     size = -(-num_queries // num_blocks)
     padded = jnp.pad(queries / num_channels**0.5, ((0, num_blocks * size - num_queries), (0, 0), (0, 0)))
     blocks = jnp.transpose(padded.reshape(num_blocks, size, num_heads, num_channels), (2, 0, 3, 1))
-    mixed = _attend(blocks, jnp.moveaxis(keys, 0, 2), jnp.moveaxis(values, 0, 2), jnp.where(mask, 0, -jnp.inf))
-    return jnp.transpose(mixed, (1, 3, 0, 2)).reshape(-1, num_heads, num_channels)[:num_queries]
-
-
-# Below, queries (h, b, c, m) stand in b blocks, and channels before rows: keys and values are (h, c, n). Sums over keys
-# and the products with 16 channels are faster on a CPU in this order. The bias is 0 or, without a key, -infinity.
-
-
-@jax.custom_jvp
-def _attend(queries: jax.Array, keys: jax.Array, values: jax.Array, bias: jax.Array) -> jax.Array:
-    return _mixed_and_total(queries, keys, values, bias)[0]
-
-
-def _mixed_and_total(
-    queries: jax.Array, keys: jax.Array, values: jax.Array, bias: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Returns the weighted means, and the logarithm of the sum of the exponentials of each query's logits."""
-
-    def of_head(queries: jax.Array, keys: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def of_block(query: jax.Array) -> tuple[jax.Array, jax.Array]:
-            logits = _product("cn,cm->nm", keys, query) + bias[:, None]
-            # Finite even without any key, so that masked keys have a share of exactly zero.
-            largest = jnp.max(logits, axis=0, initial=jnp.finfo(jnp.float32).min)
-            shares = jnp.exp(logits - largest)
-            total = jnp.sum(shares, axis=0)
-            total = jnp.where(total > 0, total, 1)
-            # Divided after the product: (c, m) numbers instead of (n, m).
-            return _product("cn,nm->cm", values, shares.astype(values.dtype)) / total, largest + jnp.log(total)
-
-        return _one_after_the_other(of_block, queries)
-
+    # Channels stand before rows, because sums over keys and products with few channels are faster on a CPU then.
+    arguments = blocks, jnp.moveaxis(keys, 0, 2), jnp.moveaxis(values, 0, 2)
+    of_head = partial(_attend_head, bias=jnp.where(mask, 0, -jnp.inf))
     # All heads at once where their logits fit the cache of a CPU.
-    num_logits = queries.shape[0] * queries.shape[1] * queries.shape[3] * keys.shape[2]
+    num_logits = num_queries * num_heads * len(keys)
     over_heads = partial(_one_after_the_other, of_head) if num_logits > MAX_LIVE_LOGITS else jax.vmap(of_head)
-    return over_heads(queries, keys, values)
+    return jnp.transpose(over_heads(*arguments), (1, 3, 0, 2)).reshape(-1, num_heads, num_channels)[:num_queries]
 
 
-@_attend.defjvp
-def _attend_jvp(primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-    queries, keys, values, bias = primals
-    mixed, log_total = _mixed_and_total(*primals)
-    dtype = queries.dtype
+def _attend_head(queries: jax.Array, keys: jax.Array, values: jax.Array, *, bias: jax.Array) -> jax.Array:
+    """Applies one head to queries (b, c, m) in b blocks and to keys (c, n); the bias is 0 or, without a key, -inf."""
 
-    def of_head(keys: jax.Array, values: jax.Array, d_keys: jax.Array, d_values: jax.Array, *blocks: jax.Array) -> Any:
-        @jax.checkpoint
-        def of_block(keys: jax.Array, values: jax.Array, d_keys: jax.Array, d_values: jax.Array, block: Any) -> Any:
-            query, log_total, mixed, d_query = block
-            shares = jnp.exp(_product("cn,cm->nm", keys, query) + bias[:, None] - log_total)
-            # In the type of the products, so that the backward pass multiplies in it, too.
-            d_logits = jnp.einsum("cn,cm->nm", keys, d_query) + jnp.einsum("cn,cm->nm", d_keys, query)
-            weighted = shares * d_logits.astype(jnp.float32)
-            from_values = jnp.einsum("cn,nm->cm", d_values, shares.astype(dtype))
-            from_logits = jnp.einsum("cn,nm->cm", values, weighted.astype(dtype))
-            return (from_logits + from_values).astype(jnp.float32) - mixed * jnp.sum(weighted, axis=0)
+    @jax.checkpoint
+    def of_block(query: jax.Array) -> jax.Array:
+        logits = _product("cn,cm->nm", keys, query) + bias[:, None]
+        # Finite even without any key, so that masked keys have a share of exactly zero.
+        largest = jnp.max(lax.stop_gradient(logits), axis=0, initial=jnp.finfo(jnp.float32).min)
+        shares = jnp.exp(logits - largest)
+        total = jnp.sum(shares, axis=0)
+        # Divided after the product: (c, m) numbers instead of (n, m).
+        return _product("cn,nm->cm", values, shares.astype(values.dtype)) / jnp.where(total > 0, total, 1)
 
-        return _one_after_the_other(lambda *block: of_block(keys, values, d_keys, d_values, block), *blocks)
-
-    d_queries, d_keys, d_values, _ = tangents
-    tangent = _one_after_the_other(of_head, keys, values, d_keys, d_values, queries, log_total, mixed, d_queries)
-    return mixed, tangent
+    return _one_after_the_other(of_block, queries)
 
 
-def _one_after_the_other(function: Callable[..., Any], *arrays: jax.Array) -> Any:
+def _one_after_the_other(function: Callable[..., jax.Array], *arrays: jax.Array) -> jax.Array:
     # Maps over the first axis. Logits that do not fit the cache of a CPU take twice as long there.
     return lax.platform_dependent(
         *arrays, cpu=lambda *arrays: lax.map(lambda one: function(*one), arrays), default=jax.vmap(function)

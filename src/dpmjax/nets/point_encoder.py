@@ -175,10 +175,6 @@ def without_masked(level: PyramidLevel) -> PyramidLevel:
     return replace(level, positions=jnp.where(level.mask[:, None], level.positions, 0))
 
 
-def _in_float32(level: PyramidLevel) -> PyramidLevel:
-    return replace(level, positions=jnp.asarray(level.positions, jnp.float32))
-
-
 def frame_directions(frame: Frame, finer: PyramidLevel, level: PyramidLevel) -> Float[Array, "m 2"] | None:
     """Computes the directions of the frames of the points of a level.
 
@@ -251,7 +247,8 @@ class PointEncoder(nn.Module):
             float32 features, one row for each point of that level; zero where its mask is False.
         """
         config = self.config
-        levels = [_in_float32(without_masked(level)) for level in pyramid.levels]
+        levels = [without_masked(level) for level in pyramid.levels]
+        levels = [replace(level, positions=jnp.asarray(level.positions, jnp.float32)) for level in levels]
         seen = jnp.asarray(levels[0].positions)
         if config.frame == "local":
             seen = seen * jnp.array([0, 0, 1])  # heights

@@ -18,10 +18,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from dpmjax.checks import require_count, require_positive, runs_on_host
+from dpmjax.checks import require, require_count, require_positive, runs_on_host
 from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
-from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph
+from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph, label_parts
 from dpmjax.pose_graph.normal_equations import BlockPattern, Linearisation, linearise, solve_symmetric
 from dpmjax.types import with_short_repr
 
@@ -32,8 +32,13 @@ _FIRST_WIDENING, _NARROWING = 1000.0, 1.6
 # Levenberg-Marquardt damping at the start, as a share of the diagonal.
 _FIRST_DAMPING = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
-# Below this share of the stiffest diagonal entry, damping goes by the stiffest entry.
-_LEAST_STIFFNESS = 1e-6
+# Diagonal entries that damping goes by, in medians of all. By a larger one, an edge a billion times stiffer than the
+# others would hold both of its nodes; by a smaller one, nodes that nothing holds would leave with the rounding.
+_LEAST_STIFFNESS, _MOST_STIFFNESS = 1e-3, 1e3
+
+
+# From a higher cost, each step must arrive at less than this share of it; else the optimisation returns.
+_DETOUR = 0.1
 
 
 @dataclass(frozen=True)
@@ -89,12 +94,26 @@ class OptimizedPoseGraph(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The optimisation between two solves; `widening` is the width of the kernel in final widths."""
+    """The optimisation between two solves.
+
+    Attributes:
+        at: the poses from which the next step begins.
+        damping: the damping of the next step.
+        widening: the width of the kernel in final widths.
+        is_converged: True at a minimum.
+        before: the poses of lower cost from which steps have led here; None where `at` has the lowest cost.
+    """
 
     at: Linearisation
     damping: float
     widening: float
     is_converged: bool = False
+    before: Linearisation | None = None
+
+    @property
+    def best(self) -> Linearisation:
+        """The poses of the lowest cost."""
+        return self.before or self.at
 
 
 @runs_on_host("call pose_graph.solve_dense there")
@@ -119,16 +138,14 @@ def optimize_pose_graph(
         ValueError: the cost of the given poses is not a finite number, `trust` is not positive, or an array is traced.
     """
     config = config or PoseGraphConfig()
-    if not (np.asarray(trust) > 0).all():
-        raise ValueError("trust: expected numbers above 0, got others")
+    require((np.asarray(trust) > 0).all(), "trust", "numbers above 0", "others")
     width = np.full(len(graph.edges.source), config.outlier_chi2 or np.inf) * trust
     nodes = np.stack([graph.edges.target, graph.edges.source], axis=1)
     pattern = BlockPattern.create(nodes, graph.held_nodes())
     still = np.zeros((len(graph.poses), graph.tangent_size))
     at = linearise(graph.poses, still, graph.edges)
     chi2_initial = float(at.chi2.sum())
-    if not np.isfinite(chi2_initial):
-        raise ValueError("graph: expected residuals of finite length, got NaN or infinity")
+    require(np.isfinite(chi2_initial), "graph", "residuals of finite length", "NaN or infinity")
     if config.is_chordal_start and len(graph.edges.source):
         chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
         at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
@@ -137,8 +154,8 @@ def optimize_pose_graph(
     while iterations < config.max_iterations and not state.is_converged and state.damping < _MOST_DAMPING:
         state = _iterate(state, graph, pattern, width, config)
         iterations += 1
-    weights, moved = _weights(state.at.chi2, width), replace(graph, poses=state.at.poses)
-    chi2 = float((weights * state.at.chi2).sum())
+    weights, moved = _weights(state.best.chi2, width), replace(graph, poses=state.best.poses)
+    chi2 = float((weights * state.best.chi2).sum())
     free = find_free_nodes(moved)
     if free:
         LOGGER.warning("%s; they stay near their given poses", describe_free_nodes(free))
@@ -146,27 +163,35 @@ def optimize_pose_graph(
 
 
 def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig) -> _State:
-    """Returns the state after one damped solve, whose step is taken where it lowers the cost."""
+    """Returns the state after one damped solve, whose step is taken where it lowers the cost.
+
+    From a step that raises the cost, further ones are tried as long as they lower it fast, and all are taken where the
+    last one arrives below. Where one edge is far stiffer than the others, the first step follows it along a tangent,
+    and the others return to it.
+    """
     at, is_narrow = state.at, state.widening <= 1.0
     width = width * state.widening
     weights = _weights(at.chi2, width)
     matrix = pattern.matrix(at.blocks * weights[:, None, None, None, None])
     right = -pattern.vector(at.gradient * weights[:, None, None])
     diagonal = matrix.diagonal()
-    extra = state.damping * np.maximum(diagonal, max(_LEAST_STIFFNESS * diagonal.max(initial=0.0), 1e-300))
+    typical = max(np.median(diagonal[diagonal > 0]), 1e-300) if diagonal.any() else 1e-300
+    extra = state.damping * np.clip(diagonal, _LEAST_STIFFNESS * typical, _MOST_STIFFNESS * typical)
     step = solve_symmetric(matrix, right, extra)
-    cost = _cost(at.chi2, width)
+    cost = _cost(state.best.chi2, width)
     small = config.tolerance * cost + 1e-12
     widening = max(1.0, state.widening / _NARROWING)
     trial, decrease = at, -np.inf
     if np.isfinite(step).all():
-        if is_narrow and step @ right + step @ (extra * step) <= small:
+        if is_narrow and state.before is None and step @ right + step @ (extra * step) <= small:
             return state._replace(is_converged=True)
         trial = linearise(at.poses, pattern.to_nodes(step, graph.tangent_size), graph.edges)
         decrease = cost - _cost(trial.chi2, width)
-    if not decrease >= 0:
-        return state._replace(damping=10.0 * state.damping, widening=widening)
-    return _State(trial, max(0.1 * state.damping, _LEAST_DAMPING), widening, is_narrow and decrease <= small)
+    if decrease >= 0:
+        return _State(trial, max(0.1 * state.damping, _LEAST_DAMPING), widening, is_narrow and decrease <= small)
+    if np.isfinite(decrease) and (state.before is None or _cost(trial.chi2, width) < _DETOUR * _cost(at.chi2, width)):
+        return state._replace(at=trial, before=state.best, widening=widening)
+    return _State(state.best, 10.0 * state.damping, widening)
 
 
 def _weights(chi2: Floats, width: Floats) -> Floats:
@@ -191,25 +216,20 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
     """
     is_planar = edges.measurements.ndim == 2
     T_target_source = se2.to_matrix(edges.measurements) if is_planar else edges.measurements
-    T_source_target = rigid.inverse(T_target_source)
-    size = T_target_source.shape[-1]
-    T = np.tile(np.eye(size), (num_nodes, 1, 1))
-    # Of several edges between two nodes, the first one counts; a number above 0 is an edge in its direction.
-    first: dict[tuple[int, int], Floats] = {}
-    for row, (source, target) in enumerate(zip(edges.source.tolist(), edges.target.tolist(), strict=True)):
-        first.setdefault((target, source), T_target_source[row])
-        first.setdefault((source, target), T_source_target[row])
-    ends = np.array(list(first), np.int64).reshape(-1, 2)
-    joined = sp.csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (num_nodes, num_nodes))
-    is_placed = np.zeros(num_nodes, bool)
-    for root in range(num_nodes):
-        if is_placed[root]:
-            continue
-        order, before = sp.csgraph.breadth_first_order(joined, root, directed=True)
-        is_placed[order] = True
-        for node in order[1:].tolist():
-            parent = int(before[node])
-            T[node] = T[parent] @ first[parent, node]
+    # Each edge in both directions, one after the other; of several edges between two nodes, the first one counts.
+    ends = np.stack([edges.target, edges.source, edges.source, edges.target], axis=1).reshape(-1, 2)
+    motions = np.stack([T_target_source, rigid.inverse(T_target_source)], axis=1).reshape(
+        -1, *T_target_source.shape[1:]
+    )
+    ends, first = np.unique(ends, axis=0, return_index=True)
+    numbers = sp.csr_matrix((first + 1, ends.T), (num_nodes, num_nodes))
+    T = np.tile(np.eye(motions.shape[-1]), (num_nodes, 1, 1))
+    for root in np.unique(label_parts(num_nodes, edges.source, edges.target), return_index=True)[1]:
+        order, before = sp.csgraph.breadth_first_order(numbers, root, directed=True)
+        nodes, parents = order[1:], before[order[1:]]
+        rows = np.ravel(numbers[parents, nodes]).astype(np.int64) - 1
+        for node, parent, row in zip(nodes, parents, rows, strict=True):
+            T[node] = T[parent] @ motions[row]
     return np.asarray(se2.from_matrix(T)) if is_planar else T
 
 

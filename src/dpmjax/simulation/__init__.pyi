@@ -10,7 +10,6 @@ from .motion import DriveConfig as DriveConfig
 from .motion import TimedPoses as TimedPoses
 from .motion import WalkConfig as WalkConfig
 from .motion import drive as drive
-from .motion import route_poses as route_poses
 from .motion import walk as walk
 from .scenes import TRAINING_MIXTURE as TRAINING_MIXTURE
 from .scenes import Scene as Scene

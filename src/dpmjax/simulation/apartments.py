@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dpmjax.checks import require_fields, runs_on_host
-from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray, homogeneous
+from dpmjax.checks import require, require_fields, runs_on_host
+from dpmjax.geometry.se3 import motion_matrices
+from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray
 from dpmjax.types import AnyArray
 
 _CAMERA_HEIGHT_M, _ROOM_HEIGHT_M, _WALL_M, _DOOR_M = 1.1, 2.6, 0.12, 0.95
@@ -89,8 +90,7 @@ def make_apartment(seed: int) -> Apartment:
     Raises:
         ValueError: a negative seed.
     """
-    if seed < 0:
-        raise ValueError(f"seed: expected zero or more, got {seed}")
+    require(seed >= 0, "seed", "zero or more", seed)
     rng = np.random.default_rng([7, seed])
     size_x, size_z = rng.uniform(5.5, 7.5), rng.uniform(5.0, 6.5)
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
@@ -259,12 +259,11 @@ def simulate_depth_sequence(
     Raises:
         ValueError: fewer than two views, an apartment without free places, or one without a walk of the spread.
     """
-    if num_views < 2:
-        raise ValueError(f"num_views: expected at least 2, got {num_views}")
+    require(num_views >= 2, "num_views", "at least 2", num_views)
     config = config or DepthWalkConfig()
     home = apartment if isinstance(apartment, Apartment) else make_apartment(apartment)
     rng = np.random.default_rng([seed, 11])
-    T_world_camera = _planar_to_matrices(_wide_walk(home, num_views, config, rng))
+    T_world_camera = np.asarray(motion_matrices(_wide_walk(home, num_views, config, rng)))
     rows, columns = ACTIVE_VISION.sample_pixels(config.height, config.width)
     rays = ACTIVE_VISION.rays(columns, rows)
     # One capacity for all apartments, so that the caster compiles once.
@@ -322,11 +321,3 @@ def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.rand
     # Noise is added to each pose, unless the new position is not free.
     moved = drawn + np.array([_JITTER_M, _JITTER_M, np.deg2rad(_JITTER_DEG)]) * rng.standard_normal(drawn.shape)
     return np.where(home.is_free(moved[:, :2], _FREE_CLEARANCE_M)[:, None], moved, drawn)
-
-
-def _planar_to_matrices(poses: FloatArray) -> FloatArray:
-    """Converts x, z and the angle about y to T_world_camera (n, 4, 4)."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    T = homogeneous(np.eye(3), np.insert(poses[:, :2], 1, 0.0, axis=1))
-    T[:, 0, 0], T[:, 0, 2], T[:, 2, 0], T[:, 2, 2] = cos, sin, -sin, cos
-    return T

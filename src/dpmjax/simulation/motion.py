@@ -12,7 +12,7 @@ from dpmjax.checks import require_positive_fields
 from dpmjax.sequences import FloatArray, homogeneous
 from dpmjax.simulation.building import Building
 from dpmjax.simulation.town.make import Town
-from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, make_streets, on_path, smooth, tangents
+from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, on_path, smooth, tangents
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
@@ -69,29 +69,6 @@ class TimedPoses(NamedTuple):
     times: FloatArray
 
 
-def route_poses(
-    rng: np.random.Generator, kind: str, length_m: float, *, block_m: float = 100.0, step_m: float = 1.0
-) -> FloatArray:
-    """Draws a route through streets, and returns poses on its lane at equal steps.
-
-    Args:
-        rng: source of all choices.
-        kind: kind of the route, see `make_streets`.
-        length_m: wanted length of the route; met within a block or two.
-        block_m: side of a block.
-        step_m: distance between two poses.
-
-    Returns:
-        (n, 4, 4) poses on the ground, x forward, y left, z up.
-    """
-    lane = lane_of(make_streets(rng, kind, length_m, block_m), is_reversed=False)
-    way = np.arange(0.0, arc_lengths(lane)[-1], step_m)
-    cos, sin = _directions(lane, way).T
-    T = homogeneous(np.eye(3), np.pad(at_way(lane, way), ((0, 0), (0, 1))))
-    T[:, :2, :2] = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), -1, 0)
-    return T
-
-
 def turn_motions(way: TimedPoses) -> FloatArray:
     """Computes the motion of the lidar during each of its turns, at the velocity to the next pose.
 
@@ -132,7 +109,10 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     way = way % whole if is_closed else way
     along = _directions(lane, way)
     left = np.column_stack([-along[:, 1], along[:, 0]])
-    places = at_way(lane, way) + (_SWAY_M * _slow_noise(rng, way))[:, None] * left
+    # Of unit variance, and changing over tens of metres.
+    phases, waves = rng.uniform(0, 2 * np.pi, 3), 2 * np.pi / np.array([31.0, 53.0, 97.0])
+    sway = np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
+    places = at_way(lane, way) + (_SWAY_M * sway)[:, None] * left
     return TimedPoses(_poses(town, places, along, left, config, rng), times)
 
 
@@ -157,13 +137,6 @@ def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
 def _directions(lane: FloatArray, way: FloatArray) -> FloatArray:
     found = on_path(lane, way)[:, 2:]
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
-
-
-def _slow_noise(rng: np.random.Generator, way: FloatArray) -> FloatArray:
-    """Draws noise of unit variance that changes over tens of metres."""
-    phases = rng.uniform(0, 2 * np.pi, 3)
-    waves = 2 * np.pi / np.array([31.0, 53.0, 97.0])
-    return np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
 
 
 def _poses(

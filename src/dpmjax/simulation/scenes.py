@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require_one_of, require_positive_fields, runs_on_host
+from dpmjax.checks import require, require_one_of, require_positive_fields, runs_on_host
 from dpmjax.sequences import SimulatedDrive
 from dpmjax.simulation.building import KINDS as INDOOR_KINDS
 from dpmjax.simulation.building import Building, BuildingConfig, make_building
@@ -59,14 +59,13 @@ class SceneMixture:
     def __post_init__(self) -> None:
         for name, entries in (("kinds", self.kinds), ("sensors", self.sensors)):
             weights = [weight for _, weight in entries]
-            if not weights or min(weights) < 0 or sum(weights) <= 0:
-                raise ValueError(f"{name} must have weights from 0 up, not all 0, got {weights}")
+            is_right = weights and min(weights) >= 0 and sum(weights) > 0
+            require(is_right, name, "weights from 0 up, not all 0", weights)
         for kind, _ in self.kinds:
             require_one_of("kinds", kind, (*OUTDOOR_KINDS, *INDOOR_KINDS))
         require_positive_fields(self, "length_m", "spacing_m")
         low, high = self.indoor_scale
-        if not 0 < low <= high:
-            raise ValueError(f"indoor_scale must be positive and ascending, got {low}, {high}")
+        require(0 < low <= high, "indoor_scale", "two positive, ascending numbers", f"{low}, {high}")
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,8 @@ class Scene:
     other_sensor: LidarSensor | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.place, BuildingConfig) != isinstance(self.motion, WalkConfig):
-            raise ValueError("motion must be a WalkConfig in a building and a DriveConfig in a town")
+        is_right = isinstance(self.place, BuildingConfig) == isinstance(self.motion, WalkConfig)
+        require(is_right, "motion", "a WalkConfig in a building and a DriveConfig in a town", self.motion)
 
 
 # Mixture for training: a third of the scenes are indoors, and some drives alternate between two lidars.
@@ -127,8 +126,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
     Raises:
         ValueError: a negative seed.
     """
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, got {seed}")
+    require(seed >= 0, "seed", "zero or more", seed)
     rng = np.random.default_rng([_SCENE_STREAM, seed])
     kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
     # Also drawn outdoors, where the scale is 1, so that later draws of a seed are the same.

@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import runs_on_host
+from dpmjax.checks import require, require_count, runs_on_host
 from dpmjax.geometry import se2
 from dpmjax.sequences import BoolArray, FloatArray, SimulatedScans
 from dpmjax.simulation.world2d import World, beam_angles, cast_scans, largest_region, make_world
@@ -41,8 +41,7 @@ def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generato
     Raises:
         ValueError: fewer than one pose, or a world too narrow to move in.
     """
-    if num_poses < 1:
-        raise ValueError(f"num_poses must be at least 1, got {num_poses}")
+    require_count("num_poses", num_poses)
     clearance = _clearance(world.is_obstacle)
     route = _plan_route(clearance, 1.15 * num_poses * _MEAN_STEP_PX + 200.0, rng)
     positions = _walk(route, clearance, num_poses, rng)
@@ -258,8 +257,7 @@ def scan_world(
     Raises:
         ValueError: a pose lies in an obstacle or outside of the image; or there is noise but no `rng`.
     """
-    if range_noise_px > 0 and rng is None:
-        raise ValueError("range_noise_px needs an rng")
+    require(range_noise_px == 0 or rng is not None, "rng", "a generator for range_noise_px", rng)
     ranges = cast_scans(is_obstacle, poses, num_beams=num_beams)
     mask = np.ones(ranges.shape, bool) if max_range is None else ranges <= max_range
     return np.where(mask[..., None], _measured_points(ranges, range_noise_px, rng), np.float32(0.0)), mask
@@ -302,8 +300,7 @@ def simulate_sequence(
     Raises:
         ValueError: an argument out of its range, or a world too narrow to move in.
     """
-    if num_scans < 2:
-        raise ValueError(f"num_scans must be at least 2, got {num_scans}")
+    require(num_scans >= 2, "num_scans", "at least 2", num_scans)
     scene = world if isinstance(world, World) else make_world(world)
     # The name is part of the seed, so that walks through two worlds are independent.
     streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(4))

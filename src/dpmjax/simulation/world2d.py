@@ -22,6 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dpmjax.checks import require, require_count
 from dpmjax.sequences import BoolArray, FloatArray
 
 SIZE_PX = 1024
@@ -90,8 +91,7 @@ def make_world(world: int | str) -> World:
     Raises:
         ValueError: a negative index, or a name that is no kind with a number.
     """
-    if isinstance(world, int) and world < 0:
-        raise ValueError(f"index must not be negative, got {world}")
+    require(isinstance(world, str) or world >= 0, "world", "zero or more", world)
     name = f"{list(_KINDS)[world % 3]}-{world}" if isinstance(world, int) else world
     found = re.fullmatch(rf"({'|'.join(_KINDS)})(?:-(\d+))?", name)
     if found is None:
@@ -262,8 +262,7 @@ def beam_angles(num_beams: int) -> FloatArray:
     Raises:
         ValueError: fewer than one beam.
     """
-    if num_beams < 1:
-        raise ValueError(f"num_beams must be at least 1, got {num_beams}")
+    require_count("num_beams", num_beams)
     return np.arange(num_beams, dtype=np.float64) * (2.0 * np.pi / num_beams)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import SampleMaker, ScanStore, init_model, prepare_drive, stored_bytes, training_preset
-from dpmjax.deeppointmap.training.preparation import varied_record
+from dpmjax.deeppointmap.training.preparation import scan_records
 from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
 from dpmjax.io import InputError
@@ -98,11 +98,11 @@ def test_shuffled_points_are_another_choice_of_each_voxel_and_drops_come_before_
     points = rng.uniform(-20, 20, (4000, 3)).astype(np.float32)
     still = replace(toy.TRAINING.augment, max_drop_ratio=0.5, sector_probability=0.0, box_probability=0.0)
     config = replace(FRESH, augment=still)
-    records = [varied_record(points, config, (0, number)) for number in range(5)]
+    records = [scan_records(points, replace(config, num_variants=1), (0, number))[0] for number in range(5)]
     assert [int(record["num_points"]) for record in records] == [config.model.preprocess.capacity] * 5
     first, second = (record["points"][: record["num_points"]] * record["unit"] for record in records[:2])
     assert not np.array_equal(np.sort(first, axis=0), np.sort(second, axis=0))
-    again = varied_record(points, config, (0, 0))
+    (again,) = scan_records(points, replace(config, num_variants=1), (0, 0))
     np.testing.assert_array_equal(again, records[0])
 
 

@@ -32,6 +32,9 @@ PAIRS_AT_ONCE = 10
 MAP_RADIUS_M = 10.0
 
 
+_merge_all = jax.jit(jax.vmap(merge_clouds))
+
+
 class PairKind(NamedTuple):
     """Distances and sizes of the pairs of an evaluation.
 
@@ -128,28 +131,27 @@ def draw_evaluation_pairs(
         ValueError: if a drive has no poses.
     """
     scans, poses = list[PointCloud](), list[Pose]()
-    found: dict[PairKind, list[Pairs]] = {kind: [] for kind in kinds}
+    found: dict[PairKind, list[tuple[np.ndarray, np.ndarray]]] = {kind: [] for kind in kinds}
     for drive in drives:
         rng = np.random.default_rng([PAIR_STREAM, seed])
         drawn = [_draw(drive, num_pairs, kind, rng) for kind in kinds]
-        if not any(len(some.sources) for some in drawn):
+        if not any(len(sources) for sources, _ in drawn):
             continue
-        for kind, sources, targets in drawn:
-            found[kind].append(Pairs(kind, sources + len(scans), targets + len(scans)))
+        for kind, (sources, targets) in zip(kinds, drawn, strict=True):
+            found[kind].append((sources + len(scans), targets + len(scans)))
         for row, T in enumerate(true_poses(drive)):
             points, T_turned = turn_scan(read_or_note(drive, row, {}), T, rng)
             scans.append(thin_scan(points, config))
             poses.append(T_turned)
-    joined = [
-        Pairs(kind, *map(np.concatenate, list(zip(*some, strict=True))[1:])) for kind, some in found.items() if some
-    ]
+    joined = (Pairs(kind, *map(np.concatenate, zip(*some, strict=True))) for kind, some in found.items() if some)
     pairs = tuple(some for some in joined if len(some.sources))
-    return EvaluationPairs(
-        scans, [pyramid_of_cloud(scan, config) for scan in scans], np.reshape(poses, (-1, 4, 4)), pairs
-    )
+    pyramids = [pyramid_of_cloud(scan, config) for scan in scans]
+    return EvaluationPairs(scans, pyramids, np.reshape(poses, (-1, 4, 4)), pairs)
 
 
-def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator) -> Pairs:
+def _draw(
+    drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, "p s"], Int[np.ndarray, "p s"]]:
     distances = scan_distances(drive)
     pairs = draw_rows_apart(distances, kind.min_distance_m, kind.max_distance_m, num_pairs, rng)
 
@@ -160,7 +162,7 @@ def _draw(drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.G
         others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans - 1) for around in near]
         return np.concatenate([rows[:, None], np.reshape(others, (len(rows), kind.num_scans - 1))], axis=1).astype(int)
 
-    return Pairs(kind, maps(pairs[:, 0]), maps(pairs[:, 1]))
+    return maps(pairs[:, 0]), maps(pairs[:, 1])
 
 
 def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
@@ -178,7 +180,7 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
     for some in pairs.pairs:
         sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
         motions = pairs.true_motions(some)
-        match, found = _in_chunks(functools.partial(_register_all, model), *sides, motions.astype(np.float32))
+        match, found = in_chunks(functools.partial(_register_all, model), *sides, motions.astype(np.float32))
         matches.append(match)
         offsets.append(found)
         recalls.append(registration_recall(match.T_target_source, motions))
@@ -186,13 +188,22 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
     return Evaluation(tuple(recalls), tuple(matches), r2, clouds)
 
 
-def _in_chunks(function: Callable[..., Any], *trees: Any) -> Any:
-    """Applies a function to so many entries at a time, so that no number of scans or pairs compiles it again."""
+def in_chunks(function: Callable[..., Any], *trees: Any, at_once: int = PAIRS_AT_ONCE) -> Any:
+    """Applies a function to parts of equal size, so that no number of scans or pairs compiles it again.
+
+    Args:
+        function: function of trees of arrays.
+        *trees: its arguments, whose leaves have one length.
+        at_once: number of entries of a part; the last one is repeated.
+
+    Returns:
+        The results, joined, as arrays of NumPy.
+    """
     trees = jax.tree.map(np.asarray, trees)
     num = len(jax.tree.leaves(trees)[0])
     parts = []
-    for start in range(0, num, PAIRS_AT_ONCE):
-        rows = np.minimum(np.arange(start, start + PAIRS_AT_ONCE), num - 1)
+    for start in range(0, num, at_once):
+        rows = np.minimum(np.arange(start, start + at_once), num - 1)
         parts.append(jax.device_get(function(*jax.tree.map(operator.itemgetter(rows), trees))))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
 
@@ -212,12 +223,7 @@ def _register_all(
 def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Poses) -> DescriptorCloud:
     T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
     of_maps = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], clouds)
-    merged = _in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
+    merged = in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
     unions = zip(merged.positions, merged.mask, strict=True)
     masks = [thinned_mask(positions, mask, clouds.mask.shape[1]) for positions, mask in unions]
     return replace(merged, mask=np.stack(masks))
-
-
-@jax.jit
-def _merge_all(clouds: DescriptorCloud, T_map_scan: Array) -> DescriptorCloud:
-    return jax.vmap(merge_clouds)(clouds, T_map_scan)

@@ -14,8 +14,8 @@ import numpy as np
 import small_gicp
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.training.sampling import Group, PlacedScans
-from dpmjax.geometry import rigid
+from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, number_scans
+from dpmjax.geometry import rigid, se3
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 
 # Values of DeepPointMap's published program: reach of the correspondences, voxels, iterations, and least range.
@@ -34,7 +34,7 @@ Mapper = Callable[..., Iterable[Any]]
 def refine_labels(
     placed: PlacedScans,
     points: Sequence[Float[np.ndarray, "_n 3"]],
-    groups: Sequence[Group | None],
+    groups: Sequence[Group],
     *,
     mapper: Mapper = map,
 ) -> PlacedScans:
@@ -49,11 +49,7 @@ def refine_labels(
     Returns:
         The corrected places; a scan keeps its given place where ICP fails.
     """
-    ends = np.cumsum([0 if group is None else len(group.rows) for group in groups])
-    frames = np.arange(ends[-1])
-    for group, end in zip(groups, ends, strict=True):
-        if group is not None:
-            frames[end - len(group.rows) : end] = end - len(group.target)
+    frames = np.concatenate([np.full(len(group.rows), group.target[0]) for group in number_scans(groups)])
     T_world_scan = placed.T_world_scan
     T_frame_scan = rigid.inverse(T_world_scan[frames]) @ T_world_scan
     refined = mapper(aligned_motion, [points[row] for row in frames], points, T_frame_scan)
@@ -90,9 +86,7 @@ def aligned_motion(
         max_iterations=NUM_ITERATIONS,
     )
     refined = np.asarray(found.T_target_source)
-    change = rigid.inverse(T_target_source) @ refined
-    turn = math.acos(float(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)))
-    is_small = np.linalg.norm(change[:3, 3]) <= MAX_SHIFT_M and turn <= MAX_TURN_RAD
+    is_small = se3.are_near(T_target_source, refined, MAX_SHIFT_M, MAX_TURN_RAD)
     is_good = found.converged and is_small and found.num_inliers >= MIN_INLIER_SHARE * len(far[1])
     return refined if is_good else T_target_source
 

@@ -116,10 +116,10 @@ class TrainingHooks:
 
     evaluate: Callable[[Model], float] | None = None
     evaluate_every: int = 100
-    on_report: Callable[[StepRecord, TrainingProgress], object] | None = None
+    on_report: Callable[[StepRecord, TrainingProgress], object] = lambda _record, _progress: None
     # int() is 0: by default nothing ends training.
     stop: Callable[[], int] = int
-    steps_left: Callable[[int], int] | None = None
+    steps_left: Callable[[int], int] = lambda _step: 0
 
     def __post_init__(self) -> None:
         require_fields(self, "evaluate_every", low=1)
@@ -163,9 +163,8 @@ def begin_training(config: TrainingConfig, *, seed: int = 0, start: Model | None
     if start is not None:
         shapes = [jax.tree.map(np.shape, params) for params in (start.params, state.params)]
         if shapes[0] != shapes[1]:
-            raise ValueError(
-                "start: expected parameters of config.model, got others; replace(config, model=start.config)"
-            )
+            found = "others; replace(config, model=start.config)"
+            raise ValueError(f"start: expected parameters of config.model, got {found}")
         state = replace(state, params=start.params)
     return TrainingProgress(state, state.params, np.asarray(-1, np.float32), np.asarray(0, np.int32))
 
@@ -280,8 +279,7 @@ def _run_steps(
         batches = maker.batches(number, max(end, config.num_steps))
         batch = next(batches) if number < end else None
         while batch is not None:
-            wanted = int(hooks.stop()), 0 if hooks.steps_left is None else hooks.steps_left(number)
-            stopped_by, left = map(int, from_first(wanted))
+            stopped_by, left = map(int, from_first((int(hooks.stop()), hooks.steps_left(number))))
             if stopped_by:
                 break
             if left > 0 and (new_end := min(number + left, max(end, config.num_steps))) != end:
@@ -300,7 +298,7 @@ def _run_steps(
             if not math.isfinite(report.loss):
                 raise TrainingLostError(f"the loss of step {number} is {report.loss}; resume from an older checkpoint")
             progress, score = _evaluate_when_due(progress, config, hooks)
-            if hooks.on_report is not None and is_first():
+            if is_first():
                 hooks.on_report(StepRecord(number, stage, report, score, speed), progress)
     return progress, stopped_by, speed
 

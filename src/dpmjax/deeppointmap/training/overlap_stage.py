@@ -8,7 +8,7 @@ parameters count. A step depends on the seed and its number alone, so that a res
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from dpmjax.deeppointmap.model import Model, correlate, decode
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M
 from dpmjax.deeppointmap.scan_evaluation import NO_OVERLAP_M, REVISIT_PATH_M
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
+from dpmjax.deeppointmap.training.evaluation import in_chunks
 from dpmjax.deeppointmap.training.sampling import NUM_ATTEMPTS, SampleScans, ScanTable
 from dpmjax.deeppointmap.training.scan_store import ScanStore
 from dpmjax.deeppointmap.training.step import WEIGHT_DECAY, encode_sample
@@ -38,6 +39,8 @@ MAX_POOL_SCANS = 1024
 HARD_SHARE = 0.25
 # Number of scans, and of pairs, in one call of a compiled program.
 SCANS_AT_ONCE, PAIRS_AT_ONCE = 16, 8
+# AdamW without its learning rate and its weight decay, which `_step` applies.
+OPTIMIZER = optax.scale_by_adam()
 
 
 @flax.struct.dataclass
@@ -82,7 +85,7 @@ class OverlapHooks:
         stop: called before each step; any number but 0 ends the stage.
     """
 
-    on_report: Callable[[OverlapRecord, OverlapState], object] | None = None
+    on_report: Callable[[OverlapRecord, OverlapState], object] = lambda _record, _state: None
     # int() is 0: by default nothing ends the stage.
     stop: Callable[[], int] = int
 
@@ -99,10 +102,6 @@ class PairFeatures(NamedTuple):
     features: Float[AnyArray, "p 2 n c"]
     mask: Bool[AnyArray, "p 2 n"]
     is_overlap: Bool[AnyArray, " p"]
-
-    def at(self, rows: Int[np.ndarray, " k"]) -> PairFeatures:
-        """Returns some of the pairs."""
-        return PairFeatures(*(column[rows] for column in self))
 
 
 NO_HOOKS = OverlapHooks()
@@ -150,8 +149,7 @@ def train_overlap(
         batch = PairFeatures(pairs.features[:, sides], pairs.mask[:, sides], pairs.is_overlap)
         rate = _learning_rate(config, step, num_steps)
         state, loss, accuracy = _step(state, frozen, batch, rate, settings.rate_share * WEIGHT_DECAY)
-        if hooks.on_report is not None:
-            hooks.on_report(OverlapRecord(step + 1, num_steps, float(loss), float(accuracy), rate), state)
+        hooks.on_report(OverlapRecord(step + 1, num_steps, float(loss), float(accuracy), rate), state)
     is_trained = int(state.step) >= num_steps
     return with_head(model, state.head, is_trained=is_trained), state
 
@@ -166,7 +164,7 @@ def init_overlap(model: Model) -> OverlapState:
         The state.
     """
     head = model.params["decoder"]["overlap_head"]
-    return OverlapState(head, _optimizer().init(head), jnp.zeros((), jnp.int32))
+    return OverlapState(head, OPTIMIZER.init(head), jnp.zeros((), jnp.int32))
 
 
 def with_head(model: Model, head: dict[str, Any], *, is_trained: bool) -> Model:
@@ -285,32 +283,24 @@ def _make_pool(store: ScanStore, model: Model, config: TrainingConfig, seed: int
     settings, rng = config.overlap, np.random.default_rng([POOL_STREAM, seed])
     num_scans = min(len(store.table), MAX_POOL_SCANS, 2 * settings.pool_pairs)
     rows = np.unique(np.linspace(0, len(store.table) - 1, num_scans).astype(int))
-    parts = []
-    for start in range(0, len(rows), SCANS_AT_ONCE):
-        some = np.resize(rows[start : start + SCANS_AT_ONCE], SCANS_AT_ONCE)  # a shorter part would be compiled again
-        parts.append(jax.device_get(_encode(model, store.read(some, config, rng)[0])))
-    clouds = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(rows)], *parts)
+    clouds = in_chunks(lambda some: _encode(model, store.read(some, config, rng)[0]), rows, at_once=SCANS_AT_ONCE)
     table = ScanTable(store.table.T_world_lidar[rows], store.table.scene[rows])
     vectors = np.stack([pooled_vector(jax.tree.map(lambda leaf, k=k: leaf[k], clouds)) for k in range(len(rows))])
     hard = hard_pairs(table, vectors, round(HARD_SHARE * settings.pool_pairs), rng)
     pairs = np.concatenate([draw_overlap_pairs(table, settings.pool_pairs - len(hard), rng), hard])
-    found = []
-    for start in range(0, len(pairs), PAIRS_AT_ONCE):
-        some = np.resize(pairs[start : start + PAIRS_AT_ONCE], (PAIRS_AT_ONCE, 2))
-        sides = (jax.tree.map(lambda leaf, side=side: leaf[side], clouds) for side in some.T)
-        found.append(jax.device_get(_correlated(model, *sides)))
-    features, mask = (np.concatenate(column)[: len(pairs)] for column in zip(*found, strict=True))
-    return PairFeatures(features, mask, _labels(table, pairs))
+    features, mask = in_chunks(lambda some: _correlated(model, *_sides(clouds, some)), pairs, at_once=PAIRS_AT_ONCE)
+    return PairFeatures(features, mask, overlap_labels(table, pairs))
 
 
 def _pool_batch(pool: PairFeatures, config: TrainingConfig, seed: int, step: int) -> PairFeatures:
     """Returns the batch of a step; every pair is in one batch of an epoch."""
     num_pairs, size = len(pool.is_overlap), config.overlap.batch_pairs
-    epochs = [divmod(place, num_pairs) for place in range(step * size, (step + 1) * size)]
-    orders = {
-        epoch: np.random.default_rng([ORDER_STREAM, seed, epoch, 1]).permutation(num_pairs) for epoch, _ in epochs
-    }
-    return pool.at(np.array([orders[epoch][place] for epoch, place in epochs]))
+    epochs, places = np.divmod(np.arange(step * size, (step + 1) * size), num_pairs)
+    orders = [
+        np.random.default_rng([ORDER_STREAM, seed, epoch, 1]).permutation(num_pairs) for epoch in np.unique(epochs)
+    ]
+    rows = np.concatenate(orders)[places + num_pairs * (epochs - epochs[0])]
+    return PairFeatures(*(column[rows] for column in pool))
 
 
 def _new_pairs(store: ScanStore, model: Model, config: TrainingConfig, seeds: tuple[int, int]) -> PairFeatures:
@@ -318,15 +308,26 @@ def _new_pairs(store: ScanStore, model: Model, config: TrainingConfig, seeds: tu
     rng = np.random.default_rng([PAIR_STREAM, *seeds])
     pairs = draw_overlap_pairs(store.table, config.overlap.batch_pairs, rng)
     scans, _ = store.read(pairs.ravel(), config, rng)
-    clouds = _encode(model, scans)
-    sides = (jax.tree.map(lambda leaf, side=side: leaf[side::2], clouds) for side in (0, 1))
-    features, mask = _correlated(model, *sides)
-    return PairFeatures(features, mask, _labels(store.table, pairs))
+    features, mask = _correlated(model, *_sides(_encode(model, scans), np.arange(pairs.size).reshape(pairs.shape)))
+    return PairFeatures(features, mask, overlap_labels(store.table, pairs))
 
 
-def _labels(table: ScanTable, pairs: Int[np.ndarray, "p 2"]) -> Bool[np.ndarray, " p"]:
+def overlap_labels(table: ScanTable, pairs: Int[np.ndarray, "p 2"]) -> Bool[np.ndarray, " p"]:
+    """Returns True for pairs of scans of one drive that are less than 20 m apart.
+
+    Args:
+        table: poses and drive of each scan.
+        pairs: rows of the table.
+
+    Returns:
+        A label for each pair.
+    """
     apart_m = np.linalg.norm(table.positions[pairs[:, 0]] - table.positions[pairs[:, 1]], axis=1)
     return np.asarray((apart_m < OVERLAP_M) & (table.scene[pairs[:, 0]] == table.scene[pairs[:, 1]]))
+
+
+def _sides(clouds: DescriptorCloud, pairs: Int[np.ndarray, "p 2"]) -> Iterator[DescriptorCloud]:
+    return (jax.tree.map(lambda leaf, side=side: leaf[side], clouds) for side in pairs.T)
 
 
 @jax.jit
@@ -356,7 +357,7 @@ def _step(
         return jnp.mean(losses), jnp.mean((logits > 0) == batch.is_overlap)
 
     (loss, accuracy), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.head)
-    updates, optimizer = _optimizer().update(gradient, state.optimizer)
+    updates, optimizer = OPTIMIZER.update(gradient, state.optimizer)
     head = jax.tree.map(
         lambda value, update: value - learning_rate * (update + weight_decay * value), state.head, updates
     )
@@ -381,12 +382,9 @@ def head_logits(model: Model, pairs: PairFeatures) -> Float[Array, " p"]:
     return jax.vmap(one)(jnp.asarray(pairs.features, jnp.float32), jnp.asarray(pairs.mask))
 
 
-def _optimizer() -> optax.GradientTransformation:
-    return optax.scale_by_adam()
-
-
 def _learning_rate(config: TrainingConfig, step: int, num_steps: int) -> float:
     """Returns a cosine over the whole stage."""
-    share = (1 + np.cos(np.pi * step / num_steps)) / 2
-    rate = config.final_learning_rate + share * (config.learning_rate - config.final_learning_rate)
-    return float(config.overlap.rate_share * rate)
+    schedule = optax.cosine_decay_schedule(
+        config.learning_rate, num_steps, config.final_learning_rate / config.learning_rate
+    )
+    return config.overlap.rate_share * float(schedule(step))

@@ -74,7 +74,7 @@ def stored_bytes(config: TrainingConfig) -> int:
     Returns:
         Bytes of all variants of a scan; 0 where scans are prepared anew at each use.
     """
-    return config.num_variants * record_type(config.model.pyramid, config.model.preprocess.capacity).itemsize
+    return config.num_variants * _record_type(config).itemsize
 
 
 def prepare_drive(
@@ -158,7 +158,7 @@ def prepare_variants(
     for number in numbers:
         bad: dict[str, str] = {}
         points = read_or_note(drive, number, bad)
-        yield PreparedScan(_packed(points, config, (seed, number)), bad)
+        yield PreparedScan(scan_records(points, config, (seed, number)), bad)
 
 
 def store_scans(
@@ -218,23 +218,17 @@ def read_or_note(drive: LidarSequence, number: int, bad: dict[str, str]) -> Floa
         return np.zeros((0, 3), np.float32)
 
 
-def varied_record(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seeds: tuple[int, int]) -> np.void:
-    """Prepares one new variant of a scan.
+def scan_records(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seeds: tuple[int, int]) -> np.ndarray:
+    """Prepares the variants of a scan.
 
     Args:
         points: the scan as it was read, metres.
         config: settings of training.
-        seeds: two numbers that decide the variant.
+        seeds: two numbers that decide the variants.
 
     Returns:
-        A record of `record_type`.
+        A record of `record_type` for each variant.
     """
-    record: np.void = _packed(points, replace(config, num_variants=1), seeds)[0]
-    return record
-
-
-def _packed(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seeds: tuple[int, int]) -> np.ndarray:
-    """Returns the records of all variants of a scan."""
     records = np.zeros(config.num_variants, _record_type(config))
     for record, cloud in zip(records, _variants(points, config, seeds), strict=True):
         pack_pyramid(pyramid_of_cloud(cloud, config.model, num_threads=1), record)
@@ -259,16 +253,11 @@ def _variants(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seeds: t
     for _ in range(config.num_variants):
         cloud = preprocess_scan_on_host(rng.permutation(points), None, whole, num_threads=1)
         (varied,) = variants_on_host(cloud, still, 1, (seeds[0], int(rng.integers(1 << 31))))
-        variants.append(_thinned_to(varied, settings.capacity))
+        # Evenly spaced points; of shuffled ones these are random. Valid points stand in front.
+        slots, num_valid = np.arange(settings.capacity), int(np.sum(varied.mask))
+        rows = slots * num_valid // len(slots) if num_valid > len(slots) else slots
+        variants.append(PointCloud(np.asarray(varied.points)[rows], np.asarray(varied.mask)[rows]))
     return variants
-
-
-def _thinned_to(cloud: PointCloud, capacity: int) -> PointCloud:
-    """Keeps evenly spaced points; of shuffled ones these are random. Valid points stand in front."""
-    num_valid = int(np.sum(cloud.mask))
-    slots = np.arange(capacity)
-    rows = slots * num_valid // capacity if num_valid > capacity else slots
-    return PointCloud(np.asarray(cloud.points)[rows], np.asarray(cloud.mask)[rows])
 
 
 def variants_on_host(

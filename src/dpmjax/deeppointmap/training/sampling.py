@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from dpmjax.checks import require, require_shape
 from dpmjax.deeppointmap.matching import thinned_mask
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, Layout, SamplingConfig
 from dpmjax.geometry import rigid
@@ -39,11 +40,9 @@ class ScanTable:
     scene: Int[np.ndarray, " n"]
 
     def __post_init__(self) -> None:
-        if self.T_world_lidar.shape != (len(self.scene), 4, 4) or len(self.scene) < 2:
-            found = f"got {self.T_world_lidar.shape} and {self.scene.shape}"
-            raise ValueError(f"T_world_lidar, scene: expected (n, 4, 4) and (n,) with n >= 2, {found}")
-        if not np.isfinite(self.T_world_lidar).all():
-            raise ValueError("T_world_lidar: expected finite poses")
+        require(len(self.scene) >= 2, "scene", "at least two scans", len(self.scene))
+        require_shape("T_world_lidar", self.T_world_lidar, (len(self.scene), 4, 4))
+        require(np.isfinite(self.T_world_lidar).all(), "T_world_lidar", "finite poses", "others")
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -85,7 +84,7 @@ class Group(NamedTuple):
 
 def draw_groups(
     table: ScanTable, first_anchor: int, layout: Layout, config: SamplingConfig, rng: np.random.Generator
-) -> tuple[Group | None, ...]:
+) -> tuple[Group, ...]:
     """Draws the groups of one sample: for each an anchor, and random scans around it.
 
     Args:
@@ -96,19 +95,21 @@ def draw_groups(
         rng: source of the draws.
 
     Returns:
-        The groups; smaller where there are fewer scans, None where no anchor with a scan near it was found.
+        The groups; smaller where there are fewer scans, and fewer where too few anchors have a scan near them.
 
     Raises:
-        ValueError: if all are None.
+        ValueError: if there is no group.
     """
-    groups: list[Group | None] = [None] * layout.num_groups
+    groups = list[Group]()
     anchor, num_left = first_anchor, NUM_ATTEMPTS
-    for place in range(layout.num_groups):
-        while groups[place] is None and num_left > 0:
-            groups[place] = _group_at(table, anchor, layout, config, rng)
-            num_left -= groups[place] is None
-            anchor = int(rng.integers(len(table)))
-    if not any(groups):
+    while len(groups) < layout.num_groups and num_left > 0:
+        group = _group_at(table, anchor, layout, config, rng)
+        if group is None:
+            num_left -= 1
+        else:
+            groups.append(group)
+        anchor = int(rng.integers(len(table)))
+    if not groups:
         limits = f"{MIN_DISTANCE_M} to {config.max_distance_m} m"
         raise ValueError(f"table: expected scans with others {limits} from them, found none in {NUM_ATTEMPTS} draws")
     return tuple(groups)
@@ -129,6 +130,22 @@ def _group_at(
     # map, and thinning keeps all its descriptors.
     target = _nearest_first(table, members[num_source:], int(members[0]))
     return Group(_nearest_first(table, members[:num_source], int(target[0])), target)
+
+
+def number_scans(groups: Sequence[Group]) -> list[Group]:
+    """Numbers the scans of groups anew: the source of the first group, its target, the source of the second, ...
+
+    Args:
+        groups: groups from `draw_groups`.
+
+    Returns:
+        The same groups with the new numbers.
+    """
+    ends = np.cumsum([len(group.rows) for group in groups])
+    return [
+        Group(*np.split(np.arange(end - len(group.rows), end), [len(group.source)]))
+        for group, end in zip(groups, ends, strict=True)
+    ]
 
 
 def _nearest_first(table: ScanTable, rows: Int[np.ndarray, " k"], row: int) -> Int[np.ndarray, " k"]:
@@ -208,41 +225,26 @@ class RegistrationSample:
     groups: GroupBatch
 
 
-def arrange_groups(
-    groups: Sequence[Group | None], capacity: Layout, placed: PlacedScans, *, thins: bool = True
-) -> GroupBatch:
+def arrange_groups(groups: Sequence[Group], capacity: Layout, placed: PlacedScans, *, thins: bool = True) -> GroupBatch:
     """Arranges groups as NumPy arrays, whose shapes depend on the capacity only.
 
     Args:
         groups: groups from `draw_groups`.
         capacity: capacity from `layout_capacity`.
-        placed: the scans of all groups: the source of the first group, its target, the source of the second, ...
+        placed: the scans of all groups in the order of `number_scans`.
         thins: True for maps without the descriptors that `matching.thinned_mask` removes.
 
     Returns:
         The groups.
-
-    Raises:
-        ValueError: if the number of poses is not that of the scans in the groups.
     """
-    T_world_scan = placed.T_world_scan
-    ends = np.cumsum([0 if group is None else len(group.rows) for group in groups])
-    if ends[-1] != len(T_world_scan):
-        raise ValueError(f"T_world_scan: expected {ends[-1]} poses, one for each scan, got {len(T_world_scan)}")
-    rows_of = [
-        None if group is None else Group(*np.split(np.arange(end - len(group.rows), end), [len(group.source)]))
-        for group, end in zip(groups, ends, strict=True)
-    ]
-    rows_of += [None] * (capacity.num_groups - len(rows_of))
+    numbered, T_world_scan = number_scans(groups), placed.T_world_scan
     sources, targets = (
-        _maps_of_scans([None if rows is None else rows[side] for rows in rows_of], placed, capacity[side], thins)
-        for side in (0, 1)
+        _maps_of_scans([group[side] for group in numbered], placed, capacity, side, thins) for side in (0, 1)
     )
-    T = np.tile(np.eye(4), (len(rows_of), 1, 1))
-    for number, rows in enumerate(rows_of):
-        if rows is not None:
-            T[number] = rigid.inverse(T_world_scan[rows.target[0]]) @ T_world_scan[rows.source[0]]
-    return GroupBatch(sources, targets, T.astype(np.float32), np.array([rows is not None for rows in rows_of]))
+    T = np.tile(np.eye(4, dtype=np.float32), (capacity.num_groups, 1, 1))
+    for number, (source, target) in enumerate(numbered):
+        T[number] = rigid.inverse(T_world_scan[target[0]]) @ T_world_scan[source[0]]
+    return GroupBatch(sources, targets, T, np.arange(capacity.num_groups) < len(numbered))
 
 
 def stack(trees: Sequence[TreeT]) -> TreeT:
@@ -258,18 +260,16 @@ def stack(trees: Sequence[TreeT]) -> TreeT:
 
 
 def _maps_of_scans(
-    rows: Sequence[Int[np.ndarray, " k"] | None], placed: PlacedScans, capacity: int, thins: bool
+    maps: Sequence[Int[np.ndarray, " k"]], placed: PlacedScans, capacity: Layout, side: int, thins: bool
 ) -> MapOfScans:
-    num_descriptors = placed.mask.shape[1]
-    padded = np.zeros((len(rows), capacity), np.int32)
-    mask = np.zeros((len(rows), capacity, num_descriptors), bool)
-    T_map_scan = np.tile(np.eye(4, dtype=np.float32), (len(rows), capacity, 1, 1))
-    for number, scans in enumerate(rows):
-        if scans is not None:
-            padded[number, : len(scans)] = scans
-            positions, is_there = placed.positions_world[scans].reshape(-1, 3), placed.mask[scans].reshape(-1)
-            kept = thinned_mask(positions, is_there, num_descriptors) if thins else is_there
-            mask[number, : len(scans)] = kept.reshape(len(scans), -1)
-            T_world_first = placed.T_world_scan[scans[0]]
-            T_map_scan[number, : len(scans)] = rigid.inverse(T_world_first) @ placed.T_world_scan[scans]
-    return MapOfScans(padded, mask, T_map_scan)
+    shape, num_descriptors = (capacity.num_groups, capacity[side]), placed.mask.shape[1]
+    rows, mask = np.zeros(shape, np.int32), np.zeros((*shape, num_descriptors), bool)
+    T_map_scan = np.tile(np.eye(4, dtype=np.float32), (*shape, 1, 1))
+    for number, scans in enumerate(maps):
+        rows[number, : len(scans)] = scans
+        positions, is_there = placed.positions_world[scans].reshape(-1, 3), placed.mask[scans].reshape(-1)
+        kept = thinned_mask(positions, is_there, num_descriptors) if thins else is_there
+        mask[number, : len(scans)] = kept.reshape(len(scans), -1)
+        T_world_first = placed.T_world_scan[scans[0]]
+        T_map_scan[number, : len(scans)] = rigid.inverse(T_world_first) @ placed.T_world_scan[scans]
+    return MapOfScans(rows, mask, T_map_scan)

@@ -11,7 +11,9 @@ import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -23,7 +25,7 @@ from dpmjax.deeppointmap.training.preparation import (
     PreparedDrive,
     prepare_drive,
     read_or_note,
-    varied_record,
+    scan_records,
     why_useless,
 )
 from dpmjax.deeppointmap.training.sampling import (
@@ -94,12 +96,13 @@ class ScanStore:
         placed = PlacedScans(T_world_lidar @ np.linalg.inv(motions), positions_world, mask)
         return SampleScans(pyramids, motions.astype(np.float32)), placed
 
-    def _record(self, config: TrainingConfig, row: int, variant: int) -> np.void:
+    def _record(self, config: TrainingConfig, row: int, variant: int) -> Any:
         pyramids, number = self._pyramids[self.table.scene[row]], int(self._number[row])
         if isinstance(pyramids, LidarSequence):
-            return varied_record(read_or_note(pyramids, number, self.bad), config, (variant, number))
-        record: np.void = pyramids[number, variant]
-        return record
+            points = read_or_note(pyramids, number, self.bad)
+            (record,) = scan_records(points, replace(config, num_variants=1), (variant, number))
+            return record
+        return pyramids[number, variant]
 
 
 def prepare_drives(
@@ -196,7 +199,7 @@ class SampleMaker:
         layout = self._config.layout_at(step, seed=self._seed)
         capacity = layout_capacity(layout, sampling)
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
-        rows = np.concatenate([group.rows for group in groups if group is not None])
+        rows = np.concatenate([group.rows for group in groups])
         # The number of scans is always that of the capacity: another number would be compiled again.
         num_spare = capacity.num_scans - len(rows)
         padded = np.concatenate([rows, np.full(num_spare, rows[0])])

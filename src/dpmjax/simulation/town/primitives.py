@@ -189,7 +189,9 @@ def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Ar
     is_free = ((foot[:, :2] - sensor[:2]) ** 2).sum(-1) > _CLEARANCE_M**2
     low, high = _CAR_LENGTH_M
     is_car = (traffic.half_sizes[:, 0] > low) & (traffic.half_sizes[:, 0] < high)
-    body_z, cabin_z = _car_levels(traffic.half_sizes[:, 2])
+    # Body and cabin of a car divide the height above 0.25 m as 3 : 2.
+    room = traffic.half_sizes[:, 2] - 0.125
+    body_z, cabin_z = 0.6 * room, 0.4 * room
     half_body = jnp.where(is_car, body_z, traffic.half_sizes[:, 2])
     lift = jnp.where(is_car, 0.25, jnp.where(traffic.half_sizes[:, 0] >= high, 0.5, 0.0))
     up = jnp.array([0.0, 0.0, 1.0], foot.dtype)
@@ -203,12 +205,6 @@ def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Ar
         mask=body.mask & is_car,
     )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), body, cabin)
-
-
-def _car_levels(half_height: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Returns the half heights of body and cabin of a car, m, which divide the height above 0.25 m as 3 : 2."""
-    room = half_height - 0.125
-    return 0.6 * room, 0.4 * room
 
 
 def _on_lane(traffic: RoadUsers, way: Float[Array, " n"]) -> Float[Array, "n 3"]:
