@@ -98,9 +98,6 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     }
     if result.reports:
         numbers |= write_map_results(run, drive, numbers)
-    if mapped.failure is not None:
-        run.write_numbers({**numbers, "status": "interrupted"})
-        raise mapped.failure
     if errors := results.error_text(numbers):
         run.say(errors)
     if num_new:

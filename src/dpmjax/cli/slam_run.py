@@ -35,7 +35,6 @@ class SlamRun(NamedTuple):
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
         scan_s: seconds of each scan of this process, without compilation and writing.
-        failure: error that ended the run early; None without an error.
     """
 
     state: slam.SlamState
@@ -43,7 +42,6 @@ class SlamRun(NamedTuple):
     compile_s: float
     run_s: float
     scan_s: tuple[float, ...]
-    failure: Exception | None
 
 
 class _Clock:
@@ -81,14 +79,9 @@ def map_drive(run: Run, sequence: LidarSequence, methods: slam.SlamMethods) -> t
 
     Returns:
         The run with its seconds, and the trajectory and the map.
-
-    Raises:
-        InputError: a scan on the way that cannot be read.
     """
     beginning = find_beginning(run.path if run.is_resumed else None, methods, slam.init_slam())
     mapped = run_scans(run, ScanReader(sequence), methods, beginning)
-    if mapped.failure is not None:
-        raise mapped.failure
     return mapped, slam.finish_slam(mapped.state, mapped.reports, methods.config)
 
 
@@ -99,7 +92,7 @@ def run_scans(
     beginning: RunState,
     viewer: viz.LiveViewer | None = None,
 ) -> SlamRun:
-    """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
+    """Places the remaining scans and saves the state of the last keyframe; an error stops the run.
 
     Args:
         run: folder for the state.
@@ -113,7 +106,7 @@ def run_scans(
     """
     clock, sequence = _Clock(), reader.sequence
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
-    first, failure, started = len(reports), None, clock.now_s()
+    first, started = len(reports), clock.now_s()
     saved = time.perf_counter()
     resumable: RunState | None = None
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
@@ -137,11 +130,11 @@ def run_scans(
                 bar.set_postfix_str(_progress(state, report, clock.compile_s), refresh=False)
                 bar.update(1)
         except Exception as error:  # what was found is written before it goes on
-            failure = error
+            run.fail(error)
         finally:
             if resumable is not None:
                 save_state(run / STATE, *resumable)
-    return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s), failure)
+    return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s))
 
 
 def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -> Generator[_Prepared, None, None]:
