@@ -152,13 +152,6 @@ class ScanSequence:
         return replace(self, **_select(self, names, selection))
 
 
-@dataclass(frozen=True)
-class SimulatedScans(ScanSequence):
-    """A simulated sequence of planar scans, whose poses are known."""
-
-    reference_poses: FloatArray = field(repr=False)
-
-
 class Relations(NamedTuple):
     """Relative poses of a robot at pairs of times, checked by hand.
 

@@ -93,8 +93,6 @@ def map_away(place: tuple[Path, Path], options: SlamOptions) -> MappedAway:
     methods, drive = slam_methods(options), open_drive(data, options)
     reader = ScanReader(drive, is_deskewed=options.deskew, jump=options.jump)
     mapped = run_scans(DriveFolder(folder), reader, methods, find_beginning(folder, methods, slam.init_slam()))
-    if mapped.failure is not None:
-        raise mapped.failure
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
     return MappedAway(result.T_world_scan, saved_maps.map_bytes(result.map, "int8"), time.perf_counter() - began)
 

@@ -79,18 +79,16 @@ def main(options: LocalizeOptions, run: cli.Run) -> cli.Numbers:
     num_done = len(run.continue_table(TABLE))
     results = slam.localize_each(model, slam_map, (drive.read_points(i) for i in range(num_done, len(drive))))
 
-    def work(scan: int, source: str) -> cli.Row:
+    def work(scan: int, source: str) -> cli.Row | None:
         begun = time.perf_counter()
-        return as_row(case, next(results), time.perf_counter() - begun)
+        try:
+            return as_row(case, next(results), time.perf_counter() - begun)
+        except Exception as error:  # such as a scan that cannot be read
+            run.fail(error)
+            return None
 
     cases = [{"scan": number, "source": source} for number, source in enumerate(drive.sources)]
-    try:
-        rows = cli.fill_table(run, cases, work, TABLE)
-    except Exception:  # such as a scan that cannot be read
-        rows = cli.fill_table(run, cases[: len(run.read_table(TABLE))], work, TABLE)
-        run.write_numbers({**write_found(run, options, case, rows), "status": "interrupted"})
-        raise
-    return write_found(run, options, case, rows)
+    return write_found(run, options, case, cli.fill_table(run, cases, work, TABLE))
 
 
 def reference_of(options: LocalizeOptions, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:

@@ -88,7 +88,7 @@ class Run:
         self._options, self._started = options, time.perf_counter()
         self._handler: logging.Handler | None = None
         self._lock: int | None = None
-        self._signals: list[int] = []
+        self._stops: list[BaseException] = []
         self._notes: list[str] = []
         self.is_resumed = getattr(options, "resume", False)
         output = getattr(options, "output", None)
@@ -109,13 +109,17 @@ class Run:
 
     @property
     def is_stopped(self) -> bool:
-        """Returns True after the first signal: what is done is written, and the run ends."""
-        return bool(self._signals)
+        """Returns True after the first signal or failure: what is done is written, and the run ends."""
+        return bool(self._stops)
 
     def check_stop(self) -> None:
         """Ends the run after a signal, in the middle of work of which nothing can be kept."""
-        if self._signals:
-            raise Interrupted(self._signals[0])
+        if self._stops:
+            raise self._stops[0]
+
+    def fail(self, error: Exception) -> None:
+        """Stops the run as a signal does: what is done is written before the error ends the command."""
+        self._stops.append(error)
 
     def open(self, notes: Iterable[Note] = ()) -> None:
         """Makes the folder, or empties it with --force, and writes `config.json`; call it after the input was read.
@@ -218,7 +222,7 @@ class Run:
         """Stops the run at its next step; without a folder, or at a second signal, at once."""
         if self.is_stopped or not self.is_open:
             raise Interrupted(number)
-        self._signals.append(number)
+        self._stops.append(Interrupted(number))
         os.write(2, STOPPING.encode())  # without a buffer: a handler may interrupt a print
 
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -119,24 +119,23 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
         mapped = run_scans(run, reader, methods, beginning, viewer=viewer, odometry=odometry)
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
     placed = sequence.take(slice(0, len(result.reports)))
-    drive = MappedDrive(placed, start, result, options.T_base_lidar)
     num_new = len(mapped.scan_s)
     numbers = {
         "weights": options.weights,
-        **results.run_numbers(result, drive.sequence),
+        **results.run_numbers(result, placed),
         "scans_per_s": num_new / mapped.run_s if num_new else None,
         "run_s": mapped.run_s,
         "compile_s": mapped.compile_s,
     }
     if result.reports:
-        numbers |= write_map_results(run, drive, numbers)
-    if mapped.failure is not None:
-        run.write_numbers({**numbers, "status": "interrupted"})
-        raise mapped.failure
+        if options.T_base_lidar is not None:
+            poses = options.T_base_lidar @ result.T_world_scan @ geometry.rigid.inverse(options.T_base_lidar)
+            cli.write_poses(run.path, poses, "trajectory_base", times=placed.times, frame="T_world_base")
+        numbers |= write_map_results(run, placed, start, result, numbers)
     if errors := results.error_text(numbers):
         run.say(errors)
     if odometry is not None and len(result.reports) > 2:
-        numbers |= results.odometry_numbers(odometry[: len(result.reports)], drive.sequence, result, run)
+        numbers |= results.odometry_numbers(odometry[: len(result.reports)], placed, result, run)
     if num_new:
         run.say(f"{numbers['scans_per_s']:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
     return numbers
@@ -164,28 +163,6 @@ def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
         return map_drives(client, options, run)
 
 
-class MappedDrive(NamedTuple):
-    """The scans of a run and their poses.
-
-    Attributes:
-        sequence: the scans that were placed.
-        start: state before the first scan, with the map that the run extends.
-        result: trajectory and map.
-        T_base_lidar: pose of the lidar in the frame of the robot; None where it was not given.
-    """
-
-    sequence: LidarSequence
-    start: slam.SlamState
-    result: slam.SlamResult
-    T_base_lidar: np.ndarray | None
-
-    def read_keyframe(self, row: int) -> np.ndarray:
-        """Reads the points of a keyframe; those of the extended map are the points of its surface."""
-        if row < len(self.start.slam_map):
-            return slam.keyframe_points(self.result.map, row)
-        return self.sequence.read_points(self.result.map.keyframes[row].scan - self.start.front_end.num_scans)
-
-
 def slam_methods(options: SlamOptions) -> slam.SlamMethods:
     """Returns the methods of the model."""
     settings = slam.slam_preset(options.preset)
@@ -206,14 +183,20 @@ def read_odometry(options: SlamOptions, sequence: LidarSequence) -> tuple[np.nda
     return poses if options.T_base_lidar is None else poses @ options.T_base_lidar, notes
 
 
-def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) -> cli.Numbers:
+def write_map_results(
+    run: cli.Run, sequence: LidarSequence, start: slam.SlamState, result: slam.SlamResult, numbers: cli.Numbers
+) -> cli.Numbers:
     """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
-    sequence, result, slam_map = drive.sequence, drive.result, drive.result.map
+    slam_map, num_before = result.map, len(start.slam_map)
+
+    def read_keyframe(row: int) -> np.ndarray:
+        """Reads the points of a keyframe; those of the extended map are the points of its surface."""
+        if row < num_before:
+            return slam.keyframe_points(slam_map, row)
+        return sequence.read_points(slam_map.keyframes[row].scan - start.front_end.num_scans)
+
     for name, poses in (("trajectory", result.T_world_scan), ("odometry", result.T_odometry_scan)):
         cli.write_poses(run.path, poses, name, times=sequence.times, frame="T_world_lidar")
-    if drive.T_base_lidar is not None:
-        poses = drive.T_base_lidar @ result.T_world_scan @ geometry.rigid.inverse(drive.T_base_lidar)
-        cli.write_poses(run.path, poses, "trajectory_base", times=sequence.times, frame="T_world_base")
     results.write_graph(run.path, result)
     results.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
     results.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
@@ -223,7 +206,7 @@ def write_map_results(run: cli.Run, drive: MappedDrive, numbers: cli.Numbers) ->
         small = saved_maps.map_bytes(slam_map, "int8")
         sizes = {"map_bytes": whole.stat().st_size, "map_bytes_int8": len(small)}
     run.write_numbers({**numbers, **sizes})  # also where a picture fails
-    cloud = results.gather_map(slam_map.T_world_keyframe, drive.read_keyframe)
+    cloud = results.gather_map(slam_map.T_world_keyframe, read_keyframe)
     io.write_ply(run / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
-    results.draw_pictures(run.path, sequence, result, cloud, len(drive.start.slam_map))
+    results.draw_pictures(run.path, sequence, result, cloud, num_before)
     return {**sizes, "map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}

@@ -35,6 +35,10 @@ class DriveFolder(NamedTuple):
     def __truediv__(self, name: str) -> Path:
         return self.path / name
 
+    def fail(self, error: Exception) -> None:
+        """Raises the error: the worker gives it back."""
+        raise error
+
 
 class SlamRun(NamedTuple):
     """A run until its end or its stop.
@@ -45,7 +49,6 @@ class SlamRun(NamedTuple):
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
         scan_s: seconds of each scan of this process, without compilation and writing.
-        failure: error that ended the run early; None without an error.
     """
 
     state: slam.SlamState
@@ -53,7 +56,6 @@ class SlamRun(NamedTuple):
     compile_s: float
     run_s: float
     scan_s: tuple[float, ...]
-    failure: Exception | None
 
 
 class _Clock:
@@ -91,14 +93,9 @@ def map_drive(run: Run, sequence: LidarSequence, methods: slam.SlamMethods) -> t
 
     Returns:
         The run with its seconds, and the trajectory and the map.
-
-    Raises:
-        InputError: a scan on the way that cannot be read.
     """
     beginning = find_beginning(run.path if run.is_resumed else None, methods, slam.init_slam())
     mapped = run_scans(run, ScanReader(sequence), methods, beginning)
-    if mapped.failure is not None:
-        raise mapped.failure
     return mapped, slam.finish_slam(mapped.state, mapped.reports, methods.config)
 
 
@@ -111,7 +108,7 @@ def run_scans(
     viewer: viz.LiveViewer | None = None,
     odometry: np.ndarray | None = None,
 ) -> SlamRun:
-    """Places the remaining scans and saves the state of the last keyframe; the result has an error that ended the run.
+    """Places the remaining scans and saves the state of the last keyframe; an error stops the run.
 
     Args:
         run: folder for the state.
@@ -126,7 +123,7 @@ def run_scans(
     """
     clock, sequence = _Clock(), reader.sequence
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
-    first, failure, started = len(reports), None, clock.now_s()
+    first, started = len(reports), clock.now_s()
     saved = time.perf_counter()
     resumable: RunState | None = None
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
@@ -151,11 +148,11 @@ def run_scans(
                 bar.set_postfix_str(_progress(state, report, clock.compile_s), refresh=False)
                 bar.update(1)
         except Exception as error:  # what was found is written before it goes on
-            failure = error
+            run.fail(error)
         finally:
             if resumable is not None:
                 save_state(run / STATE, *resumable)
-    return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s), failure)
+    return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s))
 
 
 def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -> Generator[_Prepared, None, None]:

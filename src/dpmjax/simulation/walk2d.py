@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.checks import require, require_count, runs_on_host
 from dpmjax.geometry import se2
-from dpmjax.sequences import BoolArray, FloatArray, SimulatedScans
+from dpmjax.sequences import BoolArray, FloatArray, ScanSequence
 from dpmjax.simulation.world2d import World, beam_angles, cast_scans, largest_region, make_world
 
 # Section 4.1: headings of consecutive scans differ by a uniform angle within plus or minus this, and translations have
@@ -281,7 +281,7 @@ def simulate_sequence(
     range_noise_px: float = 0.0,
     seed: int = 0,
     with_odometry: bool = False,
-) -> SimulatedScans:
+) -> ScanSequence:
     """Simulates a drive through a planar world (DeepMapping section 4.1).
 
     Walk, noise, odometry and people have separate random streams: a seed gives the same walk with and without noise.
@@ -311,4 +311,4 @@ def simulate_sequence(
     ranges = stop_at_people(ranges, poses, beam_angles(num_beams), people)
     points, mask = _measured_points(ranges, range_noise_px, noise_rng), np.ones(ranges.shape, bool)
     odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
-    return SimulatedScans(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
+    return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)
