@@ -19,6 +19,7 @@ from dpmjax.scans.weak_directions import diagonal_information, sigma_along
 from dpmjax.slam.interfaces import Alignment, Match, PreparedInput, Proposal, SlamMethods
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
+from dpmjax.slam.surface_geometry import SAME_M, SAME_RAD
 from dpmjax.types import Information, Pose
 
 # Turn between keyframes at a smaller distance.
@@ -285,7 +286,7 @@ class _Search(NamedTuple):
         (matcher, geometry, config, _), state, local_map, scan, compact = self
         predicted, is_predicted = state.predicted, config.odometry.proposer == "prediction"
         good_score = max(MIN_SCORE, GOOD_SHARE * state.usual_score)
-        tracked = None
+        tracked, min_probability = None, config.front_end.min_probability
         # The second scan of a drive has no last motion.
         if is_predicted and state.scores:
             tracked = geometry.align(local_map, scan, predicted)
@@ -299,12 +300,15 @@ class _Search(NamedTuple):
         if tracked is None and (is_predicted or matched.score < good_score):
             tracked = geometry.align(local_map, scan, predicted)
         if tracked is not None:
-            if matched.score < good_score or not are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
+            # At a low score, too, no further starts are needed where a sure decoder leads to the same pose.
+            is_agreed = are_near(tracked.T_map_scan, matched.T_map_scan, SAME_M, SAME_RAD)
+            is_fine = matched.score >= good_score or (is_agreed and proposal.probability >= min_probability)
+            if not is_fine or not are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
                 others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
                 tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
             # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
             is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, np.inf)
-            is_sure = is_near or proposal.probability >= config.front_end.min_probability
+            is_sure = is_near or proposal.probability >= min_probability
             lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
             best = _better_of(tracked, matched, lead if state.scores else 0.0)
         return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact)

@@ -55,8 +55,9 @@ FLOOR_RAD = 0.001
 # Number of elements of the local map that are compared with the free space of a scan.
 MAX_VIEWED = 4000
 
-# Number of starts of a search that are aligned finely.
-NUM_FINE = 3
+# Largest number of coarse poses of a search that are aligned finely, and largest distance and turn between two of them
+# that are one: with a larger one, a start in another valley may be lost.
+NUM_FINE, SAME_M, SAME_RAD = 3, 0.1, 0.02
 
 # Alignment from a first guess that is nearly right, and from other starts.
 NARROW = (AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1))
@@ -117,8 +118,8 @@ class SurfaceGeometry:
         """
         coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, self._wide).T_target_source
         matched = _matched_shares(scan.surface, self._planes(local_map, scan, coarse, NUM_SAMPLES // 3))
-        best = np.argsort(-matched, kind="stable")[:NUM_FINE]
-        return max(self._aligned(local_map, scan, coarse[best]), key=lambda found: found.score)
+        best = _distinct(coarse[np.argsort(-matched, kind="stable")])
+        return max(self._aligned(local_map, scan, best), key=lambda found: found.score)
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
@@ -155,6 +156,20 @@ class SurfaceGeometry:
 
     def _planes(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
         return nearest_planes(scan.surface, local_map.surface, T_map_scan, self._plane_radius_m, num_samples)
+
+
+def _distinct(poses: Poses) -> Poses:
+    """Returns the first poses that are apart from one another: starts of one valley end coarsely at one pose."""
+    kept = poses[:1]
+    for pose in poses[1:]:
+        if len(kept) == NUM_FINE:
+            break
+        apart_m = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
+        # The Frobenius norm of the difference of two rotations is the root of 2 times a small angle between them.
+        apart_rad = np.linalg.norm(kept[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(2)
+        if ((apart_m > SAME_M) | (apart_rad > SAME_RAD)).all():
+            kept = np.concatenate([kept, pose[None]])
+    return kept
 
 
 def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
