@@ -72,14 +72,10 @@ class SurfaceGeometry:
 
     Args:
         model_config: preprocessing and pyramid of the encoder.
-        spacing: factor of the usual distance of elements, by which the radii of pairs grow.
     """
 
-    def __init__(self, model_config: ModelConfig, *, spacing: float = 1.0) -> None:
-        self._model_config, self._plane_radius_m = model_config, spacing * PLANE_RADIUS_M
-        self._narrow, self._wide = (
-            tuple(level._replace(radius_m=spacing * level.radius_m) for level in levels) for levels in (NARROW, WIDE)
-        )
+    def __init__(self, model_config: ModelConfig) -> None:
+        self._model_config = model_config
 
     def thin(self, points: Float[np.ndarray, "n 3"]) -> Scan | None:
         """Thins a scan as the encoder does, and estimates its surface; see `Geometry`.
@@ -103,7 +99,7 @@ class SurfaceGeometry:
         Returns:
             The pose.
         """
-        return self._aligned(local_map, scan, T_map_scan[None])[0]
+        return _aligned(local_map, scan, T_map_scan[None])[0]
 
     def search(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Alignment:
         """Aligns all first guesses coarsely and the best of them finely; see `Geometry`.
@@ -116,10 +112,10 @@ class SurfaceGeometry:
         Returns:
             The pose under which most elements meet planes and fewest lie in free space.
         """
-        coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, self._wide).T_target_source
-        matched = _matched_shares(scan.surface, self._planes(local_map, scan, coarse, NUM_SAMPLES // 3))
+        coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, WIDE).T_target_source
+        matched = _matched_shares(scan.surface, _planes(local_map, scan, coarse, NUM_SAMPLES // 3))
         best = _distinct(coarse[np.argsort(-matched, kind="stable")])
-        return max(self._aligned(local_map, scan, best), key=lambda found: found.score)
+        return max(_aligned(local_map, scan, best), key=lambda found: found.score)
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
@@ -145,17 +141,20 @@ class SurfaceGeometry:
         rotations, translations = (np.array(parts) for parts in zip(*motions, strict=True))
         return homogeneous(rotations, translations)
 
-    def _aligned(self, local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
-        T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), self._narrow).T_target_source
-        planes = self._planes(local_map, scan, T, ALL if scan.weak_axis is not None else NUM_SAMPLES)
-        matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
-        scores = matched - CONTRADICTION_WEIGHT * contradicted
-        columns = (column.tolist() for column in (matched, contradicted, scores))
-        information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
-        return list(map(Alignment, T, *columns, information))
 
-    def _planes(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
-        return nearest_planes(scan.surface, local_map.surface, T_map_scan, self._plane_radius_m, num_samples)
+def _aligned(local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
+    """Aligns from first guesses that are nearly right, and compares the scan with the map there."""
+    T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), NARROW).T_target_source
+    planes = _planes(local_map, scan, T, ALL if scan.weak_axis is not None else NUM_SAMPLES)
+    matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
+    scores = matched - CONTRADICTION_WEIGHT * contradicted
+    columns = (column.tolist() for column in (matched, contradicted, scores))
+    information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
+    return list(map(Alignment, T, *columns, information))
+
+
+def _planes(local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
+    return nearest_planes(scan.surface, local_map.surface, T_map_scan, PLANE_RADIUS_M, num_samples)
 
 
 def _distinct(poses: Poses) -> Poses:
