@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import require_pairs, runs_on_host
 from dpmjax.deeppointmap.confidence import OverlapEvidence
-from dpmjax.deeppointmap.encoding import CHUNK, encode, encode_scans, join_chunks, stack_chunk
+from dpmjax.deeppointmap.encoding import encode, encode_scans
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
 from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
 from dpmjax.deeppointmap.prepared_scans import ScanOrCloud, descriptors_of
@@ -238,14 +238,15 @@ def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud],
         encoded = jax.device_get(encode_scans(model, list(raw.values())).described)
         clouds |= {key: jax.tree.map(lambda leaf, row=row: leaf[row], encoded) for row, key in enumerate(raw)}
     pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]
-    chunks = (stack_chunk(pairs[start : start + CHUNK]) for start in range(0, len(pairs), CHUNK))
-    return join_chunks([_apply_to_chunk(function, model, some) for some in chunks], len(pairs))
+    # One by one: a pair takes a CPU 24 ms, and most calls of SLAM have one or two.
+    results = jax.device_get([_apply_to_pair(function, model, *pair) for pair in pairs])
+    return jax.tree.map(lambda *values: np.stack(values), *results)
 
 
 @kept_jit("function")
-def _apply_to_chunk(function: Any, model: Model, pairs: Any) -> Any:
-    """Applies a function of one pair to the pairs of a chunk, in one compiled program."""
-    return jax.vmap(lambda pair: function(model, *pair))(pairs)
+def _apply_to_pair(function: Any, model: Model, source: DescriptorCloud, target: DescriptorCloud) -> Any:
+    """Applies a function of one pair in a compiled program."""
+    return function(model, source, target)
 
 
 def _best_motion(

@@ -1,6 +1,6 @@
 """A lidar scan as every later step takes it: its surface, its free space, and its descriptors.
 
-One tree and its neighbours serve the outlier filter and the normals. `lidar_scan` makes the few elements of odometry,
+One search of neighbours serves the outlier filter and the normals. `lidar_scan` makes the few elements of odometry,
 `measure_scan` the dense surface of a registration, and `measured_elements` the surface of elements that a map keeps.
 """
 
@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.shells import without_shell
-from dpmjax.scans.preprocess import PreprocessConfig, as_cloud, filter_points, first_of_each_voxel
+from dpmjax.scans.preprocess import PreprocessConfig, first_of_each_voxel, thin_points
 from dpmjax.scans.surfaces import (
     RangeImage,
     Surface,
@@ -25,7 +26,7 @@ from dpmjax.scans.surfaces import (
     surface_of_elements,
 )
 from dpmjax.scans.weak_directions import FIRM_FLATNESS, corridor_axis, has_facing
-from dpmjax.types import DescriptorCloud, PointCloud, SurfaceElements
+from dpmjax.types import DescriptorCloud, SurfaceElements
 
 # A scan with fewer flat surface elements counts as empty.
 MIN_NUM_POINTS = 100
@@ -36,12 +37,16 @@ MAX_ELEMENTS = 3000
 # Neighbourhoods of all points of a scan, and of spread ones: in scans of 1,000 points neighbours are farther away.
 DENSE, NEIGHBOURHOODS = SurfaceConfig(), SurfaceConfig(sparse_radius_share=1.5)
 
-# Voxels and the largest number of elements in a corridor that hardly any element faces: there a relief of centimetres
-# may hold the way along it. Its corners need flatter elements.
-FINE_VOXEL_M, MAX_FINE_ELEMENTS, FINE_FLATNESS = 0.08, 6000, 0.5
+# Voxels in a corridor that hardly any element faces: there a relief of centimetres may hold the way along it. Its
+# corners need flatter elements.
+FINE_VOXEL_M, FINE_FLATNESS = 0.08, 0.5
 
 # One element of each voxel of this size is chosen first, because ground near the lidar is dense.
 SPREAD_M = 1.5
+
+# A shell of points without an echo is no wider (`geometry.shells`): if the farthest point is this many times as far as
+# the largest range, the range filter leaves out the whole shell.
+SHELL_SHARE = 1.04
 
 
 class Scan(NamedTuple):
@@ -52,7 +57,7 @@ class Scan(NamedTuple):
         image: range image, the free space.
         descriptors: descriptors of the scan, positions in metres times `scale`; None before it is encoded.
         scale: factor by which the points were enlarged for the encoder.
-        cloud: thinned points, metres, in the frame of the lidar: input of the encoder; None where none is needed.
+        thinned: points that range and voxel leave, outliers among them: input of the encoder; None if none is needed.
         extent_m: median range of the thinned points.
         weak_axis: unit vector along a corridor, which few walls face, in the frame of the lidar; None elsewhere.
     """
@@ -61,7 +66,7 @@ class Scan(NamedTuple):
     image: RangeImage
     descriptors: DescriptorCloud | None = None
     scale: float = 1.0
-    cloud: PointCloud | None = None
+    thinned: HostTree | None = None
     extent_m: float = 0.0
     weak_axis: Float[np.ndarray, "3"] | None = None
 
@@ -78,12 +83,11 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
     """
     if len(points) < MIN_NUM_POINTS:
         return None
-    points = without_shell(points)
-    tree, rows = filter_points(points, None, config)
-    thinned = tree.points.take(rows, axis=0)
-    is_inlier = np.zeros(len(tree.points), bool)
-    is_inlier[rows] = True
-    surface = surface_at(tree, rows[_spread_rows(thinned)], NEIGHBOURHOODS, is_counted=is_inlier)
+    points = _echoes(points, config)
+    tree = thin_points(points, None, config)
+    rows, weights = _spread_rows(tree.points)
+    weighing = weights if config.num_outlier_neighbours > 0 else None
+    surface = surface_at(tree, rows, NEIGHBOURHOODS, weights=weighing)
     if np.count_nonzero(surface.flatness) < MIN_NUM_POINTS:
         return None
     weak_axis = corridor_axis(surface)
@@ -91,17 +95,21 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
         surface = firm_surface(surface, FIRM_FLATNESS)
         if not has_facing(surface, weak_axis):
             surface = _fine_surface(points, config)
-    thinned = thinned.astype(np.float32)
-    extent_m = float(np.median(np.linalg.norm(thinned, axis=1)))
-    cloud = as_cloud(thinned, config)
-    return Scan(surface, range_image(thinned), cloud=cloud, extent_m=extent_m, weak_axis=weak_axis)
+    extent_m = float(np.median(np.linalg.norm(tree.points, axis=1)))
+    return Scan(surface, range_image(tree.points), thinned=tree, extent_m=extent_m, weak_axis=weak_axis)
+
+
+def _echoes(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Float[np.ndarray, "m 3"]:
+    """Leaves out points that are no echoes, unless the range filter does."""
+    is_beyond = np.square(points, dtype=np.float32).sum(axis=1).max(initial=0) > (SHELL_SHARE * config.max_range_m) ** 2
+    return points if is_beyond else without_shell(points)
 
 
 def _fine_surface(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Surface:
     """Measures the surface of a scan at points that are near each other; only flat elements are kept."""
     surface = scan_surface(points, SurfaceConfig(config.min_range_m, config.max_range_m, voxel_size_m=FINE_VOXEL_M))
     rows = np.flatnonzero(surface.flatness > FINE_FLATNESS)
-    rows = rows[_spread_rows(surface.points[rows])][:MAX_FINE_ELEMENTS]
+    rows = rows[_spread_rows(surface.points[rows])[0]]
     return chosen_elements(surface, rows)
 
 
@@ -132,8 +140,22 @@ def measured_elements(elements: SurfaceElements) -> Scan:
     return Scan(surface, range_image(surface.points))
 
 
-def _spread_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " e"]:
-    """Chooses points in random order: first one of each coarse voxel, then others."""
+def _spread_rows(points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    """Chooses points, first one of each coarse voxel, then others at random.
+
+    Args:
+        points: points of a scan.
+
+    Returns:
+        Their rows, in the order of the scan, and the number of points that each stands for.
+    """
     rng, is_first = np.random.default_rng(0), np.zeros(len(points), bool)
     is_first[first_of_each_voxel(points, SPREAD_M)] = True
-    return np.concatenate([rng.permutation(np.flatnonzero(part)) for part in (is_first, ~is_first)])[:MAX_ELEMENTS]
+    weights, num_left = np.zeros(len(points)), MAX_ELEMENTS
+    for part in (is_first, ~is_first):
+        rows = np.flatnonzero(part)
+        chosen = rng.permutation(rows)[:num_left]
+        weights[chosen] = len(rows) / max(len(chosen), 1)
+        num_left -= len(chosen)
+    rows = np.flatnonzero(weights)
+    return rows, weights[rows]

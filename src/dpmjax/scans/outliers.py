@@ -64,9 +64,21 @@ def find_inliers(tree: HostTree, num_neighbours: int) -> Bool[np.ndarray, " k"]:
         measure(np.flatnonzero(is_lonely & (weights == 0)))
         # The points that are not lonely are counted as often as there are such: no spread of theirs is large.
         weights = np.where(is_lonely, 1, weights * (~is_lonely).sum() / max(weights[~is_lonely].sum(), 1))
+    return spread <= largest_spread(spread, weights)
+
+
+def largest_spread(spread: Float[np.ndarray, " k"], weights: Float[np.ndarray, " k"]) -> float:
+    """Computes the largest mean distance of an inlier to its neighbours.
+
+    Args:
+        spread: mean distances of some points to their neighbours.
+        weights: number of points of the scan that each of them stands for.
+
+    Returns:
+        The limit, in the unit of the distances.
+    """
     mean = np.average(spread, weights=weights)
-    limit = mean + OUTLIER_SIGMAS * np.sqrt(np.average((spread - mean) ** 2, weights=weights))
-    return spread <= limit * OUTLIER_SLACK
+    return float(mean + OUTLIER_SIGMAS * np.sqrt(np.average((spread - mean) ** 2, weights=weights))) * OUTLIER_SLACK
 
 
 def _is_lonely(points: Float[np.ndarray, "n 3"], cell_m: float, num_neighbours: int) -> Bool[np.ndarray, " n"]:

@@ -24,7 +24,8 @@ from dpmjax.types import AnyArray, PointCloud
 
 MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
-# A table of 2 MB; a fortieth of the voxels of a large scan share a slot. The factor spreads them (Knuth).
+# At least two slots a point, in a table of 2 MB at most: a fortieth of the voxels of a large scan share a slot. The
+# factor spreads them (Knuth).
 HASH_FACTOR, TABLE_BITS = np.uint64(0x9E3779B97F4A7C15), 18
 
 MIN_COUNT_TO_WARN, MIN_SHARE_IN_RANGE = 20, 0.01
@@ -156,18 +157,17 @@ def preprocess_scan_on_host(
     Raises:
         ValueError: if the shapes do not match.
     """
-    tree, rows = filter_points(points, mask, config, num_threads=num_threads)
-    return as_cloud(tree.points.take(rows, axis=0), config)
+    return cloud_without_outliers(thin_points(points, mask, config, num_threads=num_threads), config)
 
 
-def filter_points(
+def thin_points(
     points: Float[np.ndarray, "n 3"],
     mask: Bool[np.ndarray, " n"] | None,
     config: PreprocessConfig,
     *,
     num_threads: int = 2,
-) -> tuple[HostTree, Int[np.ndarray, " k"]]:
-    """Applies the filters of `preprocess_scan` on the host, and keeps the tree that found the outliers.
+) -> HostTree:
+    """Applies the range and voxel filters of `preprocess_scan` on the host.
 
     Args:
         points: see `preprocess_scan_on_host`.
@@ -176,8 +176,7 @@ def filter_points(
         num_threads: threads of the neighbour search, at least 1.
 
     Returns:
-        A tree of the points that range and voxel leave, in their order, and the rows of those that are no outliers, of
-        which the farthest is exchanged with the first.
+        A tree of up to `config.capacity` remaining points, in their order.
 
     Raises:
         ValueError: if the shapes do not match.
@@ -189,29 +188,28 @@ def filter_points(
     _warn_if_out_of_range(points, mask, int(is_kept.sum()), config)
     kept = points.take(np.flatnonzero(is_kept), axis=0)  # four times faster than by the mask
     kept = kept[first_of_each_voxel(kept, config.voxel_size_m)]
-    tree = HostTree(kept[evenly_spaced(len(kept), config.capacity)], num_threads=num_threads)
+    return HostTree(kept[evenly_spaced(len(kept), config.capacity)], num_threads=num_threads)
+
+
+def cloud_without_outliers(tree: HostTree, config: PreprocessConfig) -> PointCloud:
+    """Applies the outlier filter of `preprocess_scan` on the host.
+
+    Args:
+        tree: points from `thin_points`.
+        config: number of neighbours, capacity.
+
+    Returns:
+        A cloud (capacity, 3), arrays of NumPy; the farthest point is exchanged with the first.
+    """
     rows = np.arange(len(tree.points))
     if config.num_outlier_neighbours > 0 and len(rows) > 1:
         rows = np.flatnonzero(find_inliers(tree, config.num_outlier_neighbours))
     if len(rows):
         farthest = int(np.argmax(np.square(tree.points.take(rows, axis=0)).sum(axis=1)))
         rows[[0, farthest]] = rows[[farthest, 0]]
-    return tree, rows
-
-
-def as_cloud(points: Float[np.ndarray, "k 3"], config: PreprocessConfig) -> PointCloud:
-    """Pads filtered points to the capacity.
-
-    Args:
-        points: metres, in the frame of the lidar; at most `config.capacity`.
-        config: capacity.
-
-    Returns:
-        The cloud, arrays of NumPy, float32.
-    """
     result = np.zeros((config.capacity, 3), np.float32)
-    result[: len(points)] = points
-    return PointCloud(result, np.arange(config.capacity) < len(points))
+    result[: len(rows)] = tree.points.take(rows, axis=0)
+    return PointCloud(result, np.arange(config.capacity) < len(rows))
 
 
 def _is_within(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Bool[np.ndarray, " n"]:
@@ -247,9 +245,10 @@ def first_of_each_voxel(points: Float[np.ndarray, "n 3"], voxel_size: float) -> 
         return np.zeros(0, np.int64)
     voxels = _numbered_voxels(points, voxel_size)
     # Each slot of a table keeps its first row: several times faster than sorting. A few voxels share their slot.
-    slots = (voxels.astype(np.uint64) * HASH_FACTOR >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
+    num_bits = min(TABLE_BITS, 1 + len(points).bit_length())
+    slots = (voxels.astype(np.uint64) * HASH_FACTOR >> np.uint64(64 - num_bits)).astype(np.intp)
     rows = np.arange(len(points))
-    table = np.full(1 << TABLE_BITS, len(points))
+    table = np.full(1 << num_bits, len(points))
     np.minimum.at(table, slots, rows)
     in_slot = table[slots]
     is_first = in_slot == rows

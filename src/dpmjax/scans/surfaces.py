@@ -16,6 +16,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from dpmjax.checks import as_host_points, require_count, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.planes import fit_planes
+from dpmjax.scans.outliers import largest_spread
 from dpmjax.scans.preprocess import first_of_each_voxel
 from dpmjax.types import SurfaceElements
 
@@ -102,7 +103,8 @@ def scan_surface(points: Float[np.ndarray, "n 3"], config: SurfaceConfig = Surfa
     points = points.take(np.flatnonzero(is_within), axis=0)
     points = points[first_of_each_voxel(points, config.voxel_size_m)].astype(np.float64)
     tree = HostTree(points)
-    normals, flatness = _normals(points, tree, config)
+    found = tree.nearest(points, min(config.num_neighbours, len(points)))
+    normals, flatness = _normals(points, points, found, config)
     return Surface(points, normals, flatness, _samples(normals, flatness), tree)
 
 
@@ -111,7 +113,7 @@ def surface_at(
     rows: Int[np.ndarray, " e"],
     config: SurfaceConfig = SurfaceConfig(),
     *,
-    is_counted: Bool[np.ndarray, " n"] | None = None,
+    weights: Float[np.ndarray, " e"] | None = None,
 ) -> Surface:
     """Estimates the surface of a thinned scan at some of its points, from the neighbours among all of them.
 
@@ -119,15 +121,21 @@ def surface_at(
 
     Args:
         tree: the points, metres, in the frame of the lidar.
-        rows: rows of the chosen points.
+        rows: rows of the chosen points; those in the order of the scan are searched faster.
         config: neighbourhoods; range and density are those of the points.
-        is_counted: False for points that belong to no neighbourhood, as outliers; None for none.
+        weights: number of points that each chosen one stands for, to leave out outliers (`scans.outliers`) by the same
+            neighbours; None to keep them.
 
     Returns:
         The surface; its points are those of the rows.
     """
     chosen = tree.points.take(rows, axis=0)
-    normals, flatness = _normals(chosen, tree, config, is_counted)
+    found = tree.nearest(chosen, min(config.num_neighbours, len(tree.points)))
+    if weights is not None and found[1].shape[1] > 1:
+        spread = found[1][:, 1:].mean(axis=1)
+        is_inlier = spread <= largest_spread(spread, weights)
+        chosen, found = chosen[is_inlier], (found[0][is_inlier], found[1][is_inlier])
+    normals, flatness = _normals(chosen, tree.points, found, config)
     return firm_surface(Surface(chosen, normals, flatness, np.arange(len(chosen)), HostTree(chosen)), MIN_FLATNESS)
 
 
@@ -179,20 +187,17 @@ def surface_of_elements(elements: SurfaceElements) -> Surface:
 
 def _normals(
     points: Float[np.ndarray, "n 3"],
-    tree: HostTree,
+    searched: Float[np.ndarray, "m 3"],
+    found: tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n k"]],
     config: SurfaceConfig,
-    is_counted: Bool[np.ndarray, " m"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Fits planes to the neighbours of points among those of a tree."""
-    num_neighbours = min(config.num_neighbours, len(tree.points))
-    if num_neighbours < MIN_NEIGHBOURS:
+    """Fits planes to the neighbours of points, which were found among all points of a scan."""
+    rows, distances = found
+    if rows.shape[1] < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    rows, distances = tree.nearest(points, num_neighbours)
     farthest_m = np.median(distances[:: max(1, len(points) // NUM_PROBED), -1]) if len(points) else 0.0
     is_near = distances < max(config.neighbour_radius_m, config.sparse_radius_share * farthest_m)
-    if is_counted is not None:
-        is_near &= is_counted.take(rows)
-    columns, own = (np.ascontiguousarray(values.T, np.float32) for values in (tree.points, points))
+    columns, own = (np.ascontiguousarray(values.T, np.float32) for values in (searched, points))
     # Neighbour by neighbour in memory: sums over them are several times faster.
     rows, is_near = rows.T, np.asfortranarray(is_near)
     x, y, z = ((column.take(rows) - middle).T for column, middle in zip(columns, own, strict=True))

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy import fft
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
@@ -144,7 +143,10 @@ def T_level_lidar(surface: Surface, min_flatness: float = MIN_FLATNESS) -> Pose:
             return T
         up = normals[is_ground].sum(axis=0)
         up /= np.linalg.norm(up)
-    T[:3, :3] = Rotation.align_vectors([[0, 0, 1.0]], [up])[0].as_matrix()
+    # The shortest turn that takes `up` to the z axis; `up` is never opposite to it.
+    x, y, z = up
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    T[:3, :3] += cross + cross @ cross / (1 + z)
     T[2, 3] = -np.median(points[is_ground] @ up)
     return T
 

@@ -67,28 +67,22 @@ class LoopClosureConfig:
 
     Attributes:
         is_on: False leaves the map as odometry makes it.
-        num_near: largest number of candidates by distance.
         num_similar: largest number of candidates by retrieval.
         min_overlap: smallest overlap probability of a candidate that is registered.
-        num_asked: number of candidates whose overlap is predicted at a time, alternately by distance and by retrieval.
-        num_registered: largest number of candidates that are registered.
         min_probability: smallest P(correct) of an accepted registration.
         min_support: smallest number of consistent registrations, its own included, with which a loop becomes an edge.
     """
 
     is_on: bool = True
-    num_near: int = 6
     num_similar: int = 6
     min_overlap: float = 0.3
-    num_asked: int = 4
-    num_registered: int = 2
     min_probability: float = 0.5
     min_support: int = 2
 
     def __post_init__(self) -> None:
         require_fields(self, "min_overlap", "min_probability", low=0, high=1)
-        require_fields(self, "min_support", "num_registered", "num_asked", low=1)
-        require_fields(self, "num_near", "num_similar", low=0)
+        require_fields(self, "min_support", low=1)
+        require_fields(self, "num_similar", low=0)
 
 
 @dataclass(frozen=True)

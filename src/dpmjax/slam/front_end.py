@@ -19,6 +19,7 @@ from dpmjax.scans.weak_directions import diagonal_information, sigma_along
 from dpmjax.slam.interfaces import Alignment, Match, PreparedInput, Proposal, SlamMethods
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, add_keyframe, with_origin
 from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, local_map_of, placed_scan, with_scan
+from dpmjax.slam.surface_geometry import SAME_M, SAME_RAD
 from dpmjax.types import Information, Pose
 
 # Turn between keyframes at a smaller distance.
@@ -49,9 +50,10 @@ SURE_PROBABILITY = 0.9
 # decoder it is this share of the usual score.
 MIN_LEAD, UNSURE_LEAD_SHARE = 0.1, 0.5
 
-# Number of scans whose median is the usual score, and of those before which the decoder proposes every pose: a wrong
-# pose among the first scans makes low scores usual.
-USUAL_WINDOW, NUM_USUAL = 20, 10
+# Number of scans whose median is the usual score. The decoder proposes each of the first poses, because one wrong pose
+# there would make low scores usual: NUM_USUAL of them, or until it has led to the pose of the last motion NUM_AGREED
+# times in a row.
+USUAL_WINDOW, NUM_USUAL, NUM_AGREED = 20, 10, 4
 
 # Standard deviation of a predicted translation.
 GUESS_M = 1.0
@@ -135,6 +137,7 @@ class FrontEndState(NamedTuple):
         dropped: the same where the method is "descriptors", with their registrations; None for an empty scan.
         keyframe_ratio: factor of the distance of keyframes where the method is "descriptors"; None before the first.
         num_coasting: number of scans since the way along a corridor was known.
+        num_agreed: number of scans in a row, among the first, whose pose the last motion and the decoder lead to.
     """
 
     num_scans: int = 0
@@ -147,6 +150,12 @@ class FrontEndState(NamedTuple):
     dropped: tuple[RegisteredScan | None, ...] = ()
     keyframe_ratio: float | None = None
     num_coasting: int = 0
+    num_agreed: int = 0
+
+    @property
+    def is_settled(self) -> bool:
+        """True once the usual score rests on right poses."""
+        return len(self.scores) >= NUM_USUAL or self.num_agreed >= NUM_AGREED
 
     @property
     def predicted(self) -> Pose:
@@ -187,6 +196,8 @@ def place_scan(
     state = state._replace(local_map=local_map)
     located = _Search(methods, state, local_map, thinned, scan.compact).located(report)
     report = located.report
+    if not state.is_settled:
+        state = state._replace(num_agreed=state.num_agreed + 1 if located.is_agreed else 0)
     if report.status == "restarted" or _is_keyframe(methods, report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after = _advanced(state, report)
@@ -216,18 +227,22 @@ def empty_reason(scan: PreparedInput) -> str:
 
 
 class _Located(NamedTuple):
-    # The pose and why it was accepted; its information in the tangent of the scan; the scan, if it was encoded.
+    # The pose and why it was accepted; its information in the tangent of the scan; the scan, if it was encoded; True
+    # where the last motion and the decoder lead to one pose.
     report: ScanReport
     information: Information
     compact: CompactScan | None = None
+    is_agreed: bool = False
 
 
 class _Attempt(NamedTuple):
-    # The best pose; that from the prediction and other motions; the poses that the decoder proposes.
+    # The best pose; that from the prediction and other motions; the poses that the decoder proposes; the encoded scan;
+    # True where prediction and decoder lead to one pose.
     best: Alignment
     tracked: Alignment | None
     proposal: Proposal | None = None
     compact: CompactScan | None = None
+    is_agreed: bool = False
 
 
 class _Search(NamedTuple):
@@ -268,7 +283,8 @@ class _Search(NamedTuple):
             reason += ", nothing faces the axis of the corridor"
         # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
         report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
-        return _Located(report._replace(score=best.score, probability=probability), information, tried.compact)
+        report = report._replace(score=best.score, probability=probability)
+        return _Located(report, information, tried.compact, tried.is_agreed)
 
     def _guess(self, tried: _Attempt) -> Pose:
         """Returns the guessed pose of a rejected scan, aligned with the lost scans, too: behind a door the map ends."""
@@ -285,11 +301,11 @@ class _Search(NamedTuple):
         (matcher, geometry, config, _), state, local_map, scan, compact = self
         predicted, is_predicted = state.predicted, config.odometry.proposer == "prediction"
         good_score = max(MIN_SCORE, GOOD_SHARE * state.usual_score)
-        tracked = None
+        tracked, is_agreed, min_probability = None, False, config.front_end.min_probability
         # The second scan of a drive has no last motion.
         if is_predicted and state.scores:
             tracked = geometry.align(local_map, scan, predicted)
-            if tracked.score >= good_score and len(state.scores) >= NUM_USUAL:
+            if tracked.score >= good_score and state.is_settled:
                 return _Attempt(tracked, tracked)
         compact = matcher.encode(scan) if compact is None else compact
         row = local_map.nearest(predicted[:3, 3])
@@ -299,15 +315,19 @@ class _Search(NamedTuple):
         if tracked is None and (is_predicted or matched.score < good_score):
             tracked = geometry.align(local_map, scan, predicted)
         if tracked is not None:
-            if matched.score < good_score or not are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD):
+            is_agreed = are_near(tracked.T_map_scan, matched.T_map_scan, SAME_M, SAME_RAD)
+            is_agreed &= proposal.probability >= min_probability
+            is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, PLACE_RAD)
+            # At a low score, too, no further starts are needed where a sure decoder leads to the same pose.
+            if not is_agreed and (matched.score < good_score or not is_near):
                 others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
                 tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
             # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
             is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, np.inf)
-            is_sure = is_near or proposal.probability >= config.front_end.min_probability
+            is_sure = is_near or proposal.probability >= min_probability
             lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
             best = _better_of(tracked, matched, lead if state.scores else 0.0)
-        return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact)
+        return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact, is_agreed)
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
@@ -395,7 +415,7 @@ def _advanced(state: FrontEndState, report: ScanReport) -> FrontEndState:
         return after
     after = after._replace(lost=(), num_coasting=num_coasting + 1 if report.status == "coasting" else 0)
     if report.status in ("first", "restarted"):
-        return after._replace(scores=())
+        return after._replace(scores=(), num_agreed=0)
     T_before_last = rigid.inverse(state.T_keyframe_last) @ T
     # The error along a corridor is that of all scans since it was known, and not of the last step.
     before_m = state.T_before_last[:3, 3]

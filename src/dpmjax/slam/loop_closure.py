@@ -49,6 +49,16 @@ EVERY_KEYFRAMES = 8
 # Share of all keyframes between two optimisations, so that the cost of a scan does not grow with the map.
 EVERY_SHARE = 0.05
 
+# Largest number of candidates by distance: more find loops after a longer drift, at the cost of their overlap.
+NUM_NEAR = 6
+
+# Number of candidates whose overlap is predicted at a time, alternately by distance and by retrieval: one that surely
+# overlaps ends the search after fewer of them.
+NUM_ASKED = 4
+
+# Largest number of registrations of a keyframe; each takes as long as some scans.
+NUM_REGISTERED = 2
+
 # Largest number of further registrations after an optimisation.
 MAX_AGAIN = 4
 
@@ -169,7 +179,7 @@ def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates
     loops = _with_overlaps(methods, slam_map, candidates)
     overlapping = [number for number, loop in enumerate(loops) if loop.status == "not registered"]
     overlapping.sort(key=lambda number: -(loops[number].overlap or 0.0))
-    for number in overlapping[: config.num_registered]:
+    for number in overlapping[:NUM_REGISTERED]:
         loop = loops[number]
         source, target = (submap_around(slam_map, row, num_submap) for row in loop[:2])
         (match,) = methods.matcher.register([(source, target)])
@@ -182,8 +192,8 @@ def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates
 def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list[Loop]) -> list[Loop]:
     """Predicts the overlap, some candidates at a time, until one surely overlaps; the remaining ones do not change."""
     config, loops = methods.config.loops, list(candidates)
-    for start in range(0, len(candidates), config.num_asked):
-        some = candidates[start : start + config.num_asked]
+    for start in range(0, len(candidates), NUM_ASKED):
+        some = candidates[start : start + NUM_ASKED]
         scans = [slam_map.keyframes[loop.target].compact for loop in some]
         overlaps = methods.matcher.overlaps(slam_map.keyframes[some[0].source].compact, scans).tolist()
         for number, overlap in enumerate(overlaps, start):
@@ -203,7 +213,7 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
     Args:
         slam_map: the map.
         row: row of the new keyframe.
-        config: largest numbers of candidates.
+        config: largest number of candidates by retrieval.
 
     Returns:
         Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
@@ -213,7 +223,7 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
     apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
     is_near = is_old & (apart_m <= np.minimum(RADIUS_SHARE * extent_m + DRIFT_SHARE * since_m, MAX_RADIUS_M))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
-    near = _spread(near, slam_map, extent_m / 2, config.num_near)
+    near = _spread(near, slam_map, extent_m / 2, NUM_NEAR)
     by_distance = [Loop(row, int(other), "distance") for other in near]
     by_retrieval = [loop for loop in similar_keyframes(slam_map, row, is_old, config) if loop.target not in near]
     in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))

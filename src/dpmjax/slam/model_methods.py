@@ -28,6 +28,7 @@ from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.align import align_on_host
 from dpmjax.scans.lidar import Scan
 from dpmjax.scans.pairs import nearest_planes
+from dpmjax.scans.preprocess import cloud_without_outliers
 from dpmjax.scans.weak_directions import diagonal_information, plane_information
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.interfaces import Match, Proposal, SlamMethods
@@ -77,9 +78,9 @@ class NetworkMatcher:
             ValueError: if the scan has no thinned points.
         """
         config = self._model.config
-        if scan.cloud is None:
+        if scan.thinned is None:
             raise ValueError("scan: expected the thinned points of lidar_scan, got none")
-        pyramid = pyramid_of_cloud(scan.cloud, config)
+        pyramid = pyramid_of_cloud(cloud_without_outliers(scan.thinned, config.preprocess), config)
         cloud = encode_pyramid(self._model, pyramid, num_elements=config.pyramid.stages[0].num_points)
         return compact_scan(jax.device_get(cloud), scan.image)
 

@@ -55,8 +55,9 @@ FLOOR_RAD = 0.001
 # Number of elements of the local map that are compared with the free space of a scan.
 MAX_VIEWED = 4000
 
-# Number of starts of a search that are aligned finely.
-NUM_FINE = 3
+# Largest number of coarse poses of a search that are aligned finely, and largest distance and turn between two of them
+# that are one: with a larger one, a start in another valley may be lost.
+NUM_FINE, SAME_M, SAME_RAD = 3, 0.1, 0.02
 
 # Alignment from a first guess that is nearly right, and from other starts.
 NARROW = (AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1))
@@ -71,14 +72,10 @@ class SurfaceGeometry:
 
     Args:
         model_config: preprocessing and pyramid of the encoder.
-        spacing: factor of the usual distance of elements, by which the radii of pairs grow.
     """
 
-    def __init__(self, model_config: ModelConfig, *, spacing: float = 1.0) -> None:
-        self._model_config, self._plane_radius_m = model_config, spacing * PLANE_RADIUS_M
-        self._narrow, self._wide = (
-            tuple(level._replace(radius_m=spacing * level.radius_m) for level in levels) for levels in (NARROW, WIDE)
-        )
+    def __init__(self, model_config: ModelConfig) -> None:
+        self._model_config = model_config
 
     def thin(self, points: Float[np.ndarray, "n 3"]) -> Scan | None:
         """Thins a scan as the encoder does, and estimates its surface; see `Geometry`.
@@ -102,7 +99,7 @@ class SurfaceGeometry:
         Returns:
             The pose.
         """
-        return self._aligned(local_map, scan, T_map_scan[None])[0]
+        return _aligned(local_map, scan, T_map_scan[None])[0]
 
     def search(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Alignment:
         """Aligns all first guesses coarsely and the best of them finely; see `Geometry`.
@@ -115,10 +112,10 @@ class SurfaceGeometry:
         Returns:
             The pose under which most elements meet planes and fewest lie in free space.
         """
-        coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, self._wide).T_target_source
-        matched = _matched_shares(scan.surface, self._planes(local_map, scan, coarse, NUM_SAMPLES // 3))
-        best = np.argsort(-matched, kind="stable")[:NUM_FINE]
-        return max(self._aligned(local_map, scan, coarse[best]), key=lambda found: found.score)
+        coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, WIDE).T_target_source
+        matched = _matched_shares(scan.surface, _planes(local_map, scan, coarse, NUM_SAMPLES // 3))
+        best = _distinct(coarse[np.argsort(-matched, kind="stable")])
+        return max(_aligned(local_map, scan, best), key=lambda found: found.score)
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
         """Returns variants of the predicted step, steps straight ahead, and turns on the spot; see `Geometry`.
@@ -144,17 +141,34 @@ class SurfaceGeometry:
         rotations, translations = (np.array(parts) for parts in zip(*motions, strict=True))
         return homogeneous(rotations, translations)
 
-    def _aligned(self, local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
-        T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), self._narrow).T_target_source
-        planes = self._planes(local_map, scan, T, ALL if scan.weak_axis is not None else NUM_SAMPLES)
-        matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
-        scores = matched - CONTRADICTION_WEIGHT * contradicted
-        columns = (column.tolist() for column in (matched, contradicted, scores))
-        information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
-        return list(map(Alignment, T, *columns, information))
 
-    def _planes(self, local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
-        return nearest_planes(scan.surface, local_map.surface, T_map_scan, self._plane_radius_m, num_samples)
+def _aligned(local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
+    """Aligns from first guesses that are nearly right, and compares the scan with the map there."""
+    T = align_on_host(scan.surface, local_map.surface, orthonormal(starts), NARROW).T_target_source
+    planes = _planes(local_map, scan, T, ALL if scan.weak_axis is not None else NUM_SAMPLES)
+    matched, contradicted = _matched_shares(scan.surface, planes), _contradicted_shares(local_map, scan, T)
+    scores = matched - CONTRADICTION_WEIGHT * contradicted
+    columns = (column.tolist() for column in (matched, contradicted, scores))
+    information = (_information(scan, planes.take(row), pose) for row, pose in enumerate(T))
+    return list(map(Alignment, T, *columns, information))
+
+
+def _planes(local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
+    return nearest_planes(scan.surface, local_map.surface, T_map_scan, PLANE_RADIUS_M, num_samples)
+
+
+def _distinct(poses: Poses) -> Poses:
+    """Returns the first poses that are apart from one another: starts of one valley end coarsely at one pose."""
+    kept = poses[:1]
+    for pose in poses[1:]:
+        if len(kept) == NUM_FINE:
+            break
+        apart_m = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
+        # The Frobenius norm of the difference of two rotations is the root of 2 times a small angle between them.
+        apart_rad = np.linalg.norm(kept[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(2)
+        if ((apart_m > SAME_M) | (apart_rad > SAME_RAD)).all():
+            kept = np.concatenate([kept, pose[None]])
+    return kept
 
 
 def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
