@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -128,8 +129,8 @@ def step_to_planes(
         normals: normals of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
         weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
-        prior: present motion T (..., d+1, d+1), expected motion, and information (k, k) about the latter; None for
-            none.
+        prior: present motion T (..., d+1, d+1), expected motion, and the information (..., k, k) about it: of the
+            position of the origin of the moved side, and of its turn, in the fixed frame; None for none.
 
     Returns:
         The step, 0 where no pair counts; and the information (..., k, k) of the pairs about its centre.
@@ -147,10 +148,13 @@ def step_to_planes(
     damping = 1e-6 * diagonal + floor + np.finfo(points.dtype).tiny
     if prior is not None:
         T, T_prior, of_prior = prior
-        system = system + of_prior
-        gradient = gradient + rigid.matmul(of_prior, _offset_about(T, T_prior, centre)[..., None])
-    tangent = -xp.linalg.solve(system + damping[..., None] * np.eye(system.shape[-1], dtype=points.dtype), gradient)
-    return PlaneStep(tangent[..., 0], centre), information
+        moves = _moves_of_origin(T, centre)
+        weighted_moves = rigid.matmul(xp.swapaxes(moves, -1, -2), of_prior)
+        system = system + rigid.matmul(weighted_moves, moves)
+        gradient = gradient + rigid.matmul(weighted_moves, _offset(T, T_prior)[..., None])
+    damped = system + damping[..., None] * np.eye(system.shape[-1], dtype=points.dtype)
+    tangent = -_solve_positive(damped, gradient[..., 0])
+    return PlaneStep(tangent, centre), information
 
 
 def _torques(levers: Any, forces: Any) -> Any:
@@ -160,14 +164,60 @@ def _torques(levers: Any, forces: Any) -> Any:
     return xp.stack([levers[..., i] * forces[..., j] - levers[..., j] * forces[..., i] for i, j in axes], axis=-2)
 
 
-def _offset_about(T: Any, T_prior: Any, centre: Any) -> Any:
-    """Returns the small motion (..., k) from a prior to `T`, to first order: shift of the centre, then the turn."""
-    xp, dim = rigid.namespace_of(T), T.shape[-1] - 1
-    T_here_prior = rigid.matmul(T, rigid.inverse(T_prior))
-    turn = T_here_prior[..., :dim, :dim]
-    shift = rigid.matmul(turn, centre[..., None])[..., 0] + T_here_prior[..., :dim, dim] - centre
+def information_about_origin(information: Any, T: Any, centre: Any) -> Any:
+    """Moves the information of pairs from the centre of a step to the origin of the moved side.
+
+    Args:
+        information: (..., k, k) of the shift and the turn about the centre, in the fixed frame.
+        T: (..., d+1, d+1) motion of the moved side.
+        centre: (..., d) of the step.
+
+    Returns:
+        (..., k, k) information of the position of the origin and of the turn, in the fixed frame.
+    """
+    xp = rigid.namespace_of(information)
+    back = 2 * xp.eye(information.shape[-1], dtype=information.dtype) - _moves_of_origin(T, centre)
+    return rigid.matmul(xp.swapaxes(back, -1, -2), rigid.matmul(information, back))
+
+
+def _moves_of_origin(T: Any, centre: Any) -> Any:
+    """Returns the matrices (..., k, k) from a step about a centre to the motion of the origin of the moved side."""
+    xp, dim = rigid.namespace_of(T, centre), centre.shape[-1]
+    axes = xp.broadcast_to(xp.eye(dim, dtype=centre.dtype), (*centre.shape, dim))
+    levers = xp.broadcast_to((T[..., :dim, dim] - centre)[..., None, :], axes.shape)
+    by_turns = xp.swapaxes(_torques(levers, axes), -1, -2)
+    last = xp.eye(dim + by_turns.shape[-1], dtype=centre.dtype)[dim:]
+    top = xp.concatenate([axes, by_turns], axis=-1)
+    return xp.concatenate([top, xp.broadcast_to(last, (*centre.shape[:-1], *last.shape))], axis=-2)
+
+
+def _offset(T: Any, T_prior: Any) -> Any:
+    """Returns the small motion (..., k) from a prior to `T`: of the origin, then the turn to first order."""
+    xp, dim = rigid.namespace_of(T, T_prior), T.shape[-1] - 1
+    turn = rigid.matmul(T[..., :dim, :dim], xp.swapaxes(T_prior[..., :dim, :dim], -1, -2))
     rows, columns = ([1], [0]) if dim == 2 else ([2, 0, 1], [1, 2, 0])
+    shift = T[..., :dim, dim] - T_prior[..., :dim, dim]
     return xp.concatenate([shift, (turn[..., rows, columns] - turn[..., columns, rows]) / 2], axis=-1)
+
+
+def _solve_positive(matrix: Any, right: Any) -> Any:
+    """Solves positive definite systems (..., k, k) by Cholesky's factors.
+
+    For small matrices of JAX the loops are unrolled: a general solver compiles for seconds.
+    """
+    if rigid.namespace_of(matrix) is np:
+        return np.linalg.solve(matrix, right[..., None])[..., 0]
+    size, factor = matrix.shape[-1], {}
+    solution: list[Any] = []
+    for i in range(size):
+        for j in range(i + 1):
+            rest = matrix[..., i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
+            factor[i, j] = rest / factor[j, j] if j < i else rest**0.5
+        solution.append((right[..., i] - sum(factor[i, k] * solution[k] for k in range(i))) / factor[i, i])
+    for i in reversed(range(size)):
+        above = sum(factor[k, i] * solution[k] for k in range(i + 1, size))
+        solution[i] = (solution[i] - above) / factor[i, i]
+    return jnp.stack(solution, axis=-1)
 
 
 def motion_about(step: PlaneStep) -> Any:

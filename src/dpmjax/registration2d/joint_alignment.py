@@ -18,7 +18,7 @@ import scipy.spatial
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_rows, take_rows
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.pair_alignment import Schedule, linearise_pairs
+from dpmjax.registration2d.pair_alignment import Schedule, align_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, held_steps, pose_steps, prior_steps, slide_steps
@@ -62,9 +62,7 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
             pairs = _choose_aligned(scans, poses, radius, prior)
             steps = join_rows(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
-        edges, gradient = _linearise(scans, pairs, poses, scale)
-        held, pull = _linearise_edges(steps, poses)
-        poses = se2.compose(poses, solve_step(len(poses), join_rows(edges, held), np.concatenate([gradient, pull])))
+        poses = _relax(join_rows(_align_pairs(scans, pairs, poses, scale), steps), poses, 1)
     return poses
 
 
@@ -85,7 +83,8 @@ def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: 
     if not len(pairs.held.source):
         return adjusted
     scale = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)[-1]
-    edges, _ = _linearise(scans, pairs, adjusted, scale)
+    edges = _align_pairs(scans, pairs, adjusted, scale)
+    edges = edges._replace(measurements=se2.relative(adjusted[edges.target], adjusted[edges.source]))
     kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
     # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
@@ -242,10 +241,11 @@ def choose_pairs(poses: Floats, radius: float) -> Pairs:
     return source.astype(np.int64), rows[source, column].astype(np.int64)
 
 
-def _linearise(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: Floats) -> tuple[Edges, Floats]:
-    """Linearises all pairs at these poses, gate and kernel."""
+def _align_pairs(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: Floats) -> Edges:
+    """Returns edges of all pairs after one step of their alignment from these poses, at this gate and kernel."""
     source, target, across, _ = pairs
-    relative = se2.relative(poses[target], poses[source])
+    relative = np.asarray(se2.relative(poses[target], poses[source]))
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
-    information, gradient = linearise_pairs(scans, source, target, relative, scale, stride=stride)
-    return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)
+    sides = scans.elements(stride=stride), scans.elements()
+    aligned, _, information = align_pairs(sides, (source, target), relative, scale[None])
+    return Edges(source, target, aligned, across @ information @ across)

@@ -7,6 +7,7 @@ because its noise is parallel to the wall. The lines are eliminated, so each res
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -19,7 +20,8 @@ from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.kept_programs import kept_jit
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans
+from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.types import SurfaceElements
 
 # The nearest beam of a neighbour, and this number of beams to either side of it, may be part of the line.
 _NUM_BESIDE = 2
@@ -76,21 +78,23 @@ class _Fit(NamedTuple):
 
 
 @kept_jit()
-def _find_nearest(own: Lines, others: Lines, poses: Float[Array, "s 3"]) -> Int[Array, "b s"]:
+def _find_nearest(own: SurfaceElements, others: SurfaceElements, poses: Float[Array, "s 3"]) -> Int[Array, "b s"]:
     """Finds the beam of each neighbouring scan that ends nearest to each beam."""
-    search = jax.vmap(lambda some, mask: k_nearest(own.points, some, 1, mask=mask).indices[:, 0], out_axes=1)
-    return search(se2.transform_points(poses, others.points), others.mask)
+    search = jax.vmap(lambda some, mask: k_nearest(own.positions, some, 1, mask=mask).indices[:, 0], out_axes=1)
+    return search(se2.transform_points(poses, others.positions), others.mask)
 
 
-def _gather_beams(own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Array, noise: Array) -> _Beams:
+def _gather_beams(
+    own: SurfaceElements, others: SurfaceElements, nearest: Int[Array, "b s"], poses: Array, noise: Array
+) -> _Beams:
     """Gathers, for each beam, the beams of nearby scans that hit the same side of the same surface."""
-    points = se2.transform_points(poses, others.points)
+    points = se2.transform_points(poses, others.positions)
     normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), others.normals)
     index = nearest[..., None] + jnp.arange(-_NUM_BESIDE, _NUM_BESIDE + 1)
     is_inside = (index >= 0) & (index < points.shape[1])
     index, scan = jnp.clip(index, 0, points.shape[1] - 1), jnp.arange(len(points))[:, None]
     found_x, found_y = points[..., 0][scan, index], points[..., 1][scan, index]
-    x, y = found_x - own.points[:, :1, None], found_y - own.points[:, 1:, None]
+    x, y = found_x - own.positions[:, :1, None], found_y - own.positions[:, 1:, None]
     squared = x**2 + y**2
     cosine = own.normals[:, :1, None] * normals[..., 0][scan, index]
     cosine += own.normals[:, 1:, None] * normals[..., 1][scan, index]
@@ -137,12 +141,16 @@ def _wide(values: Float[Array, " b"]) -> Float[Array, "b 1 1"]:
 
 @kept_jit()
 def _linearise(
-    own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"], noise: Float[Array, ""]
-) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
+    own: SurfaceElements,
+    others: SurfaceElements,
+    nearest: Int[Array, "b s"],
+    poses: Float[Array, "s 3"],
+    noise: Float[Array, ""],
+) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:  # fmt: skip
     """Computes J^T W J and J^T W r of one scan; the first of `others` is the scan itself, at pose zero."""
     beams = _gather_beams(own, others, nearest, poses, noise)
     lines = _fit_lines(beams, jnp.asarray(own.normals), noise)
-    (x, y), (own_x, own_y) = (lines.x[:, None], lines.y[:, None]), own.points.T
+    (x, y), (own_x, own_y) = (lines.x[:, None], lines.y[:, None]), own.positions.T
     across = _wide(lines.x) * beams.x + _wide(lines.y) * beams.y
     residual = -(lines.shares * across).sum((1, 2))
     slant = lines.x * own_x + lines.y * own_y
@@ -193,7 +201,7 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
         return poses
     for _ in range(_NUM_ROUNDS):
         around = _choose_around(poses, _RADIUS * scans.typical_range)
-        pairs = [_lines_around(scans, rows) for rows in around]
+        pairs = [_beams_around(scans, rows) for rows in around]
         relative = _relative_to_own(poses, around)
         nearest = [_find_nearest(*lines, T) for lines, T in zip(pairs, relative, strict=True)]
         for _ in range(_NUM_ITERATIONS):
@@ -204,11 +212,11 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
     return poses
 
 
-def _lines_around(scans: PlanarScans, rows: Indices) -> tuple[Lines, Lines]:
-    """Returns the lines of the first scan, and those of all; repetitions of the first scan have none."""
-    others = scans.lines(rows)
+def _beams_around(scans: PlanarScans, rows: Indices) -> tuple[SurfaceElements, SurfaceElements]:
+    """Returns the beams on lines of the first scan, and of all; repetitions of the first scan have none."""
+    own, others = (replace(scans.elements(some), positions=scans.points[some]) for some in (rows[0], rows))
     is_other = (rows != rows[0]) | (np.arange(len(rows)) == 0)
-    return scans.lines(rows[0]), others._replace(mask=others.mask & is_other[:, None])
+    return own, replace(others, mask=others.mask & is_other[:, None])
 
 
 def _relative_to_own(poses: Floats, around: Indices) -> Float[np.ndarray, "n s 3"]:
