@@ -119,6 +119,8 @@ def step_to_planes(
     residuals: Float[AnyArray, "*b n"],
     weights: Float[AnyArray, "*b n"],
     prior: tuple[Any, Any, Any] | None = None,
+    *,
+    damping: float = 1e-6,
 ) -> tuple[PlaneStep, Any]:
     """Solves the weighted normal equations of point-to-plane alignment (Chen and Medioni 1992), d = 2 or 3.
 
@@ -131,6 +133,7 @@ def step_to_planes(
         weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
         prior: present motion T (..., d+1, d+1), expected motion, and the information (..., k, k) about it: of the
             position of the origin of the moved side, and of its turn, in the fixed frame; None for none.
+        damping: share of each unknown's own information that is added to it.
 
     Returns:
         The step, 0 where no pair counts; and the information (..., k, k) of the pairs about its centre.
@@ -139,26 +142,26 @@ def step_to_planes(
     counted = (weights > 0).astype(points.dtype)
     count = xp.maximum(counted.sum(axis=-1), 1)[..., None]
     centre = rigid.matmul(counted[..., None, :], points)[..., 0, :] / count
-    jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), _torques(points - centre[..., None, :], normals)], axis=-2)
+    jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), torques(points - centre[..., None, :], normals)], axis=-2)
     weighted = weights[..., None, :] * jacobian
     information = rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2))
     gradient, system = rigid.matmul(weighted, residuals[..., None]), information
     diagonal = xp.diagonal(system, axis1=-2, axis2=-1)
     floor = max(1e-9, float(np.finfo(points.dtype).eps)) * diagonal.sum(axis=-1, keepdims=True)
-    damping = 1e-6 * diagonal + floor + np.finfo(points.dtype).tiny
+    added = damping * diagonal + floor + np.finfo(points.dtype).tiny
     if prior is not None:
         T, T_prior, of_prior = prior
         moves = _moves_of_origin(T, centre)
         weighted_moves = rigid.matmul(xp.swapaxes(moves, -1, -2), of_prior)
         system = system + rigid.matmul(weighted_moves, moves)
         gradient = gradient + rigid.matmul(weighted_moves, _offset(T, T_prior)[..., None])
-    damped = system + damping[..., None] * np.eye(system.shape[-1], dtype=points.dtype)
+    damped = system + added[..., None] * np.eye(system.shape[-1], dtype=points.dtype)
     tangent = -_solve_positive(damped, gradient[..., 0])
     return PlaneStep(tangent, centre), information
 
 
-def _torques(levers: Any, forces: Any) -> Any:
-    """Returns cross products (..., 1, n) in the plane, (..., 3, n) in space, of vectors (..., n, d)."""
+def torques(levers: Any, forces: Any) -> Any:
+    """Computes the cross products of levers and forces (..., n, d): (..., 1, n) in the plane, (..., 3, n) in space."""
     xp, dim = rigid.namespace_of(levers, forces), levers.shape[-1]
     axes = [(0, 1)] if dim == 2 else [(1, 2), (2, 0), (0, 1)]
     return xp.stack([levers[..., i] * forces[..., j] - levers[..., j] * forces[..., i] for i, j in axes], axis=-2)
@@ -185,7 +188,7 @@ def _moves_of_origin(T: Any, centre: Any) -> Any:
     xp, dim = rigid.namespace_of(T, centre), centre.shape[-1]
     axes = xp.broadcast_to(xp.eye(dim, dtype=centre.dtype), (*centre.shape, dim))
     levers = xp.broadcast_to((T[..., :dim, dim] - centre)[..., None, :], axes.shape)
-    by_turns = xp.swapaxes(_torques(levers, axes), -1, -2)
+    by_turns = xp.swapaxes(torques(levers, axes), -1, -2)
     last = xp.eye(dim + by_turns.shape[-1], dtype=centre.dtype)[dim:]
     top = xp.concatenate([axes, by_turns], axis=-1)
     return xp.concatenate([top, xp.broadcast_to(last, (*centre.shape[:-1], *last.shape))], axis=-2)
@@ -207,12 +210,13 @@ def _solve_positive(matrix: Any, right: Any) -> Any:
     """
     if rigid.namespace_of(matrix) is np:
         return np.linalg.solve(matrix, right[..., None])[..., 0]
-    size, factor = matrix.shape[-1], {}
+    size, factor, eps = matrix.shape[-1], {}, float(np.finfo(matrix.dtype).eps)
     solution: list[Any] = []
     for i in range(size):
         for j in range(i + 1):
             rest = matrix[..., i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
-            factor[i, j] = rest / factor[j, j] if j < i else rest**0.5
+            # Rounding may make the last pivots negative.
+            factor[i, j] = rest / factor[j, j] if j < i else jnp.maximum(rest, eps * matrix[..., i, i]) ** 0.5
         solution.append((right[..., i] - sum(factor[i, k] * solution[k] for k in range(i))) / factor[i, i])
     for i in reversed(range(size)):
         above = sum(factor[k, i] * solution[k] for k in range(i + 1, size))

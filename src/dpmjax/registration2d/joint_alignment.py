@@ -62,7 +62,7 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
             pairs = _choose_aligned(scans, poses, radius, prior)
             steps = join_rows(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
-        poses = _relax(join_rows(_align_pairs(scans, pairs, poses, scale), steps), poses, 1)
+        poses = relax_edges(join_rows(_align_pairs(scans, pairs, poses, scale), steps), poses, 1)
     return poses
 
 
@@ -89,7 +89,7 @@ def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: 
     # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
     edges = join_rows(edges, pairs.held._replace(measurements=kept, information=information))
-    return _relax(edges, adjusted, _NUM_OPEN_ROUNDS)
+    return relax_edges(edges, adjusted, _NUM_OPEN_ROUNDS)
 
 
 def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float, prior: StepPrior) -> Floats | None:
@@ -115,9 +115,7 @@ def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float
     weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
     restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
     edges = join_rows(_fitting_pairs(scans, poses, radius), Edges(later, later - 1, restored, weights))
-    scale = np.diag([1.0, 1.0, scans.typical_range**2])
-    edges = edges._replace(information=edges.information[:, None, None] * scale)
-    return _relax(edges, poses, _NUM_TORN_ROUNDS)
+    return _relax_scored(edges, poses, scans.typical_range)
 
 
 def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: float) -> Floats:
@@ -139,13 +137,15 @@ def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: floa
     # Scans that have collapsed onto each other hold each other there.
     is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > _FAR_STEPS)
     restored = np.where(is_moved[:, None], slides.moved(steps), steps)
-    edges = join_rows(
-        take_rows(pairs, np.flatnonzero(is_kept)),
-        Edges(later, later - 1, restored, np.maximum(slides.scores, _LEAST_WEIGHT)),
-    )
-    scale = np.diag([1.0, 1.0, scans.typical_range**2])
-    edges = edges._replace(information=edges.information[:, None, None] * scale)
-    return _relax(edges, poses, _NUM_TORN_ROUNDS)
+    chain = Edges(later, later - 1, restored, np.maximum(slides.scores, _LEAST_WEIGHT))
+    edges = join_rows(take_rows(pairs, np.flatnonzero(is_kept)), chain)
+    return _relax_scored(edges, poses, scans.typical_range)
+
+
+def _relax_scored(edges: Edges, poses: Floats, typical_range: float) -> Floats:
+    """Returns the poses that agree with edges whose information is their scores (e,)."""
+    scale = np.diag([1.0, 1.0, typical_range**2])
+    return relax_edges(edges._replace(information=edges.information[:, None, None] * scale), poses, _NUM_TORN_ROUNDS)
 
 
 def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
@@ -159,17 +159,28 @@ def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
     return Edges(source[fits], target[fits], relative[fits], scores[fits])
 
 
-def _linearise_edges(edges: Edges, poses: Floats) -> tuple[Edges, Floats]:
-    """Returns the edges at the relative poses of these poses, and J^T W r (e, 3), as `solve_step` takes them."""
-    here = se2.relative(poses[edges.target], poses[edges.source])
-    pull = np.einsum("eij,ej->ei", edges.information, se2.relative(edges.measurements, here))
-    return edges._replace(measurements=here), pull
+def relax_edges(edges: Edges, poses: Floats, num_rounds: int) -> Floats:
+    """Moves poses by Gauss-Newton steps towards the measurements of edges.
 
+    Args:
+        edges: measured relative poses.
+        poses: (n, 3); the first one is fixed.
+        num_rounds: number of steps.
 
-def _relax(edges: Edges, poses: Floats, num_rounds: int) -> Floats:
-    """Returns the poses after Gauss-Newton steps towards the measurements of the edges."""
+    Returns:
+        (n, 3) poses.
+    """
+    nodes = np.stack([edges.target, edges.source], axis=1)
     for _ in range(num_rounds):
-        poses = np.asarray(se2.compose(poses, solve_step(len(poses), *_linearise_edges(edges, poses))))
+        here = np.asarray(se2.relative(poses[edges.target], poses[edges.source]))
+        off = se2.relative(edges.measurements, here)
+        # A step of the target moves the tangent of the source by minus the adjoint of T_source_target.
+        adjoint = se2.adjoint(se2.inverse(here))
+        jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
+        weighted = np.swapaxes(jacobian, 2, 3) @ edges.information[:, None]
+        blocks = weighted[:, :, None] @ jacobian[:, None]
+        step = solve_blocks(nodes, blocks, np.einsum("esij,ej->esi", weighted, off), len(poses))
+        poses = np.asarray(se2.compose(poses, step))
     return poses
 
 
@@ -203,26 +214,6 @@ def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: Ste
     return _AlignedPairs(source, target, across, held_steps(slides, poses))
 
 
-def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
-    """Computes one Gauss-Newton step of all poses in their own frames; the first pose is fixed.
-
-    Args:
-        num_poses: n.
-        edges: the relative poses at which the system was linearised, with J^T W J as information.
-        gradient: (e, 3) J^T W r of each edge in the tangent of its source frame.
-
-    Returns:
-        (n, 3) steps.
-    """
-    # A step of the target moves the tangent of an edge by minus the adjoint of T_source_target.
-    adjoint = se2.adjoint(se2.inverse(edges.measurements))
-    jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
-    transposed = np.swapaxes(jacobian, 2, 3)
-    blocks = (transposed @ edges.information[:, None])[:, :, None] @ jacobian[:, None]
-    gradients = np.einsum("esij,ej->esi", transposed, gradient)
-    return solve_blocks(np.stack([edges.target, edges.source], axis=1), blocks, gradients, num_poses)
-
-
 def choose_pairs(poses: Floats, radius: float) -> Pairs:
     """Returns pairs (source, target) of each scan and its nearest scans.
 
@@ -246,6 +237,6 @@ def _align_pairs(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale:
     source, target, across, _ = pairs
     relative = np.asarray(se2.relative(poses[target], poses[source]))
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
-    sides = scans.elements(stride=stride), scans.elements()
+    sides = scans.beams(stride=stride), scans.elements()
     aligned, _, information = align_pairs(sides, (source, target), relative, scale[None])
     return Edges(source, target, aligned, across @ information @ across)

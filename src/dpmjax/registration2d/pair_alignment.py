@@ -18,13 +18,14 @@ from jaxtyping import Array, Float
 from dpmjax.geometry import se2
 from dpmjax.kept_programs import kept_jit
 from dpmjax.registration2d.planar_scans import Floats, Pairs, PlanarScans, batches
-from dpmjax.scans.align import AlignedMotion, Prior, align
+from dpmjax.scans.align import AlignedMotion, PairRule, Prior, align
 from dpmjax.types import AnyArray, SurfaceElements
 
 # Number of distances of one batch of pairs, few enough for the cache, and the largest number of pairs in it.
 _LIVE_DISTANCES, _MAX_BATCH = 1 << 22, 256
 # Largest number of steps: all schedules are padded to it, so that one program serves them.
 _MAX_STEPS = 16
+_RULE = PairRule(is_oriented=True, cosines=(0.699, 0.701), damping=1e-3)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _align_all(
     source: SurfaceElements, target: SurfaceElements, T: Float[Array, "p 3 3"], schedule: Float[Array, "k 2"],
     prior: Prior,
 ) -> AlignedMotion:  # fmt: skip
-    return jax.vmap(partial(align, is_oriented=True), (0, 0, 0, None, 0))(source, target, T, schedule, prior)
+    return jax.vmap(partial(align, rule=_RULE), (0, 0, 0, None, 0))(source, target, T, schedule, prior)
 
 
 class AlignedPairs(NamedTuple):
@@ -177,7 +178,7 @@ def match_pairs(
     scales = schedule.gates_and_kernels(source.typical_range, source.noise)
     scales = np.concatenate([scales, scales[-1:]])
     sides = (
-        source.elements(stride=_stride(source, schedule.source_beams)),
+        source.beams(stride=_stride(source, schedule.source_beams)),
         target.elements(stride=_stride(target, schedule.target_beams)),
     )
     row = np.arange(len(guesses))[:, None]

@@ -121,7 +121,14 @@ class PlanarScans:
 
     def elements(self, rows: Any = slice(None), stride: int = 1) -> SurfaceElements:
         """Returns the surface elements of every `stride`-th beam of the scans of these rows."""
-        arrays = self.positions, self.normals, self.is_on_line.astype(np.float32), self.is_on_line
+        return self._elements(self.positions, rows, stride)
+
+    def beams(self, rows: Any = slice(None), stride: int = 1) -> SurfaceElements:
+        """Returns these elements at the measured points, not moved onto their lines."""
+        return self._elements(self.points, rows, stride)
+
+    def _elements(self, positions: Float[np.ndarray, "n b 2"], rows: Any, stride: int) -> SurfaceElements:
+        arrays = positions, self.normals, self.is_on_line.astype(np.float32), self.is_on_line
         return SurfaceElements(*(x[rows, ::stride] if stride > 1 else x[rows] for x in arrays))
 
 

@@ -41,9 +41,6 @@ MAX_RATIO, LEVER_M = 0.67, 10.0
 # Least width of the kernel, and its width as a share of the radius.
 MIN_KERNEL_M, KERNEL_SHARE = 0.05, 1 / 6
 
-# Smallest cosine between the normals of a pair; the part of the cosine above it is a factor of the weight of the pair.
-PAIR_COSINE = 0.3
-
 # Fewer pairs for each unknown do not constrain a motion.
 MIN_PAIRS_EACH = 3
 
@@ -78,6 +75,25 @@ LEVELS = (
     AlignmentLevel(2.0, ALL, 3, kernel_m=0.2),
     AlignmentLevel(2.0, ALL, 4, kernel_m=0.1),
 )
+
+
+class PairRule(NamedTuple):
+    """What makes a pair of elements of one sensor.
+
+    Attributes:
+        is_oriented: True where normals point to the side that was seen: two sides of a thin wall are no pair.
+        cosines: between the normals of a pair: up to the first the pair has no weight, from the second the full one.
+        damping: share of each unknown's own information that is added to it: a pair of scans in a corridor hardly
+            moves along it.
+    """
+
+    is_oriented: bool = False
+    cosines: tuple[float, float] = (0.3, 1.0)
+    damping: float = 1e-6
+
+
+# Normals of lidar points are of either sign.
+UNORIENTED = PairRule()
 
 
 class Prior(NamedTuple):
@@ -122,17 +138,22 @@ class _Solved(NamedTuple):
     information: Any
 
 
-def _solve(pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None) -> _Solved:
+def _solve(
+    pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None, rule: PairRule = UNORIENTED
+) -> _Solved:
     """Computes one Gauss-Newton step from motions (..., d+1, d+1)."""
     xp = rigid.namespace_of(T_target_source)
-    facing = xp.maximum(pairs.cosines - PAIR_COSINE, 0) / (1 - PAIR_COSINE)
+    low, full = rule.cosines
+    facing = xp.clip((pairs.cosines - low) / (full - low), 0, 1)
     weights = pairs.is_paired * pairs.flatness * facing
     num_pairs = (weights > 0).sum(axis=-1)
     weights = weights * geman_mcclure(pairs.residuals, kernel)
     if xp is jnp:
         weights = lax.stop_gradient(weights)
     about = None if prior is None else (T_target_source, *prior)
-    step, information = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights, about)
+    step, information = step_to_planes(
+        pairs.points, pairs.normals, pairs.residuals, weights, about, damping=rule.damping
+    )
     information = information_about_origin(information, T_target_source, step.centre)
     is_enough = num_pairs >= MIN_PAIRS_EACH * step.tangent.shape[-1]
     if prior is None:
@@ -149,7 +170,7 @@ def schedule_of(levels: tuple[AlignmentLevel, ...]) -> Float[np.ndarray, "k 2"]:
     return np.array(rows, np.float32)
 
 
-@partial(jax.jit, static_argnames="is_oriented")
+@partial(jax.jit, static_argnames="rule")
 def align(
     source: SurfaceElements,
     target: SurfaceElements,
@@ -157,7 +178,7 @@ def align(
     schedule: Float[AnyArray, "k 2"] | None = None,
     prior: Prior | None = None,
     *,
-    is_oriented: bool = False,
+    rule: PairRule = UNORIENTED,
 ) -> AlignedMotion:
     """Aligns two sets of surface elements from a first guess, by exhaustive search on any device.
 
@@ -171,7 +192,7 @@ def align(
         schedule: largest distance of a pair, and width of the kernel, of each step; other numbers compile nothing.
             Rows of zeros at the end are no steps. None takes that of `LEVELS`.
         prior: expected motion, for directions that no plane holds.
-        is_oriented: True where normals point to the side that was seen: two sides of a thin wall are no pair.
+        rule: what makes a pair.
 
     Returns:
         The motion.
@@ -186,8 +207,8 @@ def align(
         is_there, row = near.mask[:, 0] & source.mask, near.indices[:, 0]
         distances = jnp.where(is_there, jnp.sqrt(jnp.where(is_there, near.squared_distances[:, 0], 1)), jnp.inf)
         planes = Planes(target.positions[row], target.normals[row], target.planarity[row], distances)
-        pairs = pair_planes(moved, planes, scale[0], is_oriented=is_oriented)
-        solved = _solve(pairs, T, scale[1], prior)
+        pairs = pair_planes(moved, planes, scale[0], is_oriented=rule.is_oriented)
+        solved = _solve(pairs, T, scale[1], prior, rule)
         return AlignedMotion(rigid.matmul(motion_about(solved.step), T), *solved[1:])
 
     still = lax.stop_gradient((source, target))
