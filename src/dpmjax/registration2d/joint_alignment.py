@@ -184,7 +184,7 @@ def relax_edges(edges: Edges, poses: Floats, num_rounds: int) -> Floats:
     return poses
 
 
-class _AlignedPairs(NamedTuple):
+class _ChosenPairs(NamedTuple):
     """Pairs of scans that are aligned (p), and the steps that the scans do not constrain.
 
     Attributes:
@@ -200,18 +200,18 @@ class _AlignedPairs(NamedTuple):
     held: Edges
 
 
-def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
+def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _ChosenPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
     source, target = choose_pairs(poses, radius * scans.typical_range)
     if prior is None:
-        return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
+        return _ChosenPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
     slides = slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
     is_kept = (crossed[source] == crossed[target]) | (source - target > _FEW_STEPS)
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
     across = np.eye(3) - slide_steps(scans, relative, pairs=(source, target)).open_directions(relative)
-    return _AlignedPairs(source, target, across, held_steps(slides, poses))
+    return _ChosenPairs(source, target, across, held_steps(slides, poses))
 
 
 def choose_pairs(poses: Floats, radius: float) -> Pairs:
@@ -232,11 +232,15 @@ def choose_pairs(poses: Floats, radius: float) -> Pairs:
     return source.astype(np.int64), rows[source, column].astype(np.int64)
 
 
-def _align_pairs(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: Floats) -> Edges:
+def _align_pairs(scans: PlanarScans, pairs: _ChosenPairs, poses: Floats, scale: Floats) -> Edges:
     """Returns edges of all pairs after one step of their alignment from these poses, at this gate and kernel."""
     source, target, across, _ = pairs
     relative = np.asarray(se2.relative(poses[target], poses[source]))
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
     sides = scans.beams(stride=stride), scans.elements()
     aligned, _, information = align_pairs(sides, (source, target), relative, scale[None])
-    return Edges(source, target, aligned, across @ information @ across)
+    held = across @ information @ across
+    pull = across @ information @ np.asarray(se2.relative(relative, aligned))[..., None]
+    # The poses that `relax_edges` pulls by just this: along a weak direction a step may be long, and is no measurement.
+    off = -(np.linalg.pinv(held, rcond=1e-9, hermitian=True) @ pull)[..., 0]
+    return Edges(source, target, np.asarray(se2.compose(relative, se2.inverse(off))), held)

@@ -238,7 +238,7 @@ class _Beam:
     def distinct(self, parent: Indices, pose: Floats) -> Indices:
         """Returns rows of the hypotheses that differ from all earlier ones of the same sequence."""
         near = se2.is_within(pose[:, None] - pose, _SAME[0] * self.unit, _SAME[1]) & (parent[:, None] == parent)
-        return apart(-np.arange(len(parent)), near.__getitem__, len(parent))
+        return apart(-np.arange(len(parent), dtype=np.float64), near.__getitem__, len(parent))
 
     def score(self, now: _Sequences, scan: int, parent: Indices, pose: Floats) -> Floats:
         """Computes the agreement (m,) of a scan with the last placed scans, less the weighted motion prior."""
