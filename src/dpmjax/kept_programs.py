@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
+import numpy as np
 from jax import export
 
 from dpmjax.compile_cache import TRACED_FOLDER
@@ -72,7 +73,10 @@ class KeptProgram:
         leaves, tree = jax.tree.flatten(dict(bound.arguments))
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return None, []
-        shapes = tuple((jax.typeof(leaf), getattr(leaf, "weak_type", False)) for leaf in leaves)
+        # `jax.typeof` takes several times as long, and small programs are called thousands of times.
+        shapes = tuple(
+            (np.shape(leaf), getattr(leaf, "dtype", type(leaf)), getattr(leaf, "weak_type", False)) for leaf in leaves
+        )
         key = (*static.values(), tree, shapes, settings.jax_enable_x64)
         if key not in self._programs:
             self._programs[key] = self._load(static, leaves, tree)

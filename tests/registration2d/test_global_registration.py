@@ -16,7 +16,6 @@ from dpmjax.registration2d.map_assembly import add_up, agreeing_edges, assemble,
 from dpmjax.registration2d.pair_search import (
     Candidates,
     CorrelativeConfig,
-    apart,
     search_pairs,
 )
 from dpmjax.simulation import simulate_sequence
@@ -77,12 +76,6 @@ def test_only_the_given_turns_are_searched(scans) -> None:
     headings = found.poses[0, np.isfinite(found.scores[0]), 2]
     # Refinement moves a heading by less than a turn.
     np.testing.assert_allclose(headings, np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
-
-
-def test_selected_poses_lie_apart_the_best_first() -> None:
-    poses = np.array([[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2 * np.pi]]])
-    chosen = apart(poses, np.array([[1.0, 2.0, 3.0, -np.inf, 0.5]]), (0.5, 0.5), 4)
-    np.testing.assert_array_equal(chosen, [[2, 1, -1, -1]])
 
 
 @pytest.mark.slow

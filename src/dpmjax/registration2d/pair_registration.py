@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from dpmjax.checks import runs_on_host
 from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
-from dpmjax.registration2d.pair_search import APART, CorrelativeConfig, apart, search_pairs
+from dpmjax.registration2d.pair_search import CorrelativeConfig, poses_apart, search_pairs
 from dpmjax.registration2d.planar_scans import PlanarScans, planar_scans
 from dpmjax.registration2d.range_profiles import LEAST_VISIBLE, find_evidence
 from dpmjax.registration2d.steps import BEAM_DEVIATION, slide_steps
@@ -50,9 +50,8 @@ def register_planar(source: ArrayLike, target: ArrayLike) -> ScanRegistration:
     matches = match_pairs(scans.take(rows), scans.take(rows + 1), guesses[:, None], FINE)
     agreement, visible = find_evidence(scans, rows, rows + 1, matches.poses)
     scores = agreement / (visible + LEAST_VISIBLE)
-    limits = APART * scans.typical_range, APART
-    best, *others = apart(matches.poses[None], scores[None], limits, 2)[0]
-    lead = float(scores[best] - scores[others[0]]) if others[0] >= 0 else float(scores[best])
+    best, *others = poses_apart(matches.poses, scores, scans.typical_range, 2)
+    lead = float(scores[best] - (scores[others[0]] if others else 0.0))
     pose = matches.poses[best]
     slides = slide_steps(scans, pose[None], pairs=(first, second))
     information = matches.information[best] / (BEAM_DEVIATION * scans.typical_range) ** 2

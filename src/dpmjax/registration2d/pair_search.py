@@ -19,6 +19,7 @@ from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import join_rows
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, PlanarScans, Tolerances
 from dpmjax.registration2d.range_profiles import compare_pairs
+from dpmjax.scans.apart import apart
 
 # Pairs that are searched at a time, and images that are transformed at a time: their spectra take 250 MB, and fit into
 # the cache.
@@ -119,25 +120,9 @@ class Hypotheses(NamedTuple):
         return np.asarray(se2.compose(poses[self.target], self.poses))
 
 
-def apart(poses: Floats, scores: Floats, limits: tuple[float, float], count: int) -> Indices:
-    """Selects the best poses of each pair by non-maximum suppression.
-
-    Args:
-        poses: (p, m, 3).
-        scores: (p, m).
-        limits: least difference of two selected poses: length, radians.
-        count: k.
-
-    Returns:
-        (p, k) columns, the best first; where fewer poses lie apart, the remaining columns are -1.
-    """
-    scores, rows = scores.copy(), np.arange(len(poses))
-    chosen = np.full((len(poses), count), -1)
-    for k in range(count):
-        best = scores.argmax(axis=1)
-        chosen[:, k] = np.where(np.isfinite(scores[rows, best]), best, -1)
-        scores[se2.is_within(poses - poses[rows, best][:, None], *limits)] = -np.inf
-    return chosen
+def poses_apart(poses: Floats, scores: Floats, typical_range: float, count: int) -> Indices:
+    """Selects the best poses (m, 3) of a pair that lie apart; returns their rows, the best one first."""
+    return apart(scores, lambda best: se2.is_within(poses - poses[best], APART * typical_range, APART), count)
 
 
 def _spectra(
@@ -246,9 +231,12 @@ def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, t
 
 def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
     """Selects the best poses of each pair that lie apart."""
-    kept = apart(found.poses, found.scores, (APART * typical_range, APART), config.num_candidates)
-    row = np.arange(len(kept))[:, None]
-    return found._replace(poses=found.poses[row, kept], scores=np.where(kept < 0, -np.inf, found.scores[row, kept]))
+    shape = len(found.source), config.num_candidates
+    poses, scores = np.zeros((*shape, 3)), np.full(shape, -np.inf)
+    for row in range(len(found.source)):
+        kept = poses_apart(found.poses[row], found.scores[row], typical_range, config.num_candidates)
+        poses[row, : len(kept)], scores[row, : len(kept)] = found.poses[row, kept], found.scores[row, kept]
+    return found._replace(poses=poses, scores=scores)
 
 
 def refine_candidates(scans: PlanarScans, found: Candidates, config: CorrelativeConfig) -> Candidates:

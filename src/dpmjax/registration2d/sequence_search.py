@@ -30,6 +30,7 @@ from dpmjax.registration2d.range_profiles import (
 )
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_joining import join_parts
+from dpmjax.scans.apart import apart
 
 # Turns of a step that are searched, radians for each scan that it spans.
 _MAX_TURN = 1.7
@@ -154,13 +155,11 @@ def align_arcs(scans: PlanarScans, later: Indices, usual: MotionPrior) -> Hypoth
     poses[:, 2] = se2.wrap_angle(poses[:, 2])
     scores = pair_scores(scans, source, source - 1, poses)
     values = scores - _PRIOR_WEIGHT * usual.surprise(poses, np.ones(len(source), np.int64))
-    values, off = values.reshape(len(later), len(arcs)), poses.reshape(len(later), len(arcs), 3)
-    rows, kept = np.arange(len(later)), []
-    for _ in range(_NUM_ARCS):
-        best = values.argmax(axis=1)
-        kept.append(rows * len(arcs) + best)
-        is_same = se2.is_within(off - off[rows, best][:, None], _SAME_SHAPE[0] * scans.typical_range, _SAME_SHAPE[1])
-        values = np.where(is_same, -np.inf, values)
+    limits, kept = (_SAME_SHAPE[0] * scans.typical_range, _SAME_SHAPE[1]), [np.zeros(0, np.int64)]
+    for first in range(0, len(source), len(arcs)):
+        own = poses[first : first + len(arcs)]
+        near = [se2.is_within(own - one, *limits) for one in own]
+        kept.append(first + apart(values[first : first + len(arcs)], near.__getitem__, _NUM_ARCS))
     found = Hypotheses(source, source - 1, poses, scores).take(np.concatenate(kept))
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
     # of two scans alone may lie beside the right pose, too: the last placed scans choose.
@@ -214,10 +213,7 @@ class _Beam:
     def advance(self, now: _Sequences, scan: int) -> _Sequences:
         """Returns the best sequences with one more scan."""
         longer = self.extend(now, scan)
-        chosen: list[int] = []
-        for row in np.argsort(-longer.scores, kind="stable").tolist():
-            if len(chosen) < _NUM_SEQUENCES and not any(self.is_same(longer, row, other) for other in chosen):
-                chosen.append(row)
+        chosen = apart(longer.scores, lambda best: self.are_same(longer, best), _NUM_SEQUENCES)
         scores = longer.scores[chosen]
         return _Sequences(longer.poses[chosen], longer.is_placed[chosen], scores - scores[0])
 
@@ -242,11 +238,7 @@ class _Beam:
     def distinct(self, parent: Indices, pose: Floats) -> Indices:
         """Returns rows of the hypotheses that differ from all earlier ones of the same sequence."""
         near = se2.is_within(pose[:, None] - pose, _SAME[0] * self.unit, _SAME[1]) & (parent[:, None] == parent)
-        kept: list[int] = []
-        for row in range(len(parent)):
-            if not near[row, kept].any():
-                kept.append(row)
-        return np.array(kept, np.int64)
+        return apart(-np.arange(len(parent), dtype=np.float64), near.__getitem__, len(parent))
 
     def score(self, now: _Sequences, scan: int, parent: Indices, pose: Floats) -> Floats:
         """Computes the agreement (m,) of a scan with the last placed scans, less the weighted motion prior."""
@@ -266,11 +258,10 @@ class _Beam:
         step, gap = relative[np.arange(len(parent)), newest], scan - first - newest
         return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
-    def is_same(self, sequences: _Sequences, row: int, other: int) -> bool:
-        """Returns True if two sequences agree in their last scans."""
-        placed = sequences.is_placed[[row, other], -_NUM_SAME:]
-        if (placed[0] != placed[1]).any() or not placed[0].any():
-            return bool((placed[0] == placed[1]).all())
-        poses = sequences.poses[[row, other], -_NUM_SAME:][:, placed[0]]
-        inside = se2.relative(poses[:, -1:], poses)
-        return bool(se2.is_within(inside[0] - inside[1], _SAME_SHAPE[0] * self.unit, _SAME_SHAPE[1]).all())
+    def are_same(self, sequences: _Sequences, row: int) -> Booleans:
+        """Returns True for sequences that agree with one of them in their last scans."""
+        placed = sequences.is_placed[:, -_NUM_SAME:]
+        poses = sequences.poses[:, -_NUM_SAME:][:, placed[row]]
+        inside = np.asarray(se2.relative(poses[:, -1:], poses))
+        is_near = se2.is_within(inside - inside[row], _SAME_SHAPE[0] * self.unit, _SAME_SHAPE[1])
+        return np.asarray((placed == placed[row]).all(axis=1) & is_near.all(axis=1))

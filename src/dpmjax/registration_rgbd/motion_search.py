@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import rigid
@@ -31,6 +31,7 @@ from dpmjax.registration_rgbd.depth_alignment import (
 )
 from dpmjax.registration_rgbd.depth_images import Pinhole, PixelSample, Views
 from dpmjax.registration_rgbd.projective_consistency import Agreement, both_ways
+from dpmjax.scans.apart import apart
 from dpmjax.types import AnyArray
 
 # Largest translation between neighbouring images along each axis, metres.
@@ -273,16 +274,14 @@ def motions_apart(T: Poses, scores: Float[np.ndarray, " m"], count: int, shares:
         The motions, the best one first; the first motion alone where no score is finite.
     """
     far, turn = shares[0] * MAX_TRANSLATION, shares[1] * np.deg2rad(MAX_TURN_DEG)
-    kept: list[np.ndarray] = []
-    left = np.array(scores)
-    while len(kept) < count and np.isfinite(left).any():
-        best = T[np.argmax(left)]
-        kept.append(best)
-        is_near = np.linalg.norm(T[:, :3, 3] - best[:3, 3], axis=-1) < far
+
+    def is_near(best: int) -> Bool[np.ndarray, " m"]:
         # The trace gives the angle without a logarithm.
-        cosine = 0.5 * (np.einsum("ij,mij->m", best[:3, :3], T[:, :3, :3]) - 1.0)
-        left[is_near & (cosine > np.cos(turn))] = -np.inf
-    return np.stack(kept or [T[0]])
+        cosine = 0.5 * (np.einsum("ij,mij->m", T[best, :3, :3], T[:, :3, :3]) - 1.0)
+        return (np.linalg.norm(T[:, :3, 3] - T[best, :3, 3], axis=-1) < far) & (cosine > np.cos(turn))
+
+    kept = apart(scores, is_near, count)
+    return T[kept] if len(kept) else T[:1]
 
 
 def _slid(T: Poses, directions: Float[np.ndarray, "a 3"]) -> Poses:

@@ -39,6 +39,7 @@ from dpmjax.registration_rgbd.motion_search import (
     slide_margin,
     turns_rad,
 )
+from dpmjax.scans.apart import apart
 
 # Least root mean square difference of two trajectories, as shares of the largest translation and of the largest turn.
 _APART = (0.085, 0.075)
@@ -386,11 +387,8 @@ def _mean_cost(T_world_camera: Float[np.ndarray, "h n 4 4"], motion: Motion) -> 
 
 def _best_that_differ(T: Float[np.ndarray, "k n 4 4"], scores: Float[np.ndarray, " k"], motion: Motion) -> np.ndarray:
     """Selects the best trajectories that differ from all better ones, best first."""
-    is_left, kept = scores >= scores.max() - _MARGIN, list[np.ndarray]()
-    while is_left.any() and len(kept) < SEARCH[motion].num_trajectories:
-        kept.append(T[np.argmax(np.where(is_left, scores, -np.inf))])
-        is_left = is_left & _differs(T, kept[-1])
-    return np.stack(kept)
+    good = np.where(scores >= scores.max() - _MARGIN, scores, -np.inf)
+    return T[apart(good, lambda best: ~_differs(T, T[best]), SEARCH[motion].num_trajectories)]
 
 
 def _differs(T: Float[np.ndarray, "k n 4 4"], best: Float[np.ndarray, "n 4 4"]) -> np.ndarray:

@@ -10,12 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 
 from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
+from dpmjax.scans.apart import apart
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.types import Pose, Poses
 
@@ -181,22 +182,22 @@ def _best_peaks(
 ) -> list[tuple[float, float, float]]:
     """Returns turn and shift of the best peaks after non-maximum suppression."""
     shifts = fft.fftfreq(NUM_CELLS, 1 / NUM_CELLS) * cell_m
-    is_near = np.hypot(shifts[:, None], shifts) <= SHIFT_SHARE * NUM_CELLS * cell_m
-    flat = np.flatnonzero(is_near)
+    is_in_reach = np.hypot(shifts[:, None], shifts) <= SHIFT_SHARE * NUM_CELLS * cell_m
+    flat = np.flatnonzero(is_in_reach)
     within = scores.reshape(len(turns), -1)[:, flat]
     last = min(NUM_PEAKS, within.size) - 1
     # Which of several equal values a partition keeps depends on the processor; the least of those kept does not.
     best = np.flatnonzero(within.ravel() >= -np.partition(-within, last, axis=None)[last])
     best = best[np.argsort(-within.ravel()[best], kind="stable")][: last + 1]
     turn, cell = np.unravel_index(best, within.shape)
-    x, y = (shifts[part] for part in np.unravel_index(flat[cell], is_near.shape))
-    remaining, found = np.ones(len(best), bool), list[tuple[float, float, float]]()
-    while remaining.any() and len(found) < num_motions:
-        k = int(np.argmax(remaining))
-        found.append((float(turns[turn[k]]), float(x[k]), float(y[k])))
+    x, y = (shifts[part] for part in np.unravel_index(flat[cell], is_in_reach.shape))
+
+    def is_near(k: int) -> Bool[np.ndarray, " m"]:
         is_same = np.cos(turns[turn] - turns[turn[k]]) >= np.cos(DISTINCT_RAD)
-        remaining &= ~(is_same & (np.hypot(x - x[k], y - y[k]) <= DISTINCT_CELLS * cell_m))
-    return found
+        return is_same & (np.hypot(x - x[k], y - y[k]) <= DISTINCT_CELLS * cell_m)
+
+    chosen = apart(within.ravel()[best], is_near, num_motions)
+    return [(float(turns[turn[k]]), float(x[k]), float(y[k])) for k in chosen]
 
 
 def planar_motion(turn: float, x: float, y: float) -> Pose:
