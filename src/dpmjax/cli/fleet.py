@@ -8,21 +8,33 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from dpmjax import saved_maps, slam, weights
-from dpmjax.cli.drives import ScanReader, open_drive
+from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive
 from dpmjax.cli.run import Numbers, Run
 from dpmjax.cli.run_folder import write_poses
 from dpmjax.cli.slam_run import DriveFolder, find_beginning, run_scans
 from dpmjax.sequences import counted
 
-if TYPE_CHECKING:
-    from dpmjax.cli.slam import SlamOptions
+
+class DrivePlan(NamedTuple):
+    """What each worker does.
+
+    Attributes:
+        options: selection of the scans of a drive, and the weights.
+        settings: settings of SLAM.
+        is_deskewed: True for points with times.
+    """
+
+    options: DriveOptions
+    settings: slam.SlamConfig
+    is_deskewed: bool
 
 
 class MappedAway(NamedTuple):
@@ -39,12 +51,13 @@ class MappedAway(NamedTuple):
     seconds: float
 
 
-def map_drives(client: Any, options: SlamOptions, run: Run) -> Numbers:
-    """Maps the drives of the options, each on a worker, and merges their maps as a tree.
+def map_drives(client: Any, drives: Sequence[Path], plan: DrivePlan, run: Run) -> Numbers:
+    """Maps drives, each on a worker, and merges their maps as a tree.
 
     Args:
         client: of `distributed`.
-        options: options of `slam`; its drives are folders that every worker sees.
+        drives: folders that every worker sees.
+        plan: work on each.
         run: folder of the results, that every worker sees, too.
 
     Returns:
@@ -53,19 +66,19 @@ def map_drives(client: Any, options: SlamOptions, run: Run) -> Numbers:
     from distributed import as_completed
 
     began = time.perf_counter()
-    folders = [run / f"drive_{number}" for number in range(1, len(options.data) + 1)]
-    begun = [client.submit(map_away, each, options, pure=False) for each in zip(options.data, folders, strict=True)]
+    folders = [run / f"drive_{number}" for number in range(1, len(drives) + 1)]
+    begun = [client.submit(map_away, each, plan, pure=False) for each in zip(drives, folders, strict=True)]
     with tqdm(total=len(begun), unit=" drives", dynamic_ncols=True) as bar:
         for _ in as_completed(begun):
             run.check_stop()
             bar.update()
-    drives: list[MappedAway] = client.gather(begun)
-    for folder, drive in zip(folders, drives, strict=True):
+    mapped: list[MappedAway] = client.gather(begun)
+    for folder, drive in zip(folders, mapped, strict=True):
         write_poses(folder, drive.T_world_scan, frame="T_world_lidar")
-    level = [client.submit(list, [drive.content]) for drive in drives]
+    level = [client.submit(list, [drive.content]) for drive in mapped]
     while len(level) > 1:
         pairs = [level[first : first + 2] for first in range(0, len(level), 2)]
-        level = [client.submit(merge_away, *pair, options.weights) if len(pair) > 1 else pair[0] for pair in pairs]
+        level = [client.submit(merge_away, *pair, plan.options.weights) if len(pair) > 1 else pair[0] for pair in pairs]
     merged: list[bytes] = level[0].result()
     names = ["map.npz"] if len(merged) == 1 else [f"map_{part}.npz" for part in range(1, len(merged) + 1)]
     for name, content in zip(names, merged, strict=True):
@@ -73,25 +86,24 @@ def map_drives(client: Any, options: SlamOptions, run: Run) -> Numbers:
     return {
         "verdict": f"{counted(len(drives), 'drive')} in {counted(len(merged), 'map')}",
         "status": "done",
-        "weights": options.weights,
+        "weights": plan.options.weights,
         "num_drives": len(drives),
         "num_maps": len(merged),
-        "num_scans": sum(len(drive.T_world_scan) for drive in drives),
-        "sent_bytes": sum(len(drive.content) for drive in drives),
+        "num_scans": sum(len(drive.T_world_scan) for drive in mapped),
+        "sent_bytes": sum(len(drive.content) for drive in mapped),
         "map_bytes": sum(map(len, merged)),
-        "drive_s": [drive.seconds for drive in drives],
+        "drive_s": [drive.seconds for drive in mapped],
         "run_s": time.perf_counter() - began,
     }
 
 
-def map_away(place: tuple[Path, Path], options: SlamOptions) -> MappedAway:
+def map_away(place: tuple[Path, Path], plan: DrivePlan) -> MappedAway:
     """Maps a drive in its folder, from the state there where an earlier worker has left one."""
-    from dpmjax.cli.slam import slam_methods
-
     began, (data, folder) = time.perf_counter(), place
     folder.mkdir(parents=True, exist_ok=True)
-    methods, drive = slam_methods(options), open_drive(data, options)
-    reader = ScanReader(drive, is_deskewed=options.deskew, jump=options.jump)
+    name = plan.options.weights
+    methods = slam.make_methods(weights.load_model(name), plan.settings, weights=name)
+    reader = ScanReader(open_drive(data, plan.options), is_deskewed=plan.is_deskewed, jump=plan.options.jump)
     mapped = run_scans(DriveFolder(folder), reader, methods, find_beginning(folder, methods, slam.init_slam()))
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
     return MappedAway(result.T_world_scan, saved_maps.map_bytes(result.map, "int8"), time.perf_counter() - began)

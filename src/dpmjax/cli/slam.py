@@ -106,7 +106,7 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     # A map of other weights is refused here, before the scans are opened.
     start = slam.init_slam(None if options.map is None else results.open_map(options.map, methods))
     sequence = cli.open_drive(next(iter(options.data), None), options, options.sequence)
-    odometry, notes = read_odometry(options, sequence)
+    odometry, notes = odometry_of(options, sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
     beginning = find_beginning(cli.find_run("slam", options.output) if options.resume else None, methods, start)
     num_done = len(beginning.reports)
@@ -146,21 +146,21 @@ def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     cli.require_importable("distributed", "--cluster")
     from distributed import Client, LocalCluster
 
-    from dpmjax.cli.fleet import map_drives
+    from dpmjax.cli.fleet import DrivePlan, map_drives
 
     for data in options.data:  # bad input is refused here, before any work
         cli.open_drive(data, options)
-    slam_methods(options)
+    plan = DrivePlan(options, slam_methods(options).config, options.deskew)
     run.open()
     if options.cluster != "local":
         with Client(options.cluster) as client:
-            return map_drives(client, options, run)
+            return map_drives(client, options.data, plan, run)
     num_workers = min(len(options.data), cli.environment()["num_cores"])
     with (
         LocalCluster(n_workers=num_workers, threads_per_worker=1, memory_limit=None, dashboard_address=None) as cluster,
         Client(cluster) as client,
     ):
-        return map_drives(client, options, run)
+        return map_drives(client, options.data, plan, run)
 
 
 def slam_methods(options: SlamOptions) -> slam.SlamMethods:
@@ -175,7 +175,7 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
     return slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
 
 
-def read_odometry(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarray | None, tuple[Note, ...]]:
+def odometry_of(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarray | None, tuple[Note, ...]]:
     """Returns poses of the lidar by the odometry of --odometry FILE, None without a file; and notes."""
     if options.odometry is None or options.odometry in PROPOSERS:
         return None, ()
