@@ -20,8 +20,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from benchmarks import in_new_process, run_benchmark
-from dpmjax.cli import format_table
-from dpmjax.cli.options import parse_options
+from dpmjax.cli import format_table, parse_options
 from dpmjax.io import write_atomically
 
 # Modules, each with a function `run`.
