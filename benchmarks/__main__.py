@@ -20,8 +20,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from benchmarks import in_new_process, run_benchmark
-from dpmjax import cli
-from dpmjax.cli import format_table
+from dpmjax.cli import format_table, parse_options
 from dpmjax.io import write_atomically
 
 # Modules, each with a function `run`.
@@ -72,7 +71,7 @@ def describe(environment: dict[str, Any]) -> str:
 
 if __name__ == "__main__":
     try:
-        config = cli.parse_options(Config, sys.argv[1:], prog="python -m benchmarks", description=__doc__)
+        config = parse_options(Config, sys.argv[1:], prog="python -m benchmarks", description=__doc__)
     except ValueError as error:
         print(f"benchmarks: error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -53,7 +53,7 @@ def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
     recorder = cli.FitRecorder(run, "m")
     settings = deepmapping.preset(options.preset, "depth", motion="planar" if sequence.is_planar else "full")
     key = jax.random.key(options.seed)
-    with cli.progress_bar("poses from image to image", " images") as on_image:
+    with cli.counting_bar("poses from image to image", " images") as on_image:
         start = registration_rgbd.initialize_depth(images, settings.motion, key=key, on_image=on_image)
     found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
     numbers = {**depth_numbers(sequence, found), **recorder.numbers}

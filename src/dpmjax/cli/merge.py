@@ -53,7 +53,7 @@ def main(options: MergeOptions, run: cli.Run) -> cli.Numbers:
     methods = slam.make_methods(weights.load_model(options.weights), weights=options.weights)
     maps = [cli.open_map(path, methods) for path in options.maps]
     run.open()
-    with cli.progress_bar("loops between maps", " keyframes") as on_keyframe:
+    with cli.counting_bar("loops between maps", " keyframes") as on_keyframe:
         merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
     write_maps(run, maps, merged)
     numbers = {"weights": options.weights, **merge_numbers(options.maps, maps, merged)}

@@ -195,7 +195,7 @@ def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum
 
 
 @contextmanager
-def progress_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+def counting_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """Shows a bar while the block runs; yields a callback with the number of finished items and of all.
 
     Args:

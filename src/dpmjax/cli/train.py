@@ -49,7 +49,7 @@ TUNING_SHARE = 0.2
 class TrainOptions(RunOptions):
     """Options of the run."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"hours", "finish", "cache", "calibrate"})
 
     data: Annotated[tuple[str, ...], arg(metavar="town|PATH")] = ("town",)
     """Drives to train on: simulated towns, or folders of scans with poses (KITTI, KITTI-360, MulRan, plain ...)."""
@@ -61,6 +61,8 @@ class TrainOptions(RunOptions):
     stages: tuple[Literal["registration", "overlap"], ...] = ("registration", "overlap")
     """Stages of the training: all networks but the overlap head, then this head alone. overlap alone trains the head of
     --weights."""
+    calibrate: bool = True
+    """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
     """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
     frame: Literal["lidar", "local"] | None = None
@@ -162,7 +164,7 @@ def main(options: TrainOptions, run: Run) -> Numbers:
         numbers |= measured
     train_files.write_training(records, trained, evaluation, numbers, origin=origin)
     numbers["calibration"] = {}
-    if not run.is_stopped:
+    if options.calibrate and not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
         run.write_numbers({**numbers, "status": "interrupted"})
         chosen = chosen_sources(sources)
