@@ -221,13 +221,13 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
     motions = np.stack([T_target_source, rigid.inverse(T_target_source)], axis=1).reshape(
         -1, *T_target_source.shape[1:]
     )
-    ends, first = np.unique(ends, axis=0, return_index=True)
-    numbers = sp.csr_matrix((first + 1, ends.T), (num_nodes, num_nodes))
+    keys, first = np.unique(ends @ [num_nodes, 1], return_index=True)
+    joined = sp.csr_matrix((np.ones(len(keys)), np.divmod(keys, num_nodes)), (num_nodes, num_nodes))
     T = np.tile(np.eye(motions.shape[-1]), (num_nodes, 1, 1))
     for root in np.unique(label_parts(num_nodes, edges.source, edges.target), return_index=True)[1]:
-        order, before = sp.csgraph.breadth_first_order(numbers, root, directed=True)
-        nodes, parents = order[1:], before[order[1:]]
-        rows = np.ravel(numbers[parents, nodes]).astype(np.int64) - 1
+        order, before = sp.csgraph.breadth_first_order(joined, root, directed=True)
+        nodes, parents = order[1:].astype(np.int64), before[order[1:]].astype(np.int64)
+        rows = first[np.searchsorted(keys, num_nodes * parents + nodes)]
         for node, parent, row in zip(nodes, parents, rows, strict=True):
             T[node] = T[parent] @ motions[row]
     return np.asarray(se2.from_matrix(T)) if is_planar else T
