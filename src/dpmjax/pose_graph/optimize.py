@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from dpmjax.checks import require, require_count, require_positive, runs_on_host
+from dpmjax.checks import require_count, require_positive, require_value, runs_on_host
 from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
 from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph, label_parts
@@ -138,14 +138,14 @@ def optimize_pose_graph(
         ValueError: the cost of the given poses is not a finite number, `trust` is not positive, or an array is traced.
     """
     config = config or PoseGraphConfig()
-    require((np.asarray(trust) > 0).all(), "trust", "numbers above 0", "others")
+    require_value((np.asarray(trust) > 0).all(), "trust", "numbers above 0", "others")
     width = np.full(len(graph.edges.source), config.outlier_chi2 or np.inf) * trust
     nodes = np.stack([graph.edges.target, graph.edges.source], axis=1)
     pattern = BlockPattern.create(nodes, graph.held_nodes())
     still = np.zeros((len(graph.poses), graph.tangent_size))
     at = linearise(graph.poses, still, graph.edges)
     chi2_initial = float(at.chi2.sum())
-    require(np.isfinite(chi2_initial), "graph", "residuals of finite length", "NaN or infinity")
+    require_value(np.isfinite(chi2_initial), "graph", "residuals of finite length", "NaN or infinity")
     if config.is_chordal_start and len(graph.edges.source):
         chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
         at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
