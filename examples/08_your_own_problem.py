@@ -32,7 +32,7 @@ scans = jnp.asarray(walk.points[:, ::2]) / unit
 problem = deepmapping.Problem(
     config=None, phases=(Phase(),), init=lambda config, key, scans: jnp.zeros((len(scans), 3)),
     optimizer=lambda config, phase: optax.adam(optax.cosine_decay_schedule(phase.learning_rate, phase.num_steps)),
-    loss=loss, poses=lambda config, phase, poses, scans: poses, steps_per_call=100,
+    loss=loss, poses=lambda config, phase, poses, scans: poses, next_phase=lambda *_: None, steps_per_call=100,
 )  # fmt: skip
 fitted = deepmapping.fit(problem, scans, key=jax.random.key(0))
 error = dpmjax.absolute_trajectory_error(fitted.poses[:, :2] * unit, walk.reference_poses[:, :2])

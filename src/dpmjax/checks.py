@@ -210,7 +210,7 @@ def require_shape(name: str, array: AnyArray, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
 
 
-def require(is_right: Any, name: str, expected: str, got: Any) -> None:
+def require_value(is_right: Any, name: str, expected: str, got: Any) -> None:
     """Checks that an argument is as expected.
 
     Args:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from dpmjax.checks import require, require_fields, require_one_of
+from dpmjax.checks import require_fields, require_one_of, require_value
 from dpmjax.geometry.se3 import Motion
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 
@@ -169,7 +169,7 @@ def with_steps(config: DeepMappingConfig, num_steps: int) -> DeepMappingConfig:
     """
 
     def shorten(phases: tuple[PhaseConfig, ...]) -> tuple[PhaseConfig, ...]:
-        require(num_steps >= len(phases), "steps", f"at least one for each of {len(phases)} phases", num_steps)
+        require_value(num_steps >= len(phases), "steps", f"at least one for each of {len(phases)} phases", num_steps)
         total = max(1, sum(phase.num_steps for phase in phases))
         counts = [max(1, round(phase.num_steps * num_steps / total)) for phase in phases[:-1]]
         counts.append(max(1, num_steps - sum(counts)))

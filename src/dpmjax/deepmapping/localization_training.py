@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from dpmjax.checks import require, require_count
+from dpmjax.checks import require_count, require_value
 from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
 from dpmjax.deepmapping.engine import solve
 from dpmjax.deepmapping.mapping import Fitted
@@ -198,7 +198,7 @@ def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps:
     require_count("num_steps", num_steps)
     scans = as_scan_set(scans)
     num, num_given = len(fitted.poses), len(scans.points)
-    require(num_given == num, "scans", f"the {num} scans of the fit", num_given)
+    require_value(num_given == num, "scans", f"the {num} scans of the fit", num_given)
     poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
     measured = replace(scans, points=scans.points / fitted.unit)
     render_key, train_key, net_key = jax.random.split(key, 3)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from dpmjax.checks import require, runs_on_host
+from dpmjax.checks import require_value, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig
 from dpmjax.deepmapping.localization_training import (
     MapRaster,
@@ -173,7 +173,7 @@ def relocalize(fitted: Fitted, scan: ScanSet | ArrayLike, *, max_nats: float = 0
         ValueError: the shape is another one, a scan has no valid beam, the fit has several L-Nets, L-Net's outputs
             correct given start poses, or `max_nats` is not positive.
     """
-    require(max_nats > 0.0, "max_nats", "a positive number", max_nats)
+    require_value(max_nats > 0.0, "max_nats", "a positive number", max_nats)
     if has_windows(fitted):
         raise ValueError("fitted: each of its L-Nets knows one window of the walk; call train_localization first")
     if np.any(np.asarray(fitted.params.start) != 0.0) or not has_localization(fitted):

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dpmjax.checks import require, require_shape, runs_on_host
+from dpmjax.checks import require_shape, require_value, runs_on_host
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.bearing import from_ray_frame, ray_directions
 from dpmjax.geometry.normals import pyramid_elements
@@ -143,10 +143,10 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
         ValueError: if the pyramid has other stages than the model, or if `num_elements` is out of range.
     """
     stages = model.config.pyramid.stages
-    require(len(pyramid.levels) == len(stages) + 1, "pyramid", f"{len(stages) + 1} levels", len(pyramid.levels))
+    require_value(len(pyramid.levels) == len(stages) + 1, "pyramid", f"{len(stages) + 1} levels", len(pyramid.levels))
     for number, (stage, level) in enumerate(zip(stages, pyramid.levels[1:], strict=True), start=1):
         num_found, num = len(level.neighbours), len(stage.radii)
-        require(num_found == num, f"pyramid.levels[{number}]", f"{num} neighbourhoods", num_found)
+        require_value(num_found == num, f"pyramid.levels[{number}]", f"{num} neighbourhoods", num_found)
     features: Any = _encoder(model.config).apply({"params": model.params["encoder"]}, pyramid)
     row = len(pyramid.levels) - 1 - len(pyramid.interpolation)
     finer, level = (without_masked(pyramid.levels[number]) for number in (row - 1, row))
@@ -155,7 +155,7 @@ def encode_pyramid(model: Model, pyramid: PointPyramid, *, num_elements: int | N
         directions = ray_directions(level.positions)
     least = model.config.num_descriptors
     num_elements = least if num_elements is None else num_elements
-    require(num_elements >= least, "num_elements", f"at least the {least} descriptors", num_elements)
+    require_value(num_elements >= least, "num_elements", f"at least the {least} descriptors", num_elements)
     elements: Any = pyramid_elements(pyramid, num_elements)
     positions = elements.positions * model.config.scale_m
     return DescriptorCloud(positions, features, elements.mask, directions, elements.normals, elements.planarity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from dpmjax.checks import require, require_one_of, require_positive
+from dpmjax.checks import require_one_of, require_positive, require_value
 from dpmjax.deeppointmap.confidence import Calibration, LogisticModel
 from dpmjax.deeppointmap.matching import MatchConfig
 from dpmjax.deeppointmap.verification import VerificationConfig
@@ -55,7 +55,7 @@ class ModelConfig:
         for stage in self.trained:
             require_one_of("trained", stage, get_args(Stage))
         inputs, outputs = self.decoder.input_channels, self.encoder.output_channels
-        require(inputs == outputs, "decoder.input_channels", f"the encoder's output_channels {outputs}", inputs)
+        require_value(inputs == outputs, "decoder.input_channels", f"the encoder's output_channels {outputs}", inputs)
 
     @property
     def num_descriptors(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_mask, as_points, require, require_count, require_positive
+from dpmjax.checks import as_mask, as_points, require_count, require_positive, require_value
 from dpmjax.geometry.traced import is_usable, with_axes_of
 from dpmjax.types import AnyArray, Neighbours
 
@@ -91,7 +91,9 @@ def radius_search(
 
 def _checked_pair(queries: AnyArray, points: AnyArray) -> tuple[jax.Array, jax.Array]:
     queries, points = as_points("queries", queries), as_points("points", points)
-    require(queries.shape[1] == points.shape[1], "points", f"{queries.shape[1]} columns like queries", points.shape[1])
+    require_value(
+        queries.shape[1] == points.shape[1], "points", f"{queries.shape[1]} columns like queries", points.shape[1]
+    )
     return queries, points
 
 

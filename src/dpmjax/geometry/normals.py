@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import as_mask, as_points, require, require_count, require_positive
+from dpmjax.checks import as_mask, as_points, require_count, require_positive, require_value
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.planes import fit_planes
 from dpmjax.geometry.traced import is_usable
@@ -82,7 +82,7 @@ def estimate_normals(
     """
     points = as_points("points", points, dimensions=(2, 3))
     require_count("k", k)
-    require(k >= points.shape[1], "k", f"at least {points.shape[1]} neighbours in {points.shape[1]}-D", k)
+    require_value(k >= points.shape[1], "k", f"at least {points.shape[1]} neighbours in {points.shape[1]}-D", k)
     if radius is not None:
         require_positive("radius", radius)
     mask = as_mask("mask", mask, points.shape[:1])
@@ -157,7 +157,7 @@ def pyramid_elements(pyramid: PointPyramid, num_elements: int) -> SurfaceElement
         ValueError: if level 1 has fewer points.
     """
     points, level = pyramid.levels[0], pyramid.levels[1]
-    require(1 <= num_elements <= len(level.mask), "num_elements", f"from 1 to {len(level.mask)}", num_elements)
+    require_value(1 <= num_elements <= len(level.mask), "num_elements", f"from 1 to {len(level.mask)}", num_elements)
     positions, mask = jnp.asarray(level.positions)[:num_elements], jnp.asarray(level.mask)[:num_elements]
     rows = jnp.asarray(level.neighbours[0])[:num_elements]
     offsets = lax.stop_gradient(jnp.asarray(points.positions)[rows] - positions[:, None])

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_mask, as_points, require, require_count, require_positive
+from dpmjax.checks import as_mask, as_points, require_count, require_positive, require_value
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.geometry.traced import LARGEST_COORDINATE, is_usable
@@ -75,10 +75,10 @@ class PyramidConfig:
 
     def __post_init__(self) -> None:
         num, most = self.num_interpolations, len(self.stages) - 1
-        require(0 <= num <= most, "num_interpolations", f"from 0 to {most}, fewer than there are stages", num)
+        require_value(0 <= num <= most, "num_interpolations", f"from 0 to {most}, fewer than there are stages", num)
         counts = [stage.num_points for stage in self.stages]
         is_falling = sorted(counts, reverse=True) == counts
-        require(is_falling, "stages", "no stage to have more points than the one before", counts)
+        require_value(is_falling, "stages", "no stage to have more points than the one before", counts)
 
 
 def build_pyramid(

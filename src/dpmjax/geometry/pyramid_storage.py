@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from dpmjax.checks import require
+from dpmjax.checks import require_value
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid import PyramidConfig, interpolation_weights
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
@@ -57,7 +57,7 @@ def record_type(config: PyramidConfig, capacity: int) -> np.dtype:
     Raises:
         ValueError: if row numbers of this many points exceed 16 bits.
     """
-    require(capacity <= MAX_STORED_POINTS, "capacity", f"at most {MAX_STORED_POINTS}", capacity)
+    require_value(capacity <= MAX_STORED_POINTS, "capacity", f"at most {MAX_STORED_POINTS}", capacity)
     fields: list[Any] = [
         ("num_points", "<i4"),
         ("unit", "<f4"),

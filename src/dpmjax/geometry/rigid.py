@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from dpmjax.checks import as_float, require
+from dpmjax.checks import as_float, require_value
 from dpmjax.types import AnyArray
 
 # Squared angle, in square radians, below which series replace differences that cancel.
@@ -97,7 +97,7 @@ def exp(tangent: Float[AnyArray, "... k"]) -> Float[Array, "... d1 d1"]:
         ValueError: the twist has neither 3 nor 6 numbers.
     """
     tangent = as_float("tangent", tangent)
-    require(tangent.shape[-1] in (3, 6), "tangent", "shape (..., 3) or (..., 6)", tangent.shape)
+    require_value(tangent.shape[-1] in (3, 6), "tangent", "shape (..., 3) or (..., 6)", tangent.shape)
     if tangent.shape[-1] == 3:  # the same motion in space, without z
         zero = jnp.zeros_like(tangent)
         T = exp(jnp.concatenate([tangent[..., :2], zero, tangent[..., 2:]], axis=-1))
@@ -147,7 +147,7 @@ def transform_points(
         points_b.ndim >= 2 and T_a_b.shape[-2:] == (dim + 1, dim + 1),
         f"{T_a_b.shape} for {points_b.shape}",
     )
-    require(is_right, "T_a_b", "shape (..., d+1, d+1) for points_b (..., n, d)", shapes)
+    require_value(is_right, "T_a_b", "shape (..., d+1, d+1) for points_b (..., n, d)", shapes)
     # Products and sums rather than a contraction: full precision on every device, and one fused loop for small d.
     points_a = T_a_b[..., None, :dim, dim]
     for axis in range(dim):

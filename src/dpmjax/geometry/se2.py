@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dpmjax.checks import require
+from dpmjax.checks import require_value
 from dpmjax.geometry.rigid import namespace_of
 
 Poses = NDArray[np.float64]
@@ -200,7 +200,9 @@ def as_poses(name: str, value: Any, count: int) -> NDArray[np.float64]:
         ValueError: the shape is another one, or a number is not finite.
     """
     poses = np.asarray(value, np.float64)
-    require(poses.shape in ((count, 3), (count, 3, 3)), name, f"shape ({count}, 3) or ({count}, 3, 3)", poses.shape)
+    require_value(
+        poses.shape in ((count, 3), (count, 3, 3)), name, f"shape ({count}, 3) or ({count}, 3, 3)", poses.shape
+    )
     if not np.isfinite(poses).all():
         raise ValueError(f"{name}: expected finite poses")
     return poses if poses.ndim == 2 else from_matrix(poses)

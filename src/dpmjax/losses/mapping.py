@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import as_float, as_mask, as_points, require, require_positive
+from dpmjax.checks import as_float, as_mask, as_points, require_positive, require_value
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.geometry.traced import usable_weights
@@ -44,7 +44,7 @@ def chamfer_distance(
         ValueError: the shapes do not match, or `max_distance` is not above 0.
     """
     a, b = as_points("a", a), as_points("b", b)
-    require(a.shape[1] == b.shape[1], "b", f"{a.shape[1]} columns like a", b.shape[1])
+    require_value(a.shape[1] == b.shape[1], "b", f"{a.shape[1]} columns like a", b.shape[1])
     if max_distance is not None:
         require_positive("max_distance", max_distance)
     limit = jnp.asarray(jnp.inf if max_distance is None else max_distance, a.dtype)
@@ -93,7 +93,7 @@ def occupancy_loss(
     for name, array in (("labels", labels), ("weights", weights)):
         sizes = zip(reversed(array.shape), reversed(logits.shape), strict=False)
         is_right = array.ndim <= logits.ndim and all(size in (1, whole) for size, whole in sizes)
-        require(is_right, name, f"a shape that broadcasts to {logits.shape}", array.shape)
+        require_value(is_right, name, f"a shape that broadcasts to {logits.shape}", array.shape)
     return _occupancy_loss(logits, labels, weights)
 
 

@@ -11,7 +11,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import require, require_fields
+from dpmjax.checks import require_fields, require_value
 from dpmjax.nets.attention import AttentionLayer, embed_positions
 from dpmjax.nets.layers import ComputeDtype, TwoLayers, linear, require_compute_dtype
 from dpmjax.types import DescriptorCloud
@@ -48,7 +48,7 @@ class DecoderConfig:
         require_fields(self, "input_channels", "num_layers", "num_heads", low=1)
         num, num_heads = self.model_channels, self.num_heads
         is_right = num >= 6 and num % num_heads == 0
-        require(is_right, "model_channels", f"at least 6 and a multiple of num_heads = {num_heads}", num)
+        require_value(is_right, "model_channels", f"at least 6 and a multiple of num_heads = {num_heads}", num)
         require_compute_dtype(self.compute_dtype)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require, runs_on_host
+from dpmjax.checks import require_value, runs_on_host
 from dpmjax.types import with_short_repr
 
 Floats = NDArray[np.float64]
@@ -149,24 +149,24 @@ class PoseGraph:
 def _check(graph: PoseGraph) -> None:
     edges, size, count = graph.edges, len(graph.poses), len(graph.edges.source)
     pose = graph.poses.shape[1:]
-    require(pose in TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", graph.poses.shape)
+    require_value(pose in TANGENT_SIZE and size > 0, "poses", "shape (n, 3) or (n, 4, 4), n >= 1", graph.poses.shape)
     tangent = (graph.tangent_size, graph.tangent_size)
     arrays = {"poses": graph.poses, "is_fixed": graph.is_fixed, "ids": graph.ids, **edges._asdict()}
     leading = {"poses": size, "is_fixed": size, "ids": size}
     inner = {"poses": pose, "measurements": pose, "information": tangent}
     for name, array in arrays.items():
         shape = (leading.get(name, count), *inner.get(name, ()))
-        require(array.shape == shape, name, f"shape {shape}", array.shape)
+        require_value(array.shape == shape, name, f"shape {shape}", array.shape)
         bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
-        require(not len(bad), name, "finite numbers", f"NaN or infinity in row {next(iter(bad), None)}")
-    require(len(np.unique(graph.ids)) == size, "ids", "every id once", "an id twice")
+        require_value(not len(bad), name, "finite numbers", f"NaN or infinity in row {next(iter(bad), None)}")
+    require_value(len(np.unique(graph.ids)) == size, "ids", "every id once", "an id twice")
     for name, rows in (("source", edges.source), ("target", edges.target)):
         is_node = (rows >= 0) & (rows < size)
-        require(is_node.all(), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
+        require_value(is_node.all(), name, f"rows of nodes in [0, {size})", rows[~is_node][:1])
     loops = np.flatnonzero(edges.source == edges.target)
-    require(not len(loops), "source", "another node than the target", f"the same in edges {loops[:3]}")
+    require_value(not len(loops), "source", "another node than the target", f"the same in edges {loops[:3]}")
     is_good = is_semidefinite(edges.information).all()
-    require(is_good, "information", "symmetric, positive semidefinite matrices", "others")
+    require_value(is_good, "information", "symmetric, positive semidefinite matrices", "others")
 
 
 def is_semidefinite(information: Floats) -> NDArray[np.bool_]:

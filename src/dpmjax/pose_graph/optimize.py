@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from dpmjax.checks import require, require_count, require_positive, runs_on_host
+from dpmjax.checks import require_count, require_positive, require_value, runs_on_host
 from dpmjax.geometry import rigid, se2
 from dpmjax.pose_graph.free_nodes import FreeNodes, describe_free_nodes, find_free_nodes
 from dpmjax.pose_graph.graph import Edges, Floats, PoseGraph, label_parts
@@ -138,14 +138,14 @@ def optimize_pose_graph(
         ValueError: the cost of the given poses is not a finite number, `trust` is not positive, or an array is traced.
     """
     config = config or PoseGraphConfig()
-    require((np.asarray(trust) > 0).all(), "trust", "numbers above 0", "others")
+    require_value((np.asarray(trust) > 0).all(), "trust", "numbers above 0", "others")
     width = np.full(len(graph.edges.source), config.outlier_chi2 or np.inf) * trust
     nodes = np.stack([graph.edges.target, graph.edges.source], axis=1)
     pattern = BlockPattern.create(nodes, graph.held_nodes())
     still = np.zeros((len(graph.poses), graph.tangent_size))
     at = linearise(graph.poses, still, graph.edges)
     chi2_initial = float(at.chi2.sum())
-    require(np.isfinite(chi2_initial), "graph", "residuals of finite length", "NaN or infinity")
+    require_value(np.isfinite(chi2_initial), "graph", "residuals of finite length", "NaN or infinity")
     if config.is_chordal_start and len(graph.edges.source):
         chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
         at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
@@ -221,13 +221,13 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
     motions = np.stack([T_target_source, rigid.inverse(T_target_source)], axis=1).reshape(
         -1, *T_target_source.shape[1:]
     )
-    ends, first = np.unique(ends, axis=0, return_index=True)
-    numbers = sp.csr_matrix((first + 1, ends.T), (num_nodes, num_nodes))
+    keys, first = np.unique(ends @ [num_nodes, 1], return_index=True)
+    joined = sp.csr_matrix((np.ones(len(keys)), np.divmod(keys, num_nodes)), (num_nodes, num_nodes))
     T = np.tile(np.eye(motions.shape[-1]), (num_nodes, 1, 1))
     for root in np.unique(label_parts(num_nodes, edges.source, edges.target), return_index=True)[1]:
-        order, before = sp.csgraph.breadth_first_order(numbers, root, directed=True)
-        nodes, parents = order[1:], before[order[1:]]
-        rows = np.ravel(numbers[parents, nodes]).astype(np.int64) - 1
+        order, before = sp.csgraph.breadth_first_order(joined, root, directed=True)
+        nodes, parents = order[1:].astype(np.int64), before[order[1:]].astype(np.int64)
+        rows = first[np.searchsorted(keys, num_nodes * parents + nodes)]
         for node, parent, row in zip(nodes, parents, rows, strict=True):
             T[node] = T[parent] @ motions[row]
     return np.asarray(se2.from_matrix(T)) if is_planar else T

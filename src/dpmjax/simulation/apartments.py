@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dpmjax.checks import require, require_fields, runs_on_host
+from dpmjax.checks import require_fields, require_value, runs_on_host
 from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, DepthSequence, FloatArray
 from dpmjax.types import AnyArray
@@ -90,7 +90,7 @@ def make_apartment(seed: int) -> Apartment:
     Raises:
         ValueError: a negative seed.
     """
-    require(seed >= 0, "seed", "zero or more", seed)
+    require_value(seed >= 0, "seed", "zero or more", seed)
     rng = np.random.default_rng([7, seed])
     size_x, size_z = rng.uniform(5.5, 7.5), rng.uniform(5.0, 6.5)
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
@@ -259,7 +259,7 @@ def simulate_depth_sequence(
     Raises:
         ValueError: fewer than two views, an apartment without free places, or one without a walk of the spread.
     """
-    require(num_views >= 2, "num_views", "at least 2", num_views)
+    require_value(num_views >= 2, "num_views", "at least 2", num_views)
     config = config or DepthWalkConfig()
     home = apartment if isinstance(apartment, Apartment) else make_apartment(apartment)
     rng = np.random.default_rng([seed, 11])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
-from dpmjax.checks import require, require_one_of, require_positive_fields
+from dpmjax.checks import require_one_of, require_positive_fields, require_value
 from dpmjax.sequences import FloatArray
 from dpmjax.simulation.floor_plan import Door, Plan, Room, make_plan, make_route
 from dpmjax.simulation.town.objects import Collection, Place, plant_bushes, put_box, put_car, put_person, put_pole
@@ -75,7 +75,7 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
     Raises:
         ValueError: a negative seed.
     """
-    require(seed >= 0, "seed", "zero or more", seed)
+    require_value(seed >= 0, "seed", "zero or more", seed)
     rng = np.random.default_rng([_BUILDING_STREAM, seed])
     plan = make_plan(rng, config.kind)
     route = make_route(rng, plan, config.route_length_m)

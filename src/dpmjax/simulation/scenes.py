@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require, require_one_of, require_positive_fields, runs_on_host
+from dpmjax.checks import require_one_of, require_positive_fields, require_value, runs_on_host
 from dpmjax.sequences import SimulatedDrive
 from dpmjax.simulation.building import KINDS as INDOOR_KINDS
 from dpmjax.simulation.building import Building, BuildingConfig, make_building
@@ -60,12 +60,12 @@ class SceneMixture:
         for name, entries in (("kinds", self.kinds), ("sensors", self.sensors)):
             weights = [weight for _, weight in entries]
             is_right = weights and min(weights) >= 0 and sum(weights) > 0
-            require(is_right, name, "weights from 0 up, not all 0", weights)
+            require_value(is_right, name, "weights from 0 up, not all 0", weights)
         for kind, _ in self.kinds:
             require_one_of("kinds", kind, (*OUTDOOR_KINDS, *INDOOR_KINDS))
         require_positive_fields(self, "length_m", "spacing_m")
         low, high = self.indoor_scale
-        require(0 < low <= high, "indoor_scale", "two positive, ascending numbers", f"{low}, {high}")
+        require_value(0 < low <= high, "indoor_scale", "two positive, ascending numbers", f"{low}, {high}")
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         is_right = isinstance(self.place, BuildingConfig) == isinstance(self.motion, WalkConfig)
-        require(is_right, "motion", "a WalkConfig in a building and a DriveConfig in a town", self.motion)
+        require_value(is_right, "motion", "a WalkConfig in a building and a DriveConfig in a town", self.motion)
 
 
 # Mixture for training: a third of the scenes are indoors, and some drives alternate between two lidars.
@@ -126,7 +126,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
     Raises:
         ValueError: a negative seed.
     """
-    require(seed >= 0, "seed", "zero or more", seed)
+    require_value(seed >= 0, "seed", "zero or more", seed)
     rng = np.random.default_rng([_SCENE_STREAM, seed])
     kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
     # Also drawn outdoors, where the scale is 1, so that later draws of a seed are the same.

@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require, require_count, runs_on_host
+from dpmjax.checks import require_count, require_value, runs_on_host
 from dpmjax.geometry import se2
 from dpmjax.sequences import BoolArray, FloatArray, ScanSequence
 from dpmjax.simulation.world2d import World, beam_angles, cast_scans, largest_region, make_world
@@ -257,7 +257,7 @@ def scan_world(
     Raises:
         ValueError: a pose lies in an obstacle or outside of the image; or there is noise but no `rng`.
     """
-    require(range_noise_px == 0 or rng is not None, "rng", "a generator for range_noise_px", rng)
+    require_value(range_noise_px == 0 or rng is not None, "rng", "a generator for range_noise_px", rng)
     ranges = cast_scans(is_obstacle, poses, num_beams=num_beams)
     mask = np.ones(ranges.shape, bool) if max_range is None else ranges <= max_range
     return np.where(mask[..., None], _measured_points(ranges, range_noise_px, rng), np.float32(0.0)), mask
@@ -300,7 +300,7 @@ def simulate_sequence(
     Raises:
         ValueError: an argument out of its range, or a world too narrow to move in.
     """
-    require(num_scans >= 2, "num_scans", "at least 2", num_scans)
+    require_value(num_scans >= 2, "num_scans", "at least 2", num_scans)
     scene = world if isinstance(world, World) else make_world(world)
     # The name is part of the seed, so that walks through two worlds are independent.
     streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(4))

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dpmjax.checks import require, require_count
+from dpmjax.checks import require_count, require_value
 from dpmjax.sequences import BoolArray, FloatArray
 
 SIZE_PX = 1024
@@ -91,7 +91,7 @@ def make_world(world: int | str) -> World:
     Raises:
         ValueError: a negative index, or a name that is no kind with a number.
     """
-    require(isinstance(world, str) or world >= 0, "world", "zero or more", world)
+    require_value(isinstance(world, str) or world >= 0, "world", "zero or more", world)
     name = f"{list(_KINDS)[world % 3]}-{world}" if isinstance(world, int) else world
     found = re.fullmatch(rf"({'|'.join(_KINDS)})(?:-(\d+))?", name)
     if found is None:

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from dpmjax.checks import require, require_count, require_fields, require_one_of, require_positive_fields
+from dpmjax.checks import require_count, require_fields, require_one_of, require_positive_fields, require_value
 from dpmjax.deeppointmap.model import Initialization
 from dpmjax.deeppointmap.model_config import ModelConfig, Preset, Stage, model_preset
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig
@@ -85,7 +85,9 @@ class SamplingConfig:
     def __post_init__(self) -> None:
         require_fields(self, "max_side", low=1)
         require_fields(self, "num_scans", low=2)
-        require(self.max_distance_m > MIN_DISTANCE_M, "max_distance_m", f"above {MIN_DISTANCE_M}", self.max_distance_m)
+        require_value(
+            self.max_distance_m > MIN_DISTANCE_M, "max_distance_m", f"above {MIN_DISTANCE_M}", self.max_distance_m
+        )
 
 
 @dataclass(frozen=True)
@@ -180,15 +182,17 @@ class TrainingConfig:
         require_fields(self, "scans_at_once", low=1)
         require_one_of("initialization", self.initialization, get_args(Initialization))
         for name, value in (("max_gradient_norm", self.max_gradient_norm), ("num_epochs", self.num_epochs)):
-            require(value is None or value > 0, name, "more than 0", value)
+            require_value(value is None or value > 0, name, "more than 0", value)
         require_count("len(curriculum)", len(self.curriculum))
         for stage in self.stages:
             require_one_of("stages", stage, get_args(Stage))
         require_count("len(stages)", len(self.stages))
         largest = max(stage.max_group for stage in self.curriculum)
         num_scans, max_side = self.sampling.num_scans, self.sampling.max_side
-        require(largest <= num_scans, "sampling.num_scans", f"at least the largest group, {largest}", num_scans)
-        require(largest <= 2 * max_side, "sampling.max_side", f"at least half the largest group, {largest}", max_side)
+        require_value(largest <= num_scans, "sampling.num_scans", f"at least the largest group, {largest}", num_scans)
+        require_value(
+            largest <= 2 * max_side, "sampling.max_side", f"at least half the largest group, {largest}", max_side
+        )
 
     @property
     def num_steps(self) -> int:

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dpmjax.checks import require, require_shape
+from dpmjax.checks import require_shape, require_value
 from dpmjax.deeppointmap.matching import thinned_mask
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, Layout, SamplingConfig
 from dpmjax.geometry import rigid
@@ -40,9 +40,9 @@ class ScanTable:
     scene: Int[np.ndarray, " n"]
 
     def __post_init__(self) -> None:
-        require(len(self.scene) >= 2, "scene", "at least two scans", len(self.scene))
+        require_value(len(self.scene) >= 2, "scene", "at least two scans", len(self.scene))
         require_shape("T_world_lidar", self.T_world_lidar, (len(self.scene), 4, 4))
-        require(np.isfinite(self.T_world_lidar).all(), "T_world_lidar", "finite poses", "others")
+        require_value(np.isfinite(self.T_world_lidar).all(), "T_world_lidar", "finite poses", "others")
 
     def __len__(self) -> int:
         return len(self.scene)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, zoom
 
-from dpmjax.checks import require, require_fields, require_one_of, require_positive_fields
+from dpmjax.checks import require_fields, require_one_of, require_positive_fields, require_value
 from dpmjax.sequences import BoolArray, FloatArray
 from dpmjax.simulation.town import objects, primitives
 from dpmjax.simulation.town.kinds import KINDS, Kind, Quarter
@@ -89,7 +89,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     Raises:
         ValueError: a negative seed, or a trajectory of another shape, shorter than 20 m or far from the origin.
     """
-    require(seed >= 0, "seed", "zero or more", seed)
+    require_value(seed >= 0, "seed", "zero or more", seed)
     rng = np.random.default_rng([_TOWN_STREAM, seed])
     support, kind = None, KINDS[config.kind]
     if trajectory is None:
@@ -97,10 +97,10 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
     else:
         poses = np.asarray(trajectory, np.float64)
         is_right = poses.ndim == 3 and poses.shape[1:] == (4, 4) and np.isfinite(poses).all()
-        require(is_right, "trajectory", "finite (n, 4, 4) poses", poses.shape)
+        require_value(is_right, "trajectory", "finite (n, 4, 4) poses", poses.shape)
         positions, farthest = poses[:, :3, 3], float(np.abs(poses[:, :3, 3]).max())
         within = f"positions within {_MAX_COORDINATE_M:g} m of the origin (subtract the first one)"
-        require(farthest <= _MAX_COORDINATE_M, "trajectory", within, f"{farthest:g} m")
+        require_value(farthest <= _MAX_COORDINATE_M, "trajectory", within, f"{farthest:g} m")
         streets = streets_along(positions[:, :2], rng)
         support = with_equal_passes(positions) - [0.0, 0.0, _SENSOR_HEIGHT_M]
     terrain = make_terrain(rng, streets, support, kind)

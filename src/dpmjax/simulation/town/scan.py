@@ -15,7 +15,7 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import NDArray
 
-from dpmjax.checks import require, require_fields, require_shape
+from dpmjax.checks import require_fields, require_shape, require_value
 from dpmjax.geometry import rigid
 from dpmjax.simulation.town.cast import Hits, NearWorld, Rays, cast_turn, near_world
 from dpmjax.simulation.town.primitives import NOTHING, TownPrimitives
@@ -73,11 +73,11 @@ class LidarSensor:
     view_deg: float = 360.0
 
     def __post_init__(self) -> None:
-        require(self.elevations_deg, "elevations_deg", "at least one beam", "none")
+        require_value(self.elevations_deg, "elevations_deg", "at least one beam", "none")
         require_fields(self, "num_azimuths", low=8)
         low, high = self.min_range_m, self.max_range_m
-        require(0 <= low < high, "min_range_m, max_range_m", "0 <= min < max", f"{low} and {high}")
-        require(0 < self.view_deg <= 360, "view_deg", "above 0 and at most 360", self.view_deg)
+        require_value(0 <= low < high, "min_range_m, max_range_m", "0 <= min < max", f"{low} and {high}")
+        require_value(0 < self.view_deg <= 360, "view_deg", "above 0 and at most 360", self.view_deg)
 
     @property
     def num_rays(self) -> int:
