@@ -204,13 +204,12 @@ def _offset(T: Any, T_prior: Any) -> Any:
 
 
 def _solve_positive(matrix: Any, right: Any) -> Any:
-    """Solves positive definite systems (..., k, k) by Cholesky's factors.
-
-    For small matrices of JAX the loops are unrolled: a general solver compiles for seconds.
-    """
+    """Solves positive definite systems (..., k, k) by Cholesky's factors."""
     if rigid.namespace_of(matrix) is np:
         return np.linalg.solve(matrix, right[..., None])[..., 0]
-    size, factor, eps = matrix.shape[-1], {}, float(np.finfo(matrix.dtype).eps)
+    # The loops are unrolled, because a general solver compiles for seconds.
+    size, eps = matrix.shape[-1], float(np.finfo(matrix.dtype).eps)
+    factor: dict[tuple[int, int], Any] = {}
     solution: list[Any] = []
     for i in range(size):
         for j in range(i + 1):
