@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dpmjax.geometry.planes import PlaneStep, geman_mcclure, information_about_origin, motion_about, step_to_planes
+from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from tests.tolerances import ACCUMULATED, DOUBLE
 
 
@@ -68,34 +68,6 @@ def test_directions_that_no_plane_holds_stay() -> None:
     up = np.tile([0.0, 0.0, 1.0], (60, 1))
     tangent = step_to_planes(points, up, residuals, weights)[0].tangent
     np.testing.assert_allclose(tangent[[0, 1, 5]], 0, atol=1e-9)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_information_of_the_origin_is_that_of_its_derivatives(dim: int) -> None:
-    points, normals, residuals, weights = pairs()
-    points, normals, T = points[:, :dim], normals[:, :dim], np.eye(dim + 1)
-    T[:dim, dim] = np.arange(dim) + 3.0
-    step, information = step_to_planes(points, normals, residuals, weights)
-    lever, axes = np.zeros((60, 3)), np.zeros((60, 3))
-    lever[:, :dim], axes[:, :dim] = points - T[:dim, dim], normals
-    turns = np.cross(lever, axes)[:, 2 if dim == 2 else 0 :]
-    jacobian = np.concatenate([normals, turns], axis=1)
-    found = information_about_origin(information, T, step.centre)
-    np.testing.assert_allclose(found, jacobian.T @ (weights[:, None] * jacobian), **DOUBLE)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("kind", [np.asarray, lambda array: jnp.asarray(array, jnp.float32)])
-def test_without_pairs_a_step_leads_to_the_prior(dim: int, kind) -> None:
-    points, normals, residuals, weights = pairs()
-    T, T_prior = np.eye(dim + 1), np.eye(dim + 1)
-    T_prior[:2, :2] = Rotation.from_rotvec([0, 0, 0.01]).as_matrix()[:2, :2]
-    T_prior[:dim, dim] = 0.5
-    prior = tuple(kind(array) for array in (T, T_prior, np.eye(3 * (dim - 1))))
-    step, _ = step_to_planes(
-        *(kind(array) for array in (points[:, :dim], normals[:, :dim], residuals, 0 * weights)), prior
-    )
-    np.testing.assert_allclose(motion_about(step), T_prior, atol=1e-3)
 
 
 @pytest.mark.slow

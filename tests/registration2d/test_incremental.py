@@ -39,7 +39,7 @@ def test_odometry_is_the_guess(walk, walk_scans) -> None:
     turned = walk.reference_poses.copy()
     turned[12:, 2] += np.pi
     sign = np.where(np.arange(24) < 12, 1.0, -1.0)[:, None, None].astype(np.float32)
-    names = ("points", "normals", "positions")
+    names = ("points", "normals", "centroids")
     scans = replace(walk_scans, **{name: sign * getattr(walk_scans, name) for name in names})
     rng = np.random.default_rng(0)
     steps = se2.relative(turned[:-1], turned[1:]) + rng.normal(size=(23, 3)) * [2.0, 2.0, 0.03]

@@ -2,12 +2,68 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dpmjax.geometry import se2
 from dpmjax.registration2d import PlanarScans
-from dpmjax.registration2d.pair_alignment import FINE, PairPrior, match_pairs
+from dpmjax.registration2d.pair_alignment import FINE, PairPrior, linearise_pair, match_pairs
+from dpmjax.registration2d.planar_scans import Lines
+
+GATE, KERNEL = 20.0, 4.0
+
+
+def residuals(source: Lines, target: Lines, pose: np.ndarray, nearest: np.ndarray, metric: str) -> np.ndarray:
+    """Slow float64 distances of fixed pairs, (b, k)."""
+    points = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
+    if metric == "point":
+        return points - np.asarray(target.points, np.float64)[nearest]
+    normals, centroids = (np.asarray(x, np.float64)[nearest] for x in (target.normals, target.centroids))
+    return ((points - centroids) * normals).sum(-1, keepdims=True)
+
+
+@pytest.mark.parametrize("metric", ["point", "plane"])
+def test_system_is_that_of_finite_differences(walk, walk_scans, metric: str) -> None:
+    source, target = (walk_scans.lines(row) for row in (1, 0))
+    pose = se2.relative(walk.reference_poses[0], walk.reference_poses[1]) + np.array([1.0, -0.7, 0.02])
+    with jax.default_matmul_precision("highest"):
+        system = linearise_pair(
+            Lines(*map(jnp.asarray, source)),
+            Lines(*map(jnp.asarray, target)),
+            jnp.asarray(pose, jnp.float32),
+            jnp.asarray([GATE, KERNEL]),
+            metric=metric,
+        )
+    moved = se2.transform_points(pose[None], np.asarray(source.points, np.float64)[None])[0]
+    apart = np.linalg.norm(moved[:, None] - np.asarray(target.points, np.float64), axis=-1)
+    apart[:, ~np.asarray(target.mask)] = np.inf
+    nearest = apart.argmin(-1)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    turned = np.asarray(source.normals, np.float64) @ np.array([[c, s], [-s, c]])
+    facing = (turned * np.asarray(target.normals)[nearest]).sum(-1) > 0.7
+    counts = np.asarray(source.mask) & (apart.min(-1) < GATE) & facing
+    here = residuals(source, target, pose, nearest, metric)
+    step = 1e-6
+    jacobian = np.stack(
+        [
+            (
+                residuals(source, target, se2.compose(pose, delta), nearest, metric)
+                - residuals(source, target, se2.compose(pose, -delta), nearest, metric)
+            )
+            / (2 * step)
+            for delta in step * np.eye(3)
+        ],
+        axis=-1,
+    )
+    weight = counts * (KERNEL**2 / (KERNEL**2 + (here**2).sum(-1))) ** 2
+    size = np.sqrt(np.einsum("b,bki,bki->i", weight, jacobian, jacobian))
+    information = np.einsum("b,bki,bkj->ij", weight, jacobian, jacobian) / np.outer(size, size)
+    gradient = np.einsum("b,bki,bk->i", weight, jacobian, here) / size
+    np.testing.assert_allclose(np.asarray(system.information) / np.outer(size, size), information, atol=2e-3)
+    np.testing.assert_allclose(np.asarray(system.gradient) / size, gradient, atol=2e-2)
+    assert float(system.weight) == pytest.approx(weight.sum(), rel=2e-3)
 
 
 def corridor(shift: float) -> PlanarScans:

@@ -36,7 +36,7 @@ def test_normals_of_noise_free_walls_are_exact_also_beside_corners() -> None:
     # Every beam lies on a straight wall; but the outermost ones of the array, which have neighbours on one side.
     assert np.asarray(lines.is_on_line).mean() > 0.97
     assert angles_between(lines, normals).max() < 0.1
-    offset = ((np.asarray(lines.positions - lines.points)[0]) * normals).sum(-1)
+    offset = ((np.asarray(lines.centroids - lines.points)[0]) * normals).sum(-1)
     assert np.abs(offset[np.asarray(lines.is_on_line[0])]).max() < 0.01
     assert lines.noise < 1e-3
 
@@ -67,12 +67,12 @@ def test_masked_beams_never_matter(filling: float) -> None:
     lines, expected = planar_scans(masked), planar_scans(reference)
     np.testing.assert_array_equal(lines.is_on_line, expected.is_on_line)
     assert not np.asarray(lines.is_on_line)[~mask].any()
-    for name in ("normals", "positions"):
+    for name in ("normals", "centroids"):
         valid = np.asarray(lines.is_on_line)
         np.testing.assert_array_equal(
             np.asarray(getattr(lines, name))[valid], np.asarray(getattr(expected, name))[valid]
         )
-    for name in ("points", "normals", "positions"):
+    for name in ("points", "normals", "centroids"):
         assert np.isfinite(getattr(lines, name)).all()
     assert (lines.noise, lines.typical_range) == (expected.noise, expected.typical_range)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -119,8 +118,6 @@ def step_to_planes(
     residuals: Float[AnyArray, "*b n"],
     weights: Float[AnyArray, "*b n"],
     prior: tuple[Any, Any, Any] | None = None,
-    *,
-    damping: float = 1e-6,
 ) -> tuple[PlaneStep, Any]:
     """Solves the weighted normal equations of point-to-plane alignment (Chen and Medioni 1992), d = 2 or 3.
 
@@ -131,9 +128,8 @@ def step_to_planes(
         normals: normals of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
         weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
-        prior: present motion T (..., d+1, d+1), expected motion, and the information (..., k, k) about it: of the
-            position of the origin of the moved side, and of its turn, in the fixed frame; None for none.
-        damping: share of each unknown's own information that is added to it.
+        prior: present motion T (..., d+1, d+1), expected motion, and information (k, k) about the latter; None for
+            none.
 
     Returns:
         The step, 0 where no pair counts; and the information (..., k, k) of the pairs about its centre.
@@ -142,86 +138,36 @@ def step_to_planes(
     counted = (weights > 0).astype(points.dtype)
     count = xp.maximum(counted.sum(axis=-1), 1)[..., None]
     centre = rigid.matmul(counted[..., None, :], points)[..., 0, :] / count
-    jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), torques(points - centre[..., None, :], normals)], axis=-2)
+    jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), _torques(points - centre[..., None, :], normals)], axis=-2)
     weighted = weights[..., None, :] * jacobian
     information = rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2))
     gradient, system = rigid.matmul(weighted, residuals[..., None]), information
     diagonal = xp.diagonal(system, axis1=-2, axis2=-1)
     floor = max(1e-9, float(np.finfo(points.dtype).eps)) * diagonal.sum(axis=-1, keepdims=True)
-    added = damping * diagonal + floor + np.finfo(points.dtype).tiny
+    damping = 1e-6 * diagonal + floor + np.finfo(points.dtype).tiny
     if prior is not None:
         T, T_prior, of_prior = prior
-        moves = _moves_of_origin(T, centre)
-        weighted_moves = rigid.matmul(xp.swapaxes(moves, -1, -2), of_prior)
-        system = system + rigid.matmul(weighted_moves, moves)
-        gradient = gradient + rigid.matmul(weighted_moves, _offset(T, T_prior)[..., None])
-    damped = system + added[..., None] * np.eye(system.shape[-1], dtype=points.dtype)
-    tangent = -_solve_positive(damped, gradient[..., 0])
-    return PlaneStep(tangent, centre), information
+        system = system + of_prior
+        gradient = gradient + rigid.matmul(of_prior, _offset_about(T, T_prior, centre)[..., None])
+    tangent = -xp.linalg.solve(system + damping[..., None] * np.eye(system.shape[-1], dtype=points.dtype), gradient)
+    return PlaneStep(tangent[..., 0], centre), information
 
 
-def torques(levers: Any, forces: Any) -> Any:
-    """Computes the cross products of levers and forces (..., n, d): (..., 1, n) in the plane, (..., 3, n) in space."""
+def _torques(levers: Any, forces: Any) -> Any:
+    """Returns cross products (..., 1, n) in the plane, (..., 3, n) in space, of vectors (..., n, d)."""
     xp, dim = rigid.namespace_of(levers, forces), levers.shape[-1]
     axes = [(0, 1)] if dim == 2 else [(1, 2), (2, 0), (0, 1)]
     return xp.stack([levers[..., i] * forces[..., j] - levers[..., j] * forces[..., i] for i, j in axes], axis=-2)
 
 
-def information_about_origin(information: Any, T: Any, centre: Any) -> Any:
-    """Moves the information of pairs from the centre of a step to the origin of the moved side.
-
-    Args:
-        information: (..., k, k) of the shift and the turn about the centre, in the fixed frame.
-        T: (..., d+1, d+1) motion of the moved side.
-        centre: (..., d) of the step.
-
-    Returns:
-        (..., k, k) information of the position of the origin and of the turn, in the fixed frame.
-    """
-    xp = rigid.namespace_of(information)
-    back = 2 * xp.eye(information.shape[-1], dtype=information.dtype) - _moves_of_origin(T, centre)
-    return rigid.matmul(xp.swapaxes(back, -1, -2), rigid.matmul(information, back))
-
-
-def _moves_of_origin(T: Any, centre: Any) -> Any:
-    """Returns the matrices (..., k, k) from a step about a centre to the motion of the origin of the moved side."""
-    xp, dim = rigid.namespace_of(T, centre), centre.shape[-1]
-    axes = xp.broadcast_to(xp.eye(dim, dtype=centre.dtype), (*centre.shape, dim))
-    levers = xp.broadcast_to((T[..., :dim, dim] - centre)[..., None, :], axes.shape)
-    by_turns = xp.swapaxes(torques(levers, axes), -1, -2)
-    last = xp.eye(dim + by_turns.shape[-1], dtype=centre.dtype)[dim:]
-    top = xp.concatenate([axes, by_turns], axis=-1)
-    return xp.concatenate([top, xp.broadcast_to(last, (*centre.shape[:-1], *last.shape))], axis=-2)
-
-
-def _offset(T: Any, T_prior: Any) -> Any:
-    """Returns the small motion (..., k) from a prior to `T`: of the origin, then the turn to first order."""
-    xp, dim = rigid.namespace_of(T, T_prior), T.shape[-1] - 1
-    turn = rigid.matmul(T[..., :dim, :dim], xp.swapaxes(T_prior[..., :dim, :dim], -1, -2))
+def _offset_about(T: Any, T_prior: Any, centre: Any) -> Any:
+    """Returns the small motion (..., k) from a prior to `T`, to first order: shift of the centre, then the turn."""
+    xp, dim = rigid.namespace_of(T), T.shape[-1] - 1
+    T_here_prior = rigid.matmul(T, rigid.inverse(T_prior))
+    turn = T_here_prior[..., :dim, :dim]
+    shift = rigid.matmul(turn, centre[..., None])[..., 0] + T_here_prior[..., :dim, dim] - centre
     rows, columns = ([1], [0]) if dim == 2 else ([2, 0, 1], [1, 2, 0])
-    shift = T[..., :dim, dim] - T_prior[..., :dim, dim]
     return xp.concatenate([shift, (turn[..., rows, columns] - turn[..., columns, rows]) / 2], axis=-1)
-
-
-def _solve_positive(matrix: Any, right: Any) -> Any:
-    """Solves positive definite systems (..., k, k) by Cholesky's factors.
-
-    For small matrices of JAX the loops are unrolled: a general solver compiles for seconds.
-    """
-    if rigid.namespace_of(matrix) is np:
-        return np.linalg.solve(matrix, right[..., None])[..., 0]
-    size, factor, eps = matrix.shape[-1], {}, float(np.finfo(matrix.dtype).eps)
-    solution: list[Any] = []
-    for i in range(size):
-        for j in range(i + 1):
-            rest = matrix[..., i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
-            # Rounding may make the last pivots negative.
-            factor[i, j] = rest / factor[j, j] if j < i else jnp.maximum(rest, eps * matrix[..., i, i]) ** 0.5
-        solution.append((right[..., i] - sum(factor[i, k] * solution[k] for k in range(i))) / factor[i, i])
-    for i in reversed(range(size)):
-        above = sum(factor[k, i] * solution[k] for k in range(i + 1, size))
-        solution[i] = (solution[i] - above) / factor[i, i]
-    return jnp.stack(solution, axis=-1)
 
 
 def motion_about(step: PlaneStep) -> Any:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.icp import icp
-from dpmjax.registration2d.pair_alignment import COARSE, FINE, PairMatches, PairPrior, fan, match_pairs
+from dpmjax.registration2d.pair_alignment import COARSE, FINE, Metric, PairMatches, PairPrior, fan, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans
 from dpmjax.registration2d.sequence_search import search_sequence
 from dpmjax.registration2d.steps import StepPrior, usual_motion
@@ -41,11 +39,7 @@ class IncrementalResult(NamedTuple):
 
 
 def incremental_icp(
-    scans: PlanarScans,
-    metric: Literal["point", "plane"] = "plane",
-    *,
-    odometry: Floats | None = None,
-    prior: StepPrior | None = None,
+    scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None, prior: StepPrior | None = None
 ) -> IncrementalResult:
     """Registers each scan to the one before and chains the steps.
 
@@ -66,23 +60,21 @@ def incremental_icp(
     if len(scans) == 1:
         return IncrementalResult(np.zeros((1, 3)), match_pairs(source, target, np.zeros((0, 1, 3)), FINE))
     if odometry is None:
-        rough = _search_steps(source, target)
+        rough = _search_steps(source, target, metric)
         prior = usual_motion(rough, unit)
     else:
         prior = prior or StepPrior.of_poses(odometry, unit)
         turns = fan(np.radians(_TURN_STEP) * np.array([0.0, -0.5, 0.5, -1.5, 1.5]))
         guesses = se2.relative(odometry[:-1], odometry[1:])[:, None] + turns
         loose = prior.as_pair_prior(_COARSE_RESIDUAL * unit)
-        rough = match_pairs(source, target, guesses, COARSE, loose)
+        rough = match_pairs(source, target, guesses, COARSE, loose, metric=metric)
     # The weight of the prior follows from the range noise; steps that the scans leave unconstrained have a larger one.
     num_beams = source.num_on_line
     is_open = rough.weakest_eigenvalue() < _MIN_EIGENVALUE * num_beams * COARSE.source_share(source)
     belief = prior.as_pair_prior(np.where(is_open, _OPEN_RESIDUAL * unit, 3.0 * scans.noise)[:, None])
     predicted = np.concatenate([prior.steps[:, :2], rough.poses[:, 2:]], axis=1)
     guesses = np.stack([rough.poses, np.where(is_open[:, None], predicted, rough.poses)], axis=1)
-    steps = match_pairs(source, target, guesses, FINE, belief)
-    if metric == "point":
-        steps = steps._replace(poses=_to_points(source, target, steps.poses))
+    steps = match_pairs(source, target, guesses, FINE, belief, metric=metric)
     poses = se2.chain(steps.poses) if odometry is not None else search_sequence(scans, steps)
     return IncrementalResult(poses, steps)
 
@@ -100,31 +92,20 @@ def scan_odometry(scans: PlanarScans) -> Floats:
     Returns:
         (n, 3) T_world_scan, the first one zero.
     """
-    matches = match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)))
+    matches = match_near(scans.take(slice(1, None)), scans.take(slice(len(scans) - 1)), "plane")
     is_lost = (matches.fitness < _POOR_FITNESS)[:, None]
     return se2.chain(np.where(is_lost, [scans.typical_range, 0.0, 0.0], matches.poses))
 
 
-def match_near(source: PlanarScans, target: PlanarScans) -> PairMatches:
+def match_near(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
     """Returns coarse matches from zero motion and small turns."""
     guesses = fan(np.radians(_TURN_STEP) * np.array([0.0, -0.5, 0.5]))
-    return match_pairs(source, target, np.broadcast_to(guesses, (len(source), 3, 3)), COARSE)
+    return match_pairs(source, target, np.broadcast_to(guesses, (len(source), 3, 3)), COARSE, metric=metric)
 
 
-def _to_points(source: PlanarScans, target: PlanarScans, poses: Floats) -> Floats:
-    """Aligns pairs point to point from these poses."""
-    T = np.asarray(se2.to_matrix(poses), np.float32)
-
-    def align(T_init: Any, *clouds: Any) -> Any:
-        return icp(*clouds[:2], "point", T_init, *clouds[2:]).T_target_source
-
-    found = jax.vmap(align)(T, source.points, target.points, source.mask, target.mask)
-    return se2.from_matrix(np.asarray(found, np.float64))
-
-
-def _search_steps(source: PlanarScans, target: PlanarScans) -> PairMatches:
+def _search_steps(source: PlanarScans, target: PlanarScans, metric: Metric) -> PairMatches:
     """Returns coarse matches from small motions, then from larger ones where the fitness is poor."""
-    unit, rough = source.typical_range, match_near(source, target)
+    unit, rough = source.typical_range, match_near(source, target, metric)
     prior = usual_motion(rough, unit).as_pair_prior(_COARSE_RESIDUAL * unit)
     # Around the predicted translations, then far from zero.
     turns = np.radians(np.arange(-_MAX_TURN, _MAX_TURN + 1.0, _TURN_STEP))
@@ -134,7 +115,7 @@ def _search_steps(source: PlanarScans, target: PlanarScans) -> PairMatches:
         rows = np.flatnonzero(rough.fitness < limit)
         belief = PairPrior(prior.mean[rows], prior.information[rows])
         around = middle[rows][:, None] + guesses
-        wide = match_pairs(source.take(rows), target.take(rows), around, COARSE, belief)
+        wide = match_pairs(source.take(rows), target.take(rows), around, COARSE, belief, metric=metric)
         better = wide.fitness > rough.fitness[rows]
         for kept, found in zip(rough, wide, strict=True):
             kept[rows[better]] = found[better]

@@ -18,7 +18,7 @@ import scipy.spatial
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, join_rows, take_rows
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.pair_alignment import Schedule, align_pairs
+from dpmjax.registration2d.pair_alignment import Schedule, linearise_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarScans
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, held_steps, pose_steps, prior_steps, slide_steps
@@ -62,7 +62,9 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
             pairs = _choose_aligned(scans, poses, radius, prior)
             steps = join_rows(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
-        poses = relax_edges(join_rows(_align_pairs(scans, pairs, poses, scale), steps), poses, 1)
+        edges, gradient = _linearise(scans, pairs, poses, scale)
+        held, pull = _linearise_edges(steps, poses)
+        poses = se2.compose(poses, solve_step(len(poses), join_rows(edges, held), np.concatenate([gradient, pull])))
     return poses
 
 
@@ -83,13 +85,12 @@ def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: 
     if not len(pairs.held.source):
         return adjusted
     scale = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)[-1]
-    edges = _align_pairs(scans, pairs, adjusted, scale)
-    edges = edges._replace(measurements=se2.relative(adjusted[edges.target], adjusted[edges.source]))
+    edges, _ = _linearise(scans, pairs, adjusted, scale)
     kept, information = se2.relative(aligned[pairs.held.target], aligned[pairs.held.source]), pairs.held.information
     # As much information as if all beams of a scan measured the unconstrained direction.
     information = information * (scans.mask.shape[1] / np.trace(information, axis1=1, axis2=2))[:, None, None]
     edges = join_rows(edges, pairs.held._replace(measurements=kept, information=information))
-    return relax_edges(edges, adjusted, _NUM_OPEN_ROUNDS)
+    return _relax(edges, adjusted, _NUM_OPEN_ROUNDS)
 
 
 def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float, prior: StepPrior) -> Floats | None:
@@ -115,7 +116,9 @@ def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float
     weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
     restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
     edges = join_rows(_fitting_pairs(scans, poses, radius), Edges(later, later - 1, restored, weights))
-    return _relax_scored(edges, poses, scans.typical_range)
+    scale = np.diag([1.0, 1.0, scans.typical_range**2])
+    edges = edges._replace(information=edges.information[:, None, None] * scale)
+    return _relax(edges, poses, _NUM_TORN_ROUNDS)
 
 
 def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: float) -> Floats:
@@ -137,15 +140,13 @@ def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: floa
     # Scans that have collapsed onto each other hold each other there.
     is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > _FAR_STEPS)
     restored = np.where(is_moved[:, None], slides.moved(steps), steps)
-    chain = Edges(later, later - 1, restored, np.maximum(slides.scores, _LEAST_WEIGHT))
-    edges = join_rows(take_rows(pairs, np.flatnonzero(is_kept)), chain)
-    return _relax_scored(edges, poses, scans.typical_range)
-
-
-def _relax_scored(edges: Edges, poses: Floats, typical_range: float) -> Floats:
-    """Returns the poses that agree with edges whose information is their scores (e,)."""
-    scale = np.diag([1.0, 1.0, typical_range**2])
-    return relax_edges(edges._replace(information=edges.information[:, None, None] * scale), poses, _NUM_TORN_ROUNDS)
+    edges = join_rows(
+        take_rows(pairs, np.flatnonzero(is_kept)),
+        Edges(later, later - 1, restored, np.maximum(slides.scores, _LEAST_WEIGHT)),
+    )
+    scale = np.diag([1.0, 1.0, scans.typical_range**2])
+    edges = edges._replace(information=edges.information[:, None, None] * scale)
+    return _relax(edges, poses, _NUM_TORN_ROUNDS)
 
 
 def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
@@ -159,32 +160,21 @@ def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
     return Edges(source[fits], target[fits], relative[fits], scores[fits])
 
 
-def relax_edges(edges: Edges, poses: Floats, num_rounds: int) -> Floats:
-    """Moves poses by Gauss-Newton steps towards the measurements of edges.
+def _linearise_edges(edges: Edges, poses: Floats) -> tuple[Edges, Floats]:
+    """Returns the edges at the relative poses of these poses, and J^T W r (e, 3), as `solve_step` takes them."""
+    here = se2.relative(poses[edges.target], poses[edges.source])
+    pull = np.einsum("eij,ej->ei", edges.information, se2.relative(edges.measurements, here))
+    return edges._replace(measurements=here), pull
 
-    Args:
-        edges: measured relative poses.
-        poses: (n, 3); the first one is fixed.
-        num_rounds: number of steps.
 
-    Returns:
-        (n, 3) poses.
-    """
-    nodes = np.stack([edges.target, edges.source], axis=1)
+def _relax(edges: Edges, poses: Floats, num_rounds: int) -> Floats:
+    """Returns the poses after Gauss-Newton steps towards the measurements of the edges."""
     for _ in range(num_rounds):
-        here = np.asarray(se2.relative(poses[edges.target], poses[edges.source]))
-        off = se2.relative(edges.measurements, here)
-        # A step of the target moves the tangent of the source by minus the adjoint of T_source_target.
-        adjoint = se2.adjoint(se2.inverse(here))
-        jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
-        weighted = np.swapaxes(jacobian, 2, 3) @ edges.information[:, None]
-        blocks = weighted[:, :, None] @ jacobian[:, None]
-        step = solve_blocks(nodes, blocks, np.einsum("esij,ej->esi", weighted, off), len(poses))
-        poses = np.asarray(se2.compose(poses, step))
+        poses = np.asarray(se2.compose(poses, solve_step(len(poses), *_linearise_edges(edges, poses))))
     return poses
 
 
-class _ChosenPairs(NamedTuple):
+class _AlignedPairs(NamedTuple):
     """Pairs of scans that are aligned (p), and the steps that the scans do not constrain.
 
     Attributes:
@@ -200,18 +190,38 @@ class _ChosenPairs(NamedTuple):
     held: Edges
 
 
-def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _ChosenPairs:
+def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
     source, target = choose_pairs(poses, radius * scans.typical_range)
     if prior is None:
-        return _ChosenPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
+        return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
     slides = slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
     is_kept = (crossed[source] == crossed[target]) | (source - target > _FEW_STEPS)
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
     across = np.eye(3) - slide_steps(scans, relative, pairs=(source, target)).open_directions(relative)
-    return _ChosenPairs(source, target, across, held_steps(slides, poses))
+    return _AlignedPairs(source, target, across, held_steps(slides, poses))
+
+
+def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
+    """Computes one Gauss-Newton step of all poses in their own frames; the first pose is fixed.
+
+    Args:
+        num_poses: n.
+        edges: the relative poses at which the system was linearised, with J^T W J as information.
+        gradient: (e, 3) J^T W r of each edge in the tangent of its source frame.
+
+    Returns:
+        (n, 3) steps.
+    """
+    # A step of the target moves the tangent of an edge by minus the adjoint of T_source_target.
+    adjoint = se2.adjoint(se2.inverse(edges.measurements))
+    jacobian = np.stack([-adjoint, np.broadcast_to(np.eye(3), adjoint.shape)], axis=1)
+    transposed = np.swapaxes(jacobian, 2, 3)
+    blocks = (transposed @ edges.information[:, None])[:, :, None] @ jacobian[:, None]
+    gradients = np.einsum("esij,ej->esi", transposed, gradient)
+    return solve_blocks(np.stack([edges.target, edges.source], axis=1), blocks, gradients, num_poses)
 
 
 def choose_pairs(poses: Floats, radius: float) -> Pairs:
@@ -232,15 +242,10 @@ def choose_pairs(poses: Floats, radius: float) -> Pairs:
     return source.astype(np.int64), rows[source, column].astype(np.int64)
 
 
-def _align_pairs(scans: PlanarScans, pairs: _ChosenPairs, poses: Floats, scale: Floats) -> Edges:
-    """Returns edges of all pairs after one step of their alignment from these poses, at this gate and kernel."""
+def _linearise(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: Floats) -> tuple[Edges, Floats]:
+    """Linearises all pairs at these poses, gate and kernel."""
     source, target, across, _ = pairs
-    relative = np.asarray(se2.relative(poses[target], poses[source]))
+    relative = se2.relative(poses[target], poses[source])
     stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
-    sides = scans.beams(stride=stride), scans.elements()
-    aligned, _, information = align_pairs(sides, (source, target), relative, scale[None])
-    held = across @ information @ across
-    pull = across @ information @ np.asarray(se2.relative(relative, aligned))[..., None]
-    # The poses that `relax_edges` pulls by just this: along a weak direction a step may be long, and is no measurement.
-    off = -(np.linalg.pinv(held, rcond=1e-9, hermitian=True) @ pull)[..., 0]
-    return Edges(source, target, np.asarray(se2.compose(relative, se2.inverse(off))), held)
+    information, gradient = linearise_pairs(scans, source, target, relative, scale, stride=stride)
+    return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)

@@ -13,14 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.geometry import se2
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.kept_programs import kept_jit
 from dpmjax.pose_graph.normal_equations import solve_blocks
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, batches
-from dpmjax.types import SurfaceElements
+from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans
 
 # The nearest beam of a neighbour, and this number of beams to either side of it, may be part of the line.
 _NUM_BESIDE = 2
@@ -38,8 +37,6 @@ _MIN_SLENDERNESS = 2.0
 _NUM_NEIGHBOURS, _RADIUS = 48, 1.2
 # Number of times that the beams of the lines are chosen, and Gauss-Newton steps after each choice.
 _NUM_ROUNDS, _NUM_ITERATIONS = 2, 2
-# Scans of one call of the program: more take memory, fewer take time for calls.
-_BATCH = 16
 
 
 class _Beams(NamedTuple):
@@ -78,17 +75,22 @@ class _Fit(NamedTuple):
     is_line: Bool[Array, " b"]
 
 
-def _gather_beams(own: SurfaceElements, others: SurfaceElements, poses: Array, noise: Array) -> _Beams:
+@kept_jit()
+def _find_nearest(own: Lines, others: Lines, poses: Float[Array, "s 3"]) -> Int[Array, "b s"]:
+    """Finds the beam of each neighbouring scan that ends nearest to each beam."""
+    search = jax.vmap(lambda some, mask: k_nearest(own.points, some, 1, mask=mask).indices[:, 0], out_axes=1)
+    return search(se2.transform_points(poses, others.points), others.mask)
+
+
+def _gather_beams(own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Array, noise: Array) -> _Beams:
     """Gathers, for each beam, the beams of nearby scans that hit the same side of the same surface."""
-    points = se2.transform_points(poses, others.positions)
-    search = jax.vmap(lambda some, mask: k_nearest(own.positions, some, 1, mask=mask).indices[:, 0], out_axes=1)
-    nearest = search(points, others.mask)
+    points = se2.transform_points(poses, others.points)
     normals = se2.transform_points(poses * jnp.array([0.0, 0.0, 1.0]), others.normals)
     index = nearest[..., None] + jnp.arange(-_NUM_BESIDE, _NUM_BESIDE + 1)
     is_inside = (index >= 0) & (index < points.shape[1])
     index, scan = jnp.clip(index, 0, points.shape[1] - 1), jnp.arange(len(points))[:, None]
     found_x, found_y = points[..., 0][scan, index], points[..., 1][scan, index]
-    x, y = found_x - own.positions[:, :1, None], found_y - own.positions[:, 1:, None]
+    x, y = found_x - own.points[:, :1, None], found_y - own.points[:, 1:, None]
     squared = x**2 + y**2
     cosine = own.normals[:, :1, None] * normals[..., 0][scan, index]
     cosine += own.normals[:, 1:, None] * normals[..., 1][scan, index]
@@ -134,18 +136,13 @@ def _wide(values: Float[Array, " b"]) -> Float[Array, "b 1 1"]:
 
 
 @kept_jit()
-def _linearise_all(own: SurfaceElements, others: SurfaceElements, poses: Array, noise: Array) -> tuple[Array, Array]:
-    """Computes the systems of several scans, one after the other, so that few values are live."""
-    return jax.lax.map(lambda scan: _linearise(*scan, noise), (own, others, poses))
-
-
 def _linearise(
-    own: SurfaceElements, others: SurfaceElements, poses: Float[Array, "s 3"], noise: Float[Array, ""]
+    own: Lines, others: Lines, nearest: Int[Array, "b s"], poses: Float[Array, "s 3"], noise: Float[Array, ""]
 ) -> tuple[Float[Array, "s s 3 3"], Float[Array, "s 3"]]:
     """Computes J^T W J and J^T W r of one scan; the first of `others` is the scan itself, at pose zero."""
-    beams = _gather_beams(own, others, poses, noise)
+    beams = _gather_beams(own, others, nearest, poses, noise)
     lines = _fit_lines(beams, jnp.asarray(own.normals), noise)
-    (x, y), (own_x, own_y) = (lines.x[:, None], lines.y[:, None]), own.positions.T
+    (x, y), (own_x, own_y) = (lines.x[:, None], lines.y[:, None]), own.points.T
     across = _wide(lines.x) * beams.x + _wide(lines.y) * beams.y
     residual = -(lines.shares * across).sum((1, 2))
     slant = lines.x * own_x + lines.y * own_y
@@ -196,21 +193,24 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
         return poses
     for _ in range(_NUM_ROUNDS):
         around = _choose_around(poses, _RADIUS * scans.typical_range)
+        pairs = [_lines_around(scans, rows) for rows in around]
+        relative = _relative_to_own(poses, around)
+        nearest = [_find_nearest(*lines, T) for lines, T in zip(pairs, relative, strict=True)]
         for _ in range(_NUM_ITERATIONS):
-            relative = se2.relative(poses[:, None], poses[around])
-            poses = se2.compose(poses, solve_blocks(around, *_systems(scans, around, relative), len(poses)))
+            relative, noise = _relative_to_own(poses, around), np.float32(scans.noise)
+            systems = [_linearise(*x, near, T, noise) for x, near, T in zip(pairs, nearest, relative, strict=True)]
+            blocks, gradient = (np.stack(x).astype(np.float64) for x in zip(*systems, strict=True))
+            poses = se2.compose(poses, solve_blocks(around, blocks, gradient, len(poses)))
     return poses
 
 
-def _systems(scans: PlanarScans, around: Indices, relative: Float[np.ndarray, "n s 3"]) -> tuple[Floats, Floats]:
-    """Returns J^T W J (n, s, s, 3, 3) and J^T W r (n, s, 3) of all scans; `relative` are poses of `around` in them."""
-    blocks, gradient = np.zeros((*relative.shape[:2], *relative.shape[1:2], 3, 3)), np.zeros(relative.shape)
-    for part, rows in batches(len(around), _BATCH):
-        others = scans.beams(around[rows])
-        # Repetitions of a scan itself have no beams.
-        is_other = (around[rows] != rows[:, None]) | (np.arange(around.shape[1]) == 0)
-        others = others.replace(mask=others.mask & is_other[..., None])
-        found = _linearise_all(scans.beams(rows), others, relative[rows].astype(np.float32), np.float32(scans.noise))
-        for kept, values in zip((blocks, gradient), found, strict=True):
-            kept[part] = np.asarray(values)[: part.stop - part.start]
-    return blocks, gradient
+def _lines_around(scans: PlanarScans, rows: Indices) -> tuple[Lines, Lines]:
+    """Returns the lines of the first scan, and those of all; repetitions of the first scan have none."""
+    others = scans.lines(rows)
+    is_other = (rows != rows[0]) | (np.arange(len(rows)) == 0)
+    return scans.lines(rows[0]), others._replace(mask=others.mask & is_other[:, None])
+
+
+def _relative_to_own(poses: Floats, around: Indices) -> Float[np.ndarray, "n s 3"]:
+    """Returns the poses of the neighbouring scans in the frame of each scan."""
+    return se2.relative(poses[around[:, 0]][:, None], poses[around]).astype(np.float32)

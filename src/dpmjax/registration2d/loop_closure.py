@@ -186,11 +186,11 @@ def _build_submaps(scans: PlanarScans, poses: Floats, centres: Indices) -> Plana
     is_there = (rows >= 0) & (rows < len(poses))
     rows = np.clip(rows, 0, len(poses) - 1)
     relative, there = se2.relative(poses[centres][:, None], poses[rows]).astype(np.float32), is_there[..., None]
-    points, positions = (se2.transform_points(relative, x[rows]) for x in (scans.points, scans.positions))
+    points, centroids = (se2.transform_points(relative, x[rows]) for x in (scans.points, scans.centroids))
     normals = se2.transform_points(relative * np.array([0.0, 0.0, 1.0], np.float32), scans.normals[rows])
-    arrays = points, scans.mask[rows] & there, normals, positions, scans.is_on_line[rows] & there
-    points, mask, normals, positions, is_on_line = (x.reshape(len(rows), -1, *x.shape[3:]) for x in arrays)
-    return PlanarScans(points, mask, normals, positions, is_on_line, scans.noise, scans.typical_range, False)
+    arrays = points, scans.mask[rows] & there, normals, centroids, scans.is_on_line[rows] & there
+    points, mask, normals, centroids, is_on_line = (x.reshape(len(rows), -1, *x.shape[3:]) for x in arrays)
+    return PlanarScans(points, mask, normals, centroids, is_on_line, scans.noise, scans.typical_range, False)
 
 
 def count_support(edges: Edges, poses: Floats, typical_range: float) -> Indices:

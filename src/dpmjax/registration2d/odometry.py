@@ -122,7 +122,7 @@ def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
     told = np.stack([se2.relative(poses[:-1], poses[1:]) for poses in ways], axis=1)
     is_within = np.hypot(told[..., 0], told[..., 1]) < _FARTHEST * scans.typical_range
     rough = match_pairs(source, target, np.where(is_within[..., None], told, 0.0), COARSE).poses
-    guesses = np.stack([match_near(source, target).poses, rough], axis=1)
+    guesses = np.stack([match_near(source, target, "plane").poses, rough], axis=1)
     steps = match_pairs(source, target, guesses, FINE).poses
     slides = slide_steps(scans, steps)
     is_clear = (slides.scores > _CLEAR_SCORE) & ~slides.is_torn & ~slides.is_open

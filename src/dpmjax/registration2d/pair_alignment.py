@@ -1,6 +1,7 @@
 """Robust alignment of many pairs of planar scans at once, for incremental ICP, loop search and refinement.
 
-A pose is a vector (x, y, heading). One program aligns a batch of pairs by `dpmjax.scans.align`.
+A pose is a vector (x, y, heading). Errors of a pair are linearised in the tangent space of T_target_source on the
+right, T_target_source @ exp(delta). So every pair costs a 3 x 3 matrix and a 3-vector.
 """
 
 from __future__ import annotations
@@ -8,24 +9,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from operator import itemgetter
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dpmjax.geometry import se2
+from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.kept_programs import kept_jit
-from dpmjax.registration2d.planar_scans import Floats, Pairs, PlanarScans, batches
-from dpmjax.scans.align import AlignedMotion, PairRule, Prior, align
-from dpmjax.types import AnyArray, SurfaceElements
+from dpmjax.registration2d.planar_scans import Floats, Indices, Lines, PlanarScans, batches
+from dpmjax.types import AnyArray
 
 # Number of distances of one batch of pairs, few enough for the cache, and the largest number of pairs in it.
 _LIVE_DISTANCES, _MAX_BATCH = 1 << 22, 256
-# Largest number of steps: all schedules are padded to it, so that one program serves them.
-_MAX_STEPS = 16
-_RULE = PairRule(is_oriented=True, cosines=(0.699, 0.701), damping=1e-3)
+
+Metric = Literal["point", "plane"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,11 @@ FINE = Schedule(gate=(0.075, 0.0225), kernel=(0.0225, 0.00225), num_iterations=1
 _KEPT_SHARE, _LEAST_KEPT, _FIRST_ITERATIONS = 0.25, 4, 3
 
 
+def _thinned(scans: PlanarScans, num_beams: int | None) -> Lines:
+    """Returns about `num_beams` beams of each scan."""
+    return scans.lines(stride=_stride(scans, num_beams))
+
+
 def _stride(scans: PlanarScans, num_beams: int | None) -> int:
     return max(1, round(scans.mask.shape[1] / (num_beams or scans.mask.shape[1])))
 
@@ -74,7 +79,7 @@ class PairMatches(NamedTuple):
     Attributes:
         poses: (p, 3) x, y, heading of T_target_source.
         fitness: (p,) robust share of matched beams, 0 to 1.
-        information: (p, 3, 3) in the tangent (dx, dy, dheading) of the source frame, one unit a beam.
+        information: (p, 3, 3) J^T W J in the source frame, one unit a beam.
     """
 
     poses: Floats
@@ -105,64 +110,147 @@ class PairPrior(NamedTuple):
     information: Float[AnyArray, "... 3"]
 
 
-@kept_jit()
-def _align_all(
-    source: SurfaceElements, target: SurfaceElements, T: Float[Array, "p 3 3"], schedule: Float[Array, "k 2"],
-    prior: Prior,
-) -> AlignedMotion:  # fmt: skip
-    return jax.vmap(partial(align, rule=_RULE), (0, 0, 0, None, 0))(source, target, T, schedule, prior)
-
-
-class AlignedPairs(NamedTuple):
-    """Aligned pairs (t), on the host.
+class PairSystem(NamedTuple):
+    """Gauss-Newton system of one pair at one relative pose.
 
     Attributes:
-        poses: (t, 3) T_target_source.
-        weight: (t,) sum of the robust weights, at most the number of source beams.
-        information: (t, 3, 3) as in `PairMatches`, at the poses before the last step.
+        information: J^T W J in the tangent (dx, dy, dheading) of the source frame.
+        gradient: J^T W r.
+        weight: sum of the robust weights, at most the number of source beams.
     """
 
-    poses: Floats
-    weight: Floats
-    information: Floats
+    information: Float[Array, "3 3"]
+    gradient: Float[Array, " 3"]
+    weight: Float[Array, ""]
 
 
-def align_pairs(
-    sides: tuple[SurfaceElements, SurfaceElements], pairs: Pairs, guesses: Floats, scales: Floats,
-    prior: PairPrior | None = None,
-) -> AlignedPairs:  # fmt: skip
-    """Aligns t pairs, in batches of one shape.
+def linearise_pair(
+    source: Lines, target: Lines, pose: Float[Array, " 3"], scale: Float[Array, " 2"], *, metric: Metric
+) -> PairSystem:
+    """Pairs every source beam with its nearest target beam and linearises the distances.
 
     Args:
-        sides: surface elements of the sources and of the targets, arrays (n, b, ...).
-        pairs: (t,) rows of the sources, and of the targets.
-        guesses: (t, 3) T_target_source.
-        scales: (k, 2) gate and kernel of the steps, 16 at most.
-        prior: prior of the relative poses, (t, 3) each; None: none.
+        source: one scan, (b, 2) arrays.
+        target: one scan.
+        pose: T_target_source (x, y, heading).
+        scale: gate and kernel, in the unit of the points: pairs farther apart than the gate do not count; the kernel is
+            the scale of the Geman-McClure weight on the residual.
+        metric: distance to the target's line ("plane") or to its nearest point.
 
     Returns:
-        AlignedPairs.
+        PairSystem at this pose.
     """
-    found = AlignedPairs(*(np.zeros((len(guesses), *size)) for size in ((3,), (), (3, 3))))
-    prior = prior or PairPrior(guesses, np.zeros_like(guesses))
-    T, T_prior = (se2.to_matrix(np.asarray(poses, np.float64)).astype(np.float32) for poses in (guesses, prior.mean))
-    information = (prior.information[..., None] * np.eye(3)).astype(np.float32)
-    schedule = np.pad(scales, ((0, _MAX_STEPS - len(scales)), (0, 0))).astype(np.float32)
-    batch = _LIVE_DISTANCES // (sides[0].mask.shape[1] * sides[1].mask.shape[1])
+    (gate, kernel), cos, sin = scale, jnp.cos(pose[2]), jnp.sin(pose[2])
+    points = se2.transform_points(pose, source.points)
+    nearest = k_nearest(points, target.points, 1, mask=target.mask).indices[:, 0]
+    (x, y), (matched_x, matched_y), (normal_x, normal_y) = points.T, target.points[nearest].T, target.normals[nearest].T
+    source_x, source_y = source.normals[:, 0], source.normals[:, 1]
+    cosine = (cos * source_x - sin * source_y) * normal_x + (sin * source_x + cos * source_y) * normal_y
+    is_near = (x - matched_x) ** 2 + (y - matched_y) ** 2 < gate**2
+    counts = source.mask & target.mask[nearest] & is_near & (cosine > 0.7)
+    # Distances along the normal to the line, or along both axes to the point.
+    if metric == "plane":
+        goal_x, goal_y = target.centroids[nearest].T
+        axes = [(normal_x, normal_y)]
+    else:
+        goal_x, goal_y, zero = matched_x, matched_y, jnp.zeros_like(x)
+        axes = [(zero + 1.0, zero), (zero, zero + 1.0)]
+    residuals = [(x - goal_x) * axis_x + (y - goal_y) * axis_y for axis_x, axis_y in axes]
+    squared = sum(residual**2 for residual in residuals)
+    weight = jnp.where(counts, (kernel**2 / (kernel**2 + squared)) ** 2, 0.0)
+    information, gradient = jnp.zeros((3, 3), pose.dtype), jnp.zeros(3, pose.dtype)
+    # Sums of products, because products of small matrices are slow on a CPU.
+    for residual, (axis_x, axis_y) in zip(residuals, axes, strict=True):
+        lever = (x - pose[0]) * axis_y - (y - pose[1]) * axis_x
+        jacobian = jnp.stack([axis_x * cos + axis_y * sin, axis_y * cos - axis_x * sin, lever])
+        weighted = weight * jacobian
+        information += (weighted[:, None] * jacobian).sum(-1)
+        gradient += (weighted * residual).sum(-1)
+    return PairSystem(information, gradient, weight.sum())
+
+
+@kept_jit("metric")
+def _linearise(
+    source: Lines, target: Lines, poses: Float[Array, "p 3"], scale: Float[Array, " 2"], *, metric: Metric
+) -> PairSystem:
+    return jax.vmap(partial(linearise_pair, metric=metric), in_axes=(0, 0, 0, None))(source, target, poses, scale)
+
+
+def _step(system: PairSystem, poses: Floats, prior: PairPrior | None) -> Floats:
+    """Computes the poses (p, 3) after a Gauss-Newton step of the scans and the prior together."""
+    information, gradient = (np.asarray(x, np.float64) for x in system[:2])
+    # Damping in proportion to each axis: a pair in a corridor moves along its constrained direction alone.
+    diagonal = np.einsum("pii->pi", information)
+    damping = 1e-3 * diagonal + 1e-6 * diagonal.max(axis=1, keepdims=True) + 1e-9
+    matrix = information + damping[:, None] * np.eye(3)
+    turn = np.zeros((len(poses), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = se2.rotation(poses[:, 2]), 1.0
+    if prior is not None:
+        offset = poses - prior.mean
+        offset[:, 2] = se2.wrap_angle(offset[:, 2])
+        weighted = prior.information[..., None] * turn
+        matrix = matrix + np.swapaxes(turn, 1, 2) @ weighted
+        gradient = gradient + np.einsum("pij,pi->pj", weighted, offset)
+    return np.asarray(poses - np.einsum("pij,pj->pi", turn, np.linalg.solve(matrix, gradient[..., None])[..., 0]))
+
+
+class _Aligned(NamedTuple):
+    """Poses (t, 3) of aligned pairs and their systems, on the host."""
+
+    poses: Floats
+    information: Floats
+    gradient: Floats
+    weight: Floats
+
+
+def _align_batches(
+    pairs: tuple[Lines, Lines], rows: tuple[Indices, Indices], guesses: Floats, prior: PairPrior | None, scales: Floats,
+    *, metric: Metric = "plane",
+) -> _Aligned:  # fmt: skip
+    """Aligns t pairs, rows of the sources and of the targets, in batches of one shape."""
+    # Gate and kernel of the last row of `scales` (i, 2) are those of the result: with one row, no pair moves.
+    found = _Aligned(*(np.zeros((len(guesses), *size)) for size in ((3,), (3, 3), (3,), ())))
+    batch = _LIVE_DISTANCES // (pairs[0].mask.shape[1] * pairs[1].mask.shape[1])
     for part, some in batches(len(guesses), 1 << int(np.log2(np.clip(batch, 1, _MAX_BATCH)))):
-        source, target = (jax.tree.map(itemgetter(end[some]), side) for side, end in zip(sides, pairs, strict=True))
-        motion = _align_all(source, target, T[some], schedule, Prior(T_prior[some], information[some]))
-        poses = se2.from_matrix(np.asarray(motion.T_target_source, np.float64))
-        turn = se2.to_matrix(poses * [0.0, 0.0, 1.0])
-        of_source = np.swapaxes(turn, 1, 2) @ np.asarray(motion.information, np.float64) @ turn
-        for kept, values in zip(found, (poses, motion.weight, of_source), strict=True):
+        source, target = (
+            Lines(*(jax.device_put(x[end[some]]) for x in lines)) for lines, end in zip(pairs, rows, strict=True)
+        )
+        belief = None if prior is None else PairPrior(*(x[some] for x in prior))
+        poses = guesses[some]
+        for number, scale in enumerate(scales.astype(np.float32)):
+            system = _linearise(source, target, poses.astype(np.float32), scale, metric=metric)
+            if number < len(scales) - 1:
+                poses = _step(system, poses, belief)
+        for kept, values in zip(found, (poses, *system), strict=True):
             kept[part] = np.asarray(values)[: part.stop - part.start]
     return found
 
 
+def linearise_pairs(
+    scans: PlanarScans, source: Indices, target: Indices, poses: Floats, scale: Floats, *, stride: int = 1
+) -> tuple[Floats, Floats]:
+    """Linearises p pairs of scans at T_target_source.
+
+    Args:
+        scans: n scans.
+        source: (p,) rows.
+        target: (p,) rows.
+        poses: (p, 3) T_target_source.
+        scale: gate and kernel, as `linearise_pair`.
+        stride: every `stride`-th beam of the sources is used.
+
+    Returns:
+        Information (p, 3, 3) and gradient (p, 3).
+    """
+    lines = scans.lines(stride=stride), scans.lines()
+    found = _align_batches(lines, (source, target), poses, None, np.asarray(scale)[None])
+    return found.information, found.gradient
+
+
 def match_pairs(
-    source: PlanarScans, target: PlanarScans, guesses: Floats, schedule: Schedule, prior: PairPrior | None = None
-) -> PairMatches:
+    source: PlanarScans, target: PlanarScans, guesses: Floats, schedule: Schedule, prior: PairPrior | None = None,
+    *, metric: Metric = "plane",
+) -> PairMatches:  # fmt: skip
     """Aligns source scan p to target scan p from each of its guesses and keeps the best.
 
     Args:
@@ -171,34 +259,32 @@ def match_pairs(
         guesses: (p, h, 3) initial relative poses T_target_source.
         schedule: search distances of the iterations.
         prior: prior of the relative poses, (p, 3) each; None: none.
+        metric: distance to the target's lines ("plane") or points.
 
     Returns:
         PairMatches of the guess with the best fitness for each pair.
     """
     scales = schedule.gates_and_kernels(source.typical_range, source.noise)
     scales = np.concatenate([scales, scales[-1:]])
-    sides = (
-        source.beams(stride=_stride(source, schedule.source_beams)),
-        target.elements(stride=_stride(target, schedule.target_beams)),
-    )
+    lines = _thinned(source, schedule.source_beams), _thinned(target, schedule.target_beams)
     row = np.arange(len(guesses))[:, None]
     if guesses.shape[1] > 2 * _LEAST_KEPT:
-        rough = _align_guesses(sides, guesses, scales[: _FIRST_ITERATIONS + 1], prior)
+        rough = _align_guesses(lines, guesses, prior, scales[: _FIRST_ITERATIONS + 1], metric)
         count = max(_LEAST_KEPT, int(np.ceil(_KEPT_SHARE * guesses.shape[1])))
         guesses = rough.poses[row, np.argsort(-rough.weight, axis=1, kind="stable")[:, :count]]
         scales = scales[_FIRST_ITERATIONS:]
-    found = _align_guesses(sides, guesses, scales, prior)
+    found = _align_guesses(lines, guesses, prior, scales, metric)
     best = found.weight.argmax(axis=1)
-    poses, weight, information = (x[row[:, 0], best] for x in found)
-    num_beams = np.maximum(np.minimum(*(side.mask.sum(1) for side in sides)), 1)
+    poses, information, _, weight = (x[row[:, 0], best] for x in found)
+    num_beams = np.maximum(np.minimum(lines[0].mask.sum(1), lines[1].mask.sum(1)), 1)
     return PairMatches(poses, np.asarray(weight / num_beams, np.float64), information)
 
 
 def _align_guesses(
-    sides: tuple[SurfaceElements, SurfaceElements], guesses: Floats, scales: Floats, prior: PairPrior | None
-) -> AlignedPairs:
+    lines: tuple[Lines, Lines], guesses: Floats, prior: PairPrior | None, scales: Floats, metric: Metric
+) -> _Aligned:
     """Aligns each pair from each of its guesses (p, h, 3); arrays of the result are (p, h, ...)."""
     rows = np.repeat(np.arange(len(guesses)), guesses.shape[1])
     belief = None if prior is None else PairPrior(*(np.asarray(x)[rows] for x in prior))
-    found = align_pairs(sides, (rows, rows), guesses.reshape(-1, 3), scales, belief)
-    return AlignedPairs(*(x.reshape(*guesses.shape[:2], *x.shape[1:]) for x in found))
+    found = _align_batches(lines, (rows, rows), guesses.reshape(-1, 3), belief, scales, metric=metric)
+    return _Aligned(*(x.reshape(*guesses.shape[:2], *x.shape[1:]) for x in found))

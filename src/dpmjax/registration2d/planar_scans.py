@@ -25,7 +25,7 @@ from dpmjax.checks import as_mask
 from dpmjax.geometry.sampling import typical_range
 from dpmjax.registration2d.views import Views, make_views
 from dpmjax.sequences import has_angular_order
-from dpmjax.types import AnyArray, ScanSet, SurfaceElements
+from dpmjax.types import AnyArray, ScanSet
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -64,6 +64,22 @@ class Tolerances(NamedTuple):
         return cls(match, contradict, 10.0 * match)
 
 
+class Lines(NamedTuple):
+    """Lines of scans, the input of alignments: arrays (n, b, ...) of NumPy or of JAX.
+
+    Attributes:
+        points: beam end points.
+        normals: unit normals of the fitted lines.
+        centroids: a point on each fitted line.
+        mask: True where the beam lies on a line.
+    """
+
+    points: Float[AnyArray, "*n b 2"]
+    normals: Float[AnyArray, "*n b 2"]
+    centroids: Float[AnyArray, "*n b 2"]
+    mask: Bool[AnyArray, "*n b"]
+
+
 @dataclass(frozen=True, eq=False)
 class PlanarScans:
     """Planar scans with a line fitted at every beam, each in its own sensor frame, on the host. By `planar_scans`.
@@ -72,7 +88,7 @@ class PlanarScans:
         points: measured beam end points, in the order of their angles; zero where `mask` is False.
         mask: True for valid beams.
         normals: unit normals of the fitted lines, turned towards the sensor; zero without a line.
-        positions: feet of the perpendiculars from the points to their lines; the points themselves without a line.
+        centroids: a point on each fitted line: the mean of its beams.
         is_on_line: True where the beam lies on a straight piece (valid, not a corner, not alone).
         noise: standard deviation of the range noise of all scans together, in the unit of the points.
         typical_range: range that nine in ten beams on a line stay below, median over the scans: the unit of settings.
@@ -83,7 +99,7 @@ class PlanarScans:
     points: Float[np.ndarray, "n b 2"]
     mask: Bool[np.ndarray, "n b"]
     normals: Float[np.ndarray, "n b 2"]
-    positions: Float[np.ndarray, "n b 2"]
+    centroids: Float[np.ndarray, "n b 2"]
     is_on_line: Bool[np.ndarray, "n b"]
     noise: float
     typical_range: float
@@ -116,20 +132,13 @@ class PlanarScans:
 
     def take(self, rows: Any) -> PlanarScans:
         """Returns the scans of these rows (a slice, a list or an array), without an order in time."""
-        names = ("points", "mask", "normals", "positions", "is_on_line")
+        names = ("points", "mask", "normals", "centroids", "is_on_line")
         return replace(self, **{name: getattr(self, name)[rows] for name in names}, is_ordered=False)
 
-    def elements(self, rows: Any = slice(None), stride: int = 1) -> SurfaceElements:
-        """Returns the surface elements of every `stride`-th beam of the scans of these rows."""
-        return self._elements(self.positions, rows, stride)
-
-    def beams(self, rows: Any = slice(None), stride: int = 1) -> SurfaceElements:
-        """Returns these elements at the measured points, not moved onto their lines."""
-        return self._elements(self.points, rows, stride)
-
-    def _elements(self, positions: Float[np.ndarray, "n b 2"], rows: Any, stride: int) -> SurfaceElements:
-        arrays = positions, self.normals, self.is_on_line.astype(np.float32), self.is_on_line
-        return SurfaceElements(*(x[rows, ::stride] if stride > 1 else x[rows] for x in arrays))
+    def lines(self, rows: Any = slice(None), stride: int = 1) -> Lines:
+        """Returns every `stride`-th beam of the scans of these rows."""
+        arrays = self.points, self.normals, self.centroids, self.is_on_line
+        return Lines(*(x[rows, ::stride] if stride > 1 else x[rows] for x in arrays))
 
 
 def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is_ordered: bool = True) -> PlanarScans:
@@ -169,10 +178,10 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     noise = max(range_noise(values, valid), 1e-6 * float(np.linalg.norm(values, axis=-1).max()))
     blocks = [slice(first, first + _BLOCK) for first in range(0, len(values), _BLOCK)]
     fitted = [_fit_lines(values[block], valid[block], noise) for block in blocks]
-    normals, positions, is_on_line = (np.concatenate(parts) for parts in zip(*fitted, strict=True))
+    normals, centroids, is_on_line = (np.concatenate(parts) for parts in zip(*fitted, strict=True))
     # Beams on lines end on walls; with all beams, people and clutter would change the unit.
     unit = typical_range(values, is_on_line if is_on_line.any() else valid)
-    return PlanarScans(values, valid, normals, positions, is_on_line, noise, unit, is_ordered)
+    return PlanarScans(values, valid, normals, centroids, is_on_line, noise, unit, is_ordered)
 
 
 def batches(count: int, size: int) -> Iterator[tuple[slice, Indices]]:
@@ -230,7 +239,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 def _fit_lines(
     points: Float[np.ndarray, "n b 2"], mask: Bool[np.ndarray, "n b"], noise: float
 ) -> tuple[Float[np.ndarray, "n b 2"], Float[np.ndarray, "n b 2"], Bool[np.ndarray, "n b"]]:
-    """Fits a line at each beam with a straight run; returns normals, positions, and True for beams on a line."""
+    """Fits a line at each beam with a straight run; returns normals, centroids, and True for beams on a line."""
     x, y = np.moveaxis(points.astype(np.float64), -1, 0)
     sums = [np.cumsum(np.pad(z, ((0, 0), (1, 0))), axis=1) for z in (mask * 1.0, x, y, x * x, x * y, y * y)]
     error = np.full(mask.shape, np.inf)
@@ -255,5 +264,4 @@ def _fit_lines(
     is_on_line, centroids = np.isfinite(error), np.moveaxis(best[1:], 0, -1)
     normals = np.stack([-np.sin(best[0]), np.cos(best[0])], axis=-1) * is_on_line[..., None]
     normals *= np.where((normals * centroids).sum(-1, keepdims=True) > 0, -1.0, 1.0)
-    positions = points - ((points - centroids) * normals).sum(-1, keepdims=True) * normals
-    return normals.astype(np.float32), positions.astype(np.float32), is_on_line
+    return normals.astype(np.float32), centroids.astype(np.float32), is_on_line

@@ -158,8 +158,8 @@ def align_arcs(scans: PlanarScans, later: Indices, usual: MotionPrior) -> Hypoth
     limits, kept = (_SAME_SHAPE[0] * scans.typical_range, _SAME_SHAPE[1]), [np.zeros(0, np.int64)]
     for first in range(0, len(source), len(arcs)):
         own = poses[first : first + len(arcs)]
-        near = [se2.is_within(own - one, *limits) for one in own]
-        kept.append(first + apart(values[first : first + len(arcs)], near.__getitem__, _NUM_ARCS))
+        are_near = [se2.is_within(own - one, *limits) for one in own]
+        kept.append(first + apart(values[first : first + len(arcs)], are_near.__getitem__, _NUM_ARCS))
     found = Hypotheses(source, source - 1, poses, scores).take(np.concatenate(kept))
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
     # of two scans alone may lie beside the right pose, too: the last placed scans choose.

@@ -104,7 +104,7 @@ def _smooth_ranges(scans: PlanarScans) -> tuple[Float[np.ndarray, "n b 2"], Floa
     reach = np.maximum(np.linalg.norm(scans.points, axis=-1), 1e-9)
     beam = scans.points / reach[..., None]
     slope = (scans.normals * beam).sum(-1)
-    on_line = (scans.normals * scans.positions).sum(-1) / np.where(np.abs(slope) > 1e-3, slope, 1.0)
+    on_line = (scans.normals * scans.centroids).sum(-1) / np.where(np.abs(slope) > 1e-3, slope, 1.0)
     usable = scans.is_on_line & (np.abs(slope) > _MIN_COSINE) & (np.abs(on_line - reach) < 4.0 * scans.noise)
     slant = np.where(scans.is_on_line, np.maximum(np.abs(slope), _MIN_COSINE), _UNKNOWN_COSINE)
     return np.where(usable[..., None], beam * on_line[..., None], scans.points), slant

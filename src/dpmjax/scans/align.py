@@ -11,7 +11,6 @@ step (Chen and Medioni 1992) with a Geman-McClure kernel. They differ in the sea
 from __future__ import annotations
 
 import operator
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +21,7 @@ from jaxtyping import Float
 
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import along_curve, k_nearest
-from dpmjax.geometry.planes import PlaneStep, geman_mcclure, information_about_origin, motion_about, step_to_planes
+from dpmjax.geometry.planes import PlaneStep, geman_mcclure, motion_about, step_to_planes
 from dpmjax.scans.pairs import Pairs, Planes, find_planes, in_columns, move_elements, pair_planes
 from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.types import AnyArray, SurfaceElements
@@ -41,8 +40,11 @@ MAX_RATIO, LEVER_M = 0.67, 10.0
 # Least width of the kernel, and its width as a share of the radius.
 MIN_KERNEL_M, KERNEL_SHARE = 0.05, 1 / 6
 
-# Fewer pairs for each unknown do not constrain a motion.
-MIN_PAIRS_EACH = 3
+# Smallest cosine between the normals of a pair; the part of the cosine above it is a factor of the weight of the pair.
+PAIR_COSINE = 0.3
+
+# Fewer pairs do not constrain a motion.
+MIN_PAIRS = 20
 
 
 class AlignmentLevel(NamedTuple):
@@ -77,32 +79,13 @@ LEVELS = (
 )
 
 
-class PairRule(NamedTuple):
-    """What makes a pair of elements of one sensor.
-
-    Attributes:
-        is_oriented: True where normals point to the side that was seen: two sides of a thin wall are no pair.
-        cosines: between the normals of a pair: up to the first the pair has no weight, from the second the full one.
-        damping: share of each unknown's own information that is added to it: a pair of scans in a corridor hardly
-            moves along it.
-    """
-
-    is_oriented: bool = False
-    cosines: tuple[float, float] = (0.3, 1.0)
-    damping: float = 1e-6
-
-
-# Normals of lidar points are of either sign.
-UNORIENTED = PairRule()
-
-
 class Prior(NamedTuple):
     """Expected motion, which holds the directions that no plane holds.
 
     Attributes:
         T_target_source: (d+1, d+1).
-        information: (k, k) inverse covariance of the position of the source's origin and of the turn, in the frame of
-            the target and in units of the weight of one pair per squared unit of length.
+        information: (k, k) inverse covariance of the shift, then of the turn about the centre of the pairs, in the
+            frame of the target and in units of the weight of one pair per squared unit of length.
     """
 
     T_target_source: Any
@@ -117,15 +100,12 @@ class AlignedMotion(NamedTuple):
         rmse: weighted root mean square distance of the pairs to their planes before the last step; infinite where
             there are too few.
         num_pairs: number of pairs of the last step.
-        weight: sum of their weights, each 1 at most.
-        information: (k, k) of the position of the source's origin and of the turn, in the frame of the target: sum of
-            the weighted squares of the derivatives.
+        information: (k, k) sum of the weighted squares of the derivatives about the centre of the pairs, shift first.
     """
 
     T_target_source: Any
     rmse: Any
     num_pairs: Any
-    weight: Any
     information: Any
 
 
@@ -134,34 +114,24 @@ class _Solved(NamedTuple):
     step: PlaneStep
     rmse: Any
     num_pairs: Any
-    weight: Any
     information: Any
 
 
-def _solve(
-    pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None, rule: PairRule = UNORIENTED
-) -> _Solved:
+def _solve(pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None) -> _Solved:
     """Computes one Gauss-Newton step from motions (..., d+1, d+1)."""
     xp = rigid.namespace_of(T_target_source)
-    low, full = rule.cosines
-    facing = xp.clip((pairs.cosines - low) / (full - low), 0, 1)
-    weights = pairs.is_paired * pairs.flatness * facing
+    weights = pairs.is_paired * pairs.flatness * xp.maximum(pairs.cosines - PAIR_COSINE, 0)
     num_pairs = (weights > 0).sum(axis=-1)
     weights = weights * geman_mcclure(pairs.residuals, kernel)
     if xp is jnp:
         weights = lax.stop_gradient(weights)
     about = None if prior is None else (T_target_source, *prior)
-    step, information = step_to_planes(
-        pairs.points, pairs.normals, pairs.residuals, weights, about, damping=rule.damping
-    )
-    information = information_about_origin(information, T_target_source, step.centre)
-    is_enough = num_pairs >= MIN_PAIRS_EACH * step.tangent.shape[-1]
-    if prior is None:
-        step = PlaneStep(xp.where(is_enough[..., None], step.tangent, 0), step.centre)
-    weight = weights.sum(axis=-1)
-    total = xp.maximum(weight, np.finfo(weights.dtype).tiny)
+    step, information = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights, about)
+    is_enough = num_pairs >= MIN_PAIRS
+    step = PlaneStep(xp.where(is_enough[..., None], step.tangent, 0), step.centre)
+    total = xp.maximum(weights.sum(axis=-1), np.finfo(weights.dtype).tiny)
     rmse = rigid.safe_sqrt((weights * pairs.residuals**2).sum(axis=-1) / total)
-    return _Solved(step, xp.where(is_enough, rmse, np.inf), num_pairs, weight, information)
+    return _Solved(step, xp.where(is_enough, rmse, np.inf), num_pairs, information)
 
 
 def schedule_of(levels: tuple[AlignmentLevel, ...]) -> Float[np.ndarray, "k 2"]:
@@ -170,15 +140,13 @@ def schedule_of(levels: tuple[AlignmentLevel, ...]) -> Float[np.ndarray, "k 2"]:
     return np.array(rows, np.float32)
 
 
-@partial(jax.jit, static_argnames="rule")
+@jax.jit
 def align(
     source: SurfaceElements,
     target: SurfaceElements,
     T_target_source: Float[AnyArray, "d1 d1"],
     schedule: Float[AnyArray, "k 2"] | None = None,
     prior: Prior | None = None,
-    *,
-    rule: PairRule = UNORIENTED,
 ) -> AlignedMotion:
     """Aligns two sets of surface elements from a first guess, by exhaustive search on any device.
 
@@ -190,9 +158,8 @@ def align(
         target: the same in the target frame.
         T_target_source: first guess, within the first radius and about 10 degrees.
         schedule: largest distance of a pair, and width of the kernel, of each step; other numbers compile nothing.
-            Rows of zeros at the end are no steps. None takes that of `LEVELS`.
+            None takes that of `LEVELS`.
         prior: expected motion, for directions that no plane holds.
-        rule: what makes a pair.
 
     Returns:
         The motion.
@@ -207,15 +174,13 @@ def align(
         is_there, row = near.mask[:, 0] & source.mask, near.indices[:, 0]
         distances = jnp.where(is_there, jnp.sqrt(jnp.where(is_there, near.squared_distances[:, 0], 1)), jnp.inf)
         planes = Planes(target.positions[row], target.normals[row], target.planarity[row], distances)
-        pairs = pair_planes(moved, planes, scale[0], is_oriented=rule.is_oriented)
-        solved = _solve(pairs, T, scale[1], prior, rule)
+        solved = _solve(pair_planes(moved, planes, scale[0]), T, scale[1], prior)
         return AlignedMotion(rigid.matmul(motion_about(solved.step), T), *solved[1:])
 
     still = lax.stop_gradient((source, target))
-    last = (schedule[:, 0] > 0).sum() - 1
     T = lax.stop_gradient(T)
-    T = lax.fori_loop(0, last, lambda row, T: step_from(*still, T, schedule[row]).T_target_source, T)
-    return step_from(source, target, lax.stop_gradient(T), schedule[last])
+    T, _ = lax.scan(lambda T, scale: (step_from(*still, T, scale).T_target_source, None), T, schedule)
+    return step_from(source, target, lax.stop_gradient(T), schedule[-1])
 
 
 def _flat(side: SurfaceElements) -> SurfaceElements:
@@ -246,10 +211,9 @@ def align_on_host(
     """
     T, size = np.array(T_target_source, np.float64), len(T_target_source)
     num_free = 3 * (T.shape[-1] - 2)
-    information = np.zeros((size, num_free, num_free))
-    found = AlignedMotion(T, np.full(size, np.inf), np.zeros(size, int), np.zeros(size), information)
+    found = AlignedMotion(T, np.full(size, np.inf), np.zeros(size, int), np.zeros((size, num_free, num_free)))
     target = in_columns(target)
-    has_pairs = np.full(size, len(target.points) > 0 and len(source.samples) >= MIN_PAIRS_EACH * num_free)
+    has_pairs = np.full(size, len(target.points) > 0 and len(source.samples) >= MIN_PAIRS)
     for level in levels:
         own, active = _first_elements(source, level.num_points), _Active(np.flatnonzero(has_pairs))
         for _ in range(level.num_iterations):

@@ -26,7 +26,7 @@ class Pairs(NamedTuple):
         points: (..., n, d) elements in the frame of the target.
         residuals: (..., n) signed distances to the planes.
         normals: (..., n, d) normals of the planes.
-        cosines: (..., n) cosine between the normals of both; 1 for an element without a normal.
+        cosines: (..., n) absolute cosine between the normals of both; 1 for an element without a normal.
         flatness: (..., n) of the target's neighbourhood.
     """
 
@@ -79,14 +79,13 @@ def move_elements(source: tuple[Any, Any], T_target_source: Any) -> tuple[Any, A
     return points + T_target_source[..., None, :dim, dim], normals
 
 
-def pair_planes(moved: tuple[Any, Any], planes: Planes, radius: Any, *, is_oriented: bool = False) -> Pairs:
+def pair_planes(moved: tuple[Any, Any], planes: Planes, radius: Any) -> Pairs:
     """Pairs moved elements with the nearest planes.
 
     Args:
         moved: result of `move_elements`.
         planes: planes nearest to the points.
         radius: largest distance of a pair.
-        is_oriented: True for normals that point to the side that was seen.
 
     Returns:
         The pairs.
@@ -94,8 +93,7 @@ def pair_planes(moved: tuple[Any, Any], planes: Planes, radius: Any, *, is_orien
     xp, (points, own) = rigid.namespace_of(moved[0]), moved
     normals, is_bare = planes.normals, (own == 0).all(axis=-1)
     residuals = ((points - planes.positions) * normals).sum(axis=-1)
-    cosines = (own * normals).sum(axis=-1)
-    cosines = xp.where(is_bare, 1.0, cosines if is_oriented else xp.abs(cosines))
+    cosines = xp.where(is_bare, 1.0, xp.abs((own * normals).sum(axis=-1)))
     return Pairs(planes.distances < radius, points, residuals, normals, cosines, planes.flatness)
 
 
