@@ -44,10 +44,10 @@ from .run import Numbers as Numbers
 from .run import Run as Run
 from .run import run_command as run_command
 from .run import run_experiment as run_experiment
+from .run_folder import counting_bar as counting_bar
 from .run_folder import find_run as find_run
 from .run_folder import load_json as load_json
 from .run_folder import load_options as load_options
-from .run_folder import counting_bar as counting_bar
 from .run_folder import write_json as write_json
 from .run_folder import write_poses as write_poses
 from .slam_results import accepted_ends as accepted_ends
