@@ -33,7 +33,7 @@ MIN_NUM_POINTS = 100
 
 # Largest number of surface elements of a scan, the outliers that are then left out among them: denser scans would align
 # ring with ring.
-MAX_ELEMENTS = 3200
+MAX_ELEMENTS = 3000
 
 # Neighbourhoods of all points of a scan, and of spread ones: in scans of 1,000 points neighbours are farther away.
 DENSE, NEIGHBOURHOODS = SurfaceConfig(), SurfaceConfig(sparse_radius_share=1.5)
