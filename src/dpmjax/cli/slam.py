@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, geometry, io, saved_maps, slam, viz, weights
@@ -90,6 +89,8 @@ class SlamOptions(cli.DriveOptions):
         """Pose of the lidar in the frame of the robot; None where it was not given."""
         if not self.base_from_lidar:
             return None
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_quat(self.base_from_lidar[3:]).as_matrix()
         return homogeneous(turn, np.array(self.base_from_lidar[:3]))
 

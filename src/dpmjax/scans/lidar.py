@@ -102,7 +102,7 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
 
 def _echoes(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Float[np.ndarray, "m 3"]:
     """Leaves out points that are no echoes, unless the range filter does."""
-    is_beyond = np.square(points, dtype=np.float32).sum(axis=1).max(initial=0) > (SHELL_SHARE * config.max_range_m) ** 2
+    is_beyond = np.square(points, dtype=np.float64).sum(axis=1).max(initial=0) > (SHELL_SHARE * config.max_range_m) ** 2
     return points if is_beyond else without_shell(points)
 
 
