@@ -7,11 +7,12 @@
 
 Random pairs of scans, 2 to 10 m (near) and 10 to 20 m (middle) apart, are registered, each scan turned by any yaw. A
 registration within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (latest links to the newest).
-table.md has the shares that are right by the network alone, after the verification by the scans, and after the final
-alignment, with 95 % intervals, and the median errors of right ones. rows.csv has every pair. reliability.png shows the
-share of right registrations for each confidence, pairs more than 60 m apart (far) included. failures.png shows wrong
-registrations from above. The AUC of overlap compares pairs less than 20 m apart (revisits where the drive has some)
-with pairs more than 40 m apart; overlap.csv has that of the overlap head on the same pairs.
+The file table.md has the shares of right registrations, with 95 % intervals, and the median errors of right ones. It
+has them for the network alone, after the verification by the scans, and after the final alignment. The file rows.csv
+has every pair. The picture reliability.png shows the share of right registrations for each confidence, also for pairs
+more than 60 m apart (far). The picture failures.png shows wrong registrations from above. The AUC of overlap compares
+pairs less than 20 m apart (revisits, if the drive has any) with pairs more than 40 m apart. The file overlap.csv has
+the AUC of the overlap head on the same pairs.
 """
 
 from __future__ import annotations

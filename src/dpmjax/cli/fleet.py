@@ -24,7 +24,7 @@ from dpmjax.sequences import counted
 
 
 class DrivePlan(NamedTuple):
-    """What each worker does.
+    """Settings that all workers share.
 
     Attributes:
         options: selection of the scans of a drive, and the weights.

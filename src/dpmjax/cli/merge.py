@@ -144,7 +144,7 @@ def layers_of(path: Path, merged: slam.MergedMaps, number: int) -> list[viz.Laye
 
 
 def merge_text(metrics: cli.Numbers) -> str:
-    """Returns the verdict: what has become of each map."""
+    """Returns the verdict: one phrase for each part, with the maps in it."""
     names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
     texts = [
         f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"

@@ -58,7 +58,7 @@ def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     points = np.concatenate([source @ T[:3, :3].T + T[:3, 3], target])
     colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
     io.write_ply(run / "aligned.ply", points, colors=colors)
-    # Files of the same name are told apart by their folders.
+    # Files of the same name are shown with their folders.
     num_parts = 1 if options.source.name != options.target.name else 2
     files = (str(Path(*options.source.parts[-num_parts:])), str(Path(*options.target.parts[-num_parts:])))
     is_calibrated = model.config.calibration is not None

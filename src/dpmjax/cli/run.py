@@ -109,7 +109,7 @@ class Run:
 
     @property
     def is_stopped(self) -> bool:
-        """Returns True after the first signal or failure: what is done is written, and the run ends."""
+        """Returns True after the first signal or failure: the run writes its results and ends."""
         return bool(self._stops)
 
     def check_stop(self) -> None:
@@ -118,7 +118,7 @@ class Run:
             raise self._stops[0]
 
     def fail(self, error: Exception) -> None:
-        """Stops the run as a signal does: what is done is written before the error ends the command."""
+        """Stops the run as a signal does: the run writes its results before the error ends the command."""
         self._stops.append(error)
 
     def open(self, notes: Iterable[Note] = ()) -> None:

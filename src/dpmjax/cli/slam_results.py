@@ -313,7 +313,7 @@ def count_parts(slam_map: slam.KeyframeMap) -> int:
 
 
 def verdict_of(numbers: Numbers) -> str:
-    """Returns what was mapped, and what is uncertain or wrong about it."""
+    """Returns the verdict: the size of the map, and its uncertain or wrong parts."""
     if (reason := why_failed(numbers["scan_statuses"])) is not None:
         return f"{reason}: check that the scans are 3-D, in metres, and follow each other"
     counts = (("scan", "num_scans"), ("keyframe", "num_new_keyframes"), ("loop closure", "num_loops"))

@@ -22,7 +22,7 @@ from dpmjax.sequences import LidarSequence, counted
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
 SAVE_EVERY_S = 10.0
-# A scan as it was read, and as it is placed.
+# A scan from its file, and the same scan prepared for SLAM.
 _Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
 
 

@@ -21,7 +21,7 @@ Row = dict[str, Any]
 
 
 def fill_table(run: Run, cases: Iterable[Row], work: Callable[..., Row | None], name: str = "rows.csv") -> list[Row]:
-    """Computes the rows of a table that are missing; each one is in the file as soon as it is computed.
+    """Computes the missing rows of a table, and writes each row at once.
 
     Args:
         run: the open run.

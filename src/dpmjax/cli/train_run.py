@@ -178,9 +178,9 @@ class Records:
         self.run.append_row(HISTORY, **dict.fromkeys(COLUMNS, "") | row)
 
     def steps_left(self, step: int, *, total_s: float) -> int:
-        """Returns the number of steps in the seconds that remain of `total_s`; 0 where the plan stays as it is.
+        """Returns the number of steps in the seconds that remain of `total_s`; 0 does not change the plan.
 
-        Where `total_s` is 0, a quarter of the steps that were done before this call remain.
+        If `total_s` is 0, training ends after a quarter of the steps that were done before this call.
         """
         if total_s == 0:
             first, end = int(self.start.state.step), int(self.start.state.end)

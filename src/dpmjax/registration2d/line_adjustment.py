@@ -164,7 +164,7 @@ def _linearise(
 def _choose_around(poses: Floats, radius: float) -> Indices:
     """Returns the row of each scan and those of neighbours within the radius, spread evenly by nearness.
 
-    Where there are too few neighbours, the row of the scan itself fills the remaining places.
+    If there are too few neighbours, the row of the scan itself fills the remaining places.
     """
     num_scans = len(poses)
     count = min(_NUM_NEIGHBOURS, num_scans - 1)

@@ -1,4 +1,4 @@
-"""Comparison of pairs of scans at relative poses: the hits that match or contradict the other scan.
+"""Comparison of pairs of scans at relative poses: hits of one scan match or contradict the view of its partner.
 
 A hit of another scan lies on the surface that a scan has seen (a match), in its free space (a contradiction), or in an
 unobserved region. The score of two scans is the agreement of their visible beams.

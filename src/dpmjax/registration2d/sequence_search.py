@@ -259,7 +259,7 @@ class _Beam:
         return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
     def are_same(self, sequences: _Sequences, row: int) -> Booleans:
-        """Returns True for sequences that agree with one of them in their last scans."""
+        """Returns True for each sequence whose last scans agree with those of the sequence in `row`."""
         placed = sequences.is_placed[:, -_NUM_SAME:]
         poses = sequences.poses[:, -_NUM_SAME:][:, placed[row]]
         inside = np.asarray(se2.relative(poses[:, -1:], poses))

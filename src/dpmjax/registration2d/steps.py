@@ -36,7 +36,8 @@ BEAM_DEVIATION, _STEP_DEVIATION = 0.03, (0.045, 0.15)
 _FREEDOM = 3.0
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
-# Every `_STRIDE`-th shift is scored first; the others are scored too, unless all are worse by this number of nats.
+# Every `_STRIDE`-th shift is scored first. If the middle one leads by this number of nats, the scores between are
+# interpolated.
 _STRIDE, _CLEAR_GAIN = 3, 8.0
 # Number of interpolated scores for each shift, because a prior may be sharper than the spacing.
 _FINER = 8

@@ -135,7 +135,7 @@ class Matcher(Protocol):
     def encode(self, scan: Scan) -> CompactScan:
         """Prepares a scan for any number of registrations.
 
-        Where each scan is encoded it runs one scan ahead, in the thread of `Geometry.thin`.
+        If every scan is encoded, this runs one scan ahead, in the thread of `Geometry.thin`.
 
         Args:
             scan: the scan.

@@ -237,7 +237,7 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, *, radius
         radius_m: keyframes farther away are left out.
 
     Returns:
-        The submap, in the frame of the central keyframe; the others follow it, nearest first.
+        The submap, in the frame of the central keyframe. Its neighbours follow it, nearest first.
     """
     steps = steps_from(slam_map, row, num_keyframes)
     apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])

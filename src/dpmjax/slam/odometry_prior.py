@@ -1,4 +1,4 @@
-"""Odometry of wheels or of an IMU as first guess of each motion, and what the drive says about it afterwards."""
+"""Odometry of wheels or of an IMU as first guess of each motion, and its errors compared with the finished map."""
 
 from __future__ import annotations
 

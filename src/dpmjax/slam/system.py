@@ -222,8 +222,8 @@ def run_slam(
             files, or the folder or bag of a drive (`io.open_lidar_sequence`). `TimedScan`s are deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
         slam_map: map from `load_map`, or its file, to be extended; None begins an empty one.
-        odometry: (n, 4, 4) poses of the lidar at each scan by wheels or an IMU, in any world, NaN where there is none:
-            the first guess of each motion, in place of the motion before.
+        odometry: (n, 4, 4) poses of the lidar at each scan by wheels or an IMU, in any world; NaN for missing poses.
+            They give the first guess of each motion, in place of the previous motion.
         progress: False shows no bar.
 
     Returns:
