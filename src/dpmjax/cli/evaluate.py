@@ -106,7 +106,7 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> 
 
 
 class PairReader:
-    """Random pairs of scans of some drives, by the name of the drive, the band of distances and a number.
+    """Random pairs of scans of several drives. The keys are the drive's name, the band of distances and a number.
 
     Attributes:
         drawn: numbers of the two scans of each pair, by drive and band.
@@ -138,7 +138,7 @@ class PairReader:
 def fill_pairs(
     run: cli.Run, model: deeppointmap.Model, pairs: PairReader, matchers: Mapping[str, Matcher] = MappingProxyType({})
 ) -> list[cli.Row]:
-    """Fills rows.csv: errors of each pair after each stage, confidence and seconds, and those of further methods.
+    """Fills rows.csv with errors of each pair after each stage, confidence and seconds, also of further methods.
 
     Args:
         run: the open run.
@@ -179,7 +179,7 @@ def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.Sca
 def fill_overlap(
     run: cli.Run, model: deeppointmap.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int
 ) -> list[cli.Row]:
-    """Fills overlap.csv: AUC and Brier score of the overlap probability of each drive; None where it lacks pairs."""
+    """Fills overlap.csv with AUC and Brier score of the overlap probability of each drive; None without pairs."""
     by_name = {drive.name: drive for drive in drives}
 
     def work(drive: str) -> cli.Row:
@@ -200,7 +200,7 @@ def fill_overlap(
 def summarize_pairs(
     rows: Sequence[cli.Row], overlap: Sequence[cli.Row], methods: Sequence[str], columns: Sequence[str]
 ) -> list[cli.Row]:
-    """Returns the shares that are right and the median errors of right motions, by drive and band, and the AUC."""
+    """Returns the shares of right motions and their median errors, by drive and band, and the AUC."""
     auc = {row["drive"]: row["auc"] for row in overlap}
     errors = {f"{name}_m": f"{name}_right" for name in methods}
     of_right = [
@@ -211,7 +211,7 @@ def summarize_pairs(
 
 
 def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.Row:
-    """Returns the Brier score of the confidence, over all pairs and those of each band, and a verdict."""
+    """Returns the Brier scores of the confidence for all pairs and for each band, and a verdict."""
 
     def brier(some: Sequence[cli.Row]) -> float:
         confidence, is_right = (np.array([row[name] for row in some]) for name in ("confidence", "refined_right"))
@@ -230,7 +230,7 @@ def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.R
 def draw_evaluation(
     run: cli.Run, model: deeppointmap.Model, pairs: PairReader, rows: Sequence[cli.Row], title: str
 ) -> None:
-    """Draws reliability.png, and failures.png: wrong registrations of overlapping pairs of the highest confidence."""
+    """Draws reliability.png and failures.png: wrong registrations of overlapping pairs, with the highest confidence."""
     confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))
     viz.save_figure(viz.reliability_figure(confidence, is_right, title=f"{title}, all pairs"), run / "reliability.png")
     wrong = [row for row in rows if row["band"] != "far" and not row["refined_right"]]

@@ -4,8 +4,8 @@
     dpmjax graph city.g2o --outlier-chi2 10       wrong edges are rejected (Geman-McClure)
     dpmjax graph edges.g2o --nearest-psd          mends information matrices that are not positive semidefinite
 
-The initial poses are those of the file or of the chordal relaxation, whichever have the lower cost; a file of edges
-alone gets poses along a spanning tree. Results go to results/graph/<time>/ (latest links to the newest): graph.g2o,
+The initial poses are those of the file or of the chordal relaxation, and the lower cost decides. A file of edges alone
+gets poses along a spanning tree. Results go to results/graph/<time>/ (latest links to the newest): graph.g2o,
 trajectory_tum.txt (stamps are the numbers of the nodes), metrics.json and trajectory.png.
 """
 

@@ -9,10 +9,12 @@
     dpmjax map2d --resume                     continue the latest run
 
 Results go to results/map2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
-npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is the odometry, where there is one, else
-incremental point-to-line ICP. There are four candidates: the start and DeepMapping, each with and without refinement.
-The one whose map fits the beams best is kept, chosen without ground truth; metrics.json and map.png name it. Of a whole
-recording, scans half a metre or 20 degrees apart are registered, and all others follow the odometry between them.
+npy, and pictures: map.png, occupancy.png, loss.png.
+
+Without --init, the start is the odometry. If there is none, it is incremental point-to-line ICP. There are four
+candidates: the start and DeepMapping, each with and without refinement. The candidate whose map fits the beams best is
+kept, without ground truth. The files metrics.json and map.png name it. In a whole recording, only scans half a metre or
+20 degrees apart are registered. The scans between them follow the odometry.
 """
 
 from __future__ import annotations
@@ -111,7 +113,7 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
-    """Registers the scans, with the recorder as engine of the fit, and prints each stage and a bar of all."""
+    """Registers the scans with the recorder as engine of the fit, and prints each stage and one bar."""
     import jax
 
     bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}]", desc="registration")
@@ -181,7 +183,7 @@ def read_scans(options: Map2dOptions) -> ScanSequence:
 
 
 def starting_poses(options: Map2dOptions, sequence: ScanSequence) -> str | FloatArray:
-    """Returns the name of the initial poses, or the poses of the file that `--init` names, for all scans."""
+    """Returns the name of the initial poses, or the poses of the file of `--init` for all scans."""
     init = options.init
     if init == "odometry" and sequence.odometry_poses is None:
         raise ValueError(
@@ -216,7 +218,7 @@ def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.D
 
 
 def ate_of(sequence: ScanSequence, unit: float) -> Callable[[FloatArray], float]:
-    """Returns a function to the ATE of poses whose lengths are multiples of `unit`; NaN without a reference."""
+    """Returns a function that computes the ATE of poses with lengths in `unit`; NaN without a reference."""
     reference = sequence.reference_poses
     if reference is None:
         return lambda _: math.nan
@@ -241,13 +243,13 @@ def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArra
 
 
 def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
-    """Returns errors under their names for the initial poses, such as ate_initial_m for ate_m; counts are left out."""
+    """Renames errors for the initial poses, such as ate_m to ate_initial_m, and leaves out counts."""
     errors = {name: value for name, value in numbers.items() if not name.startswith("num_")}
     return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
 
 
 def trust_verdict(assessment: Mapping[str, Any]) -> str:
-    """Returns whether the map can be trusted, why, the fault of the odometry, and the uncertain scans."""
+    """Returns the verdict on trust with its reason, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     # Near zero the difference of two shares has either sign.
@@ -269,7 +271,7 @@ def spans_of(rows: Sequence[int]) -> list[str]:
 
 
 def report(unit: str, numbers: Mapping[str, Any]) -> str:
-    """Returns errors and scores of each candidate, which one was kept, and errors against further references."""
+    """Returns errors and scores of each candidate, the kept candidate, and errors against further references."""
     candidates = numbers["candidates"]
     width = max(map(len, candidates))
     has_ate = all(f"ate_{unit}" in found for found in candidates.values())
@@ -295,7 +297,7 @@ def scan_set_of(sequence: ScanSequence) -> ScanSet:
 def draw_map(
     run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
 ) -> viz.Limits:
-    """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
+    """Draws map.png: the start, DeepMapping if it was trained, the kept map, the reference. Returns its limits."""
     scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
     poses, anchor = {}, None
     titles = dict(zip(result.candidates, numbers["candidates"], strict=True))

@@ -1,4 +1,4 @@
-"""Options of commands: those that several share, the parser, and checks of ranges and names."""
+"""Options of commands: common options, the parser, and checks of ranges and names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 
 class Bound(NamedTuple):
-    """The least value of an option that is a number, or of each of its numbers; it stands in the option's type.
+    """The least value of a number option, or of each number of a list option; it stands in the option's type.
 
     Attributes:
         least: the value.
@@ -131,7 +131,7 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
 
 
 def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
-    """Raises a ValueError where a name is not allowed, or no name is given."""
+    """Raises a ValueError if a name is not allowed, or if no name is given."""
     unknown = [name for name in names if name not in allowed]
     if unknown or not names:
         raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")

@@ -1,6 +1,6 @@
 """Registers two 3-D lidar scans without a first guess (DeepPointMap): the motion and the probability that it is right.
 
-    dpmjax register a.pcd b.pcd                   where points of a lie in the frame of b
+    dpmjax register a.pcd b.pcd                   the points of a in the frame of b
     dpmjax register 000000.bin 000010.bin -o out  KITTI's files
     dpmjax register a.npy b.ply --no-refine       without the final point-to-plane alignment
 

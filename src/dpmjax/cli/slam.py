@@ -86,7 +86,7 @@ class SlamOptions(cli.DriveOptions):
 
     @property
     def T_base_lidar(self) -> np.ndarray | None:
-        """Pose of the lidar in the frame of the robot; None where it was not given."""
+        """Pose of the lidar in the frame of the robot; None if it was not given."""
         if not self.base_from_lidar:
             return None
         from scipy.spatial.transform import Rotation
@@ -177,7 +177,7 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
 
 
 def odometry_of(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarray | None, tuple[Note, ...]]:
-    """Returns poses of the lidar by the odometry of --odometry FILE, None without a file; and notes."""
+    """Returns poses of the lidar from --odometry FILE (None without a file), and notes."""
     if options.odometry is None or options.odometry in PROPOSERS:
         return None, ()
     poses, notes = io.read_odometry(options.odometry, sequence)
@@ -187,11 +187,11 @@ def odometry_of(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarr
 def write_map_results(
     run: cli.Run, sequence: LidarSequence, start: slam.SlamState, result: slam.SlamResult, numbers: cli.Numbers
 ) -> cli.Numbers:
-    """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
+    """Writes all files except metrics.json, pictures last, and returns further numbers for it."""
     slam_map, num_before = result.map, len(start.slam_map)
 
     def read_keyframe(row: int) -> np.ndarray:
-        """Reads the points of a keyframe; those of the extended map are the points of its surface."""
+        """Reads the points of a keyframe; a keyframe of the extended map has only the points of its surface."""
         if row < num_before:
             return slam.keyframe_points(slam_map, row)
         return sequence.read_points(slam_map.keyframes[row].scan - start.front_end.num_scans)

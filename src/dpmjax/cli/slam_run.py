@@ -27,7 +27,7 @@ _Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInp
 
 
 class DriveFolder(NamedTuple):
-    """Folder of a drive that is mapped without a run of its own; no signal stops it."""
+    """Folder of a drive without a run of its own; no signal stops its mapping."""
 
     path: Path
     is_stopped: bool = False
@@ -36,7 +36,7 @@ class DriveFolder(NamedTuple):
         return self.path / name
 
     def fail(self, error: Exception) -> None:
-        """Raises the error: the worker gives it back."""
+        """Raises the error, which the worker sends back."""
         raise error
 
 
@@ -116,7 +116,7 @@ def run_scans(
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
         viewer: shows the run.
-        odometry: (n, 4, 4) poses of the lidar, the first guesses; None without them.
+        odometry: (n, 4, 4) poses of the lidar, as first guesses; None without odometry.
 
     Returns:
         The run.

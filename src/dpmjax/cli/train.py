@@ -13,9 +13,9 @@
 
 Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 last.safetensors, metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of
-pairs of held-out places, turned by any yaw, that are registered within 2 m and 5 degrees. Held out is the last tenth
-of the path of each drive, with all scans near it. The model is the one of the step with the best mean recall
-(metrics.json: best_step, chosen_by); `paper` takes the last one, as published. Then the overlap head is trained, and
+pairs of held-out places, turned by any yaw, that are registered within 2 m and 5 degrees. The last tenth of the path of
+each drive is held out, with all scans near it. The model of the step with the best mean recall is kept (metrics.json:
+best_step, chosen_by). With `paper`, the last model is kept, as published. Then the overlap head is trained, and
 confidence and overlap are calibrated, so that SLAM can use the model.
 """
 
@@ -124,7 +124,7 @@ class TrainOptions(RunOptions):
 
 
 def main(options: TrainOptions, run: Run) -> Numbers:
-    """Trains, evaluates, and writes the files; one of several processes writes."""
+    """Trains, evaluates, and writes the files; of several processes, only the first one writes."""
     from dpmjax.deeppointmap.training.processes import is_first, join_processes
 
     join_processes(options.coordinator, options.num_processes, options.process_id)
@@ -174,7 +174,7 @@ def main(options: TrainOptions, run: Run) -> Numbers:
 
 
 def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
-    """Returns the drives of --data; a drive of --validate or --data that has no pairs of scans raises a ValueError."""
+    """Returns the drives of --data; raises a ValueError if a drive of --validate or --data has no pairs of scans."""
     sampling = settings.sampling
     town = partial(simulation.simulate_drive, length_m=options.town_length_m, mixture=simulation.TRAINING_MIXTURE)
     towns: list[cli.Source] = [partial(town, options.seed + number) for number in range(options.num_towns)]
@@ -188,19 +188,19 @@ def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfi
 
 
 def kept_drive(source: cli.Source, folder: Path) -> LidarSequence:
-    """Returns a drive whose scans are kept in a folder from their first reading on."""
+    """Returns a drive that keeps its scans in a folder after their first reading."""
     return cli.keep_scans(source(), folder)
 
 
 def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppointmap.TrainingConfig:
-    """Returns settings whose epochs are steps: all devices together pass once over the scans in an epoch."""
+    """Converts epochs to steps: in an epoch, all devices together use each scan once."""
     import jax
 
     return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
 def chosen_sources(sources: Sequence[cli.Source]) -> list[cli.Source]:
-    """Returns the drives by which models are chosen and calibrated: those of the user, or else the towns."""
+    """Returns the drives for the choice and the calibration of models: those of the user, or else the towns."""
     return [source for source in sources if not is_town(source)] or list(sources)
 
 
@@ -215,7 +215,7 @@ def select_pairs(
     sources: Sequence[cli.Source],
     on_wait: Callable[[], object],
 ) -> Selection:
-    """Returns the pairs that choose the model: of --validate, else of held-out places of the drives or of the towns."""
+    """Returns the pairs that choose the model, of --validate or else of held-out places of the drives or towns."""
     from dpmjax.cli.train_run import Selection, draw_selection, part_of_drive
 
     if "registration" not in options.stages:
@@ -233,7 +233,7 @@ def select_pairs(
 def without_impossible_stage(
     settings: deeppointmap.TrainingConfig, store: deeppointmap.ScanStore
 ) -> deeppointmap.TrainingConfig:
-    """Leaves out the stage of overlap, with a line, where the scans cannot teach it.
+    """Leaves out the stage of overlap if the scans cannot train it, and prints a line.
 
     Args:
         settings: settings of training.
@@ -270,7 +270,7 @@ def calibrate_on_sources(
 
 
 def training_settings(options: TrainOptions, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
-    """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
+    """Returns the preset with the options applied; given first weights determine the network."""
     import jax
 
     settings = deeppointmap.training_preset(options.preset)
@@ -315,7 +315,7 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers
 
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, Numbers]:
-    """Returns recall and errors of the trained and of the untrained network, of the latter for pairs of scans alone."""
+    """Returns recall and errors of the trained network, and of the untrained one for pairs of scans alone."""
     from dpmjax.cli.train_run import KIND_NAMES
 
     pairs, of_scans = records.selection.pairs, records.selection.of_scans
