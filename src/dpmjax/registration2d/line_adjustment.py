@@ -187,7 +187,7 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
         poses: (n, 3) initial poses T_world_scan, within a few standard deviations of the noise.
 
     Returns:
-        (n, 3) poses; the first is the initial one. Without noise all are the initial ones, since weights are undefined.
+        (n, 3) poses; the first pose does not change. Without noise no pose changes, because weights are undefined.
     """
     if len(poses) < 2 or scans.noise <= 0:
         return poses
