@@ -39,7 +39,7 @@ class DepthOptions(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of NAME.depth.png with an intrinsics file, and poses or none. Without it: a simulated apartment."""
+    """Folder of NAME.depth.png with an intrinsics file, with or without poses. Default: a simulated apartment."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
 

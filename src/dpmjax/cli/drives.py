@@ -37,9 +37,9 @@ class DriveOptions(ScanOptions, ModelOptions, RunOptions):
     """Options of every command that reads the scans of whole drives."""
 
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
-    """Which clouds of a bag of ROS, where it holds several topics of them."""
+    """Topic of the clouds, if a bag of ROS holds several."""
     columns: Annotated[int | None, arg(metavar="N"), Bound(3)] = None
-    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    """Number of values of each point in .bin files (4: KITTI, 5: nuScenes). Without it, the values decide."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
 
@@ -262,7 +262,7 @@ class ScanReader:
         return slam.TimedScan(points, offsets)
 
     def _interval_s(self, index: int) -> float | None:
-        """Returns the time of the motion by which a scan is deskewed; None where it is unknown."""
+        """Returns the time of the motion by which a scan is deskewed; None if it is unknown."""
         times, last = self.sequence.times, max(index - 1, 1)
         if times is None or len(times) < 2:
             return None

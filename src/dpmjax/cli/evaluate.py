@@ -52,7 +52,7 @@ class EvaluateOptions(cli.ModelOptions, cli.RunOptions):
     pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 15
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1
-    """Number of towns, where town is among the data; a suburb first, then other kinds of place."""
+    """Number of towns, if town is among the data. The first one is a suburb; other kinds of place follow."""
 
     def __post_init__(self) -> None:
         """Checks bounds, and that there are data."""

@@ -42,7 +42,7 @@ class LocalizeOptions(cli.DriveOptions):
     scans: Annotated[Positional[Path], arg(metavar="SCANS", help_behavior_hint="required")] = Path()
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
-    """Which drive of a folder that holds several."""
+    """Name of the drive, if the folder holds several."""
     map_poses: Annotated[Path | None, arg(metavar="FILE")] = None
     """Reference poses of all scans of the drive that made the map, in the world of the scans' reference."""
 
@@ -105,7 +105,7 @@ def reference_of(options: LocalizeOptions, slam_map: slam.KeyframeMap, drive: Li
 
 
 def _check_map_poses(path: Path, reference: np.ndarray, slam_map: slam.KeyframeMap) -> None:
-    """Raises a `ValueError` where the motions between keyframes are not those of the map."""
+    """Raises a `ValueError` if the motions between keyframes are not those of the map."""
     edges = slam_map.edges_of("odometry")
     if not edges:
         return

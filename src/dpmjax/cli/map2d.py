@@ -52,26 +52,26 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Without it: the built-in world."""
+    """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Default: the built-in world."""
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
-    """Which scans of a bag, where it holds several topics of them."""
+    """Topic of the scans, if a bag holds several."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
-    """Where the poses start; auto: odometry if there is any, else icp-plane; if the map from odometry cannot be
-    trusted, icp-plane is tried, too; global: exhaustive search of scan pairs, needs no guess; FILE: poses (TUM, KITTI,
-    or x y theta)."""
+    """Initial poses. auto: odometry if there is any, else icp-plane. If the map from odometry cannot be trusted,
+    icp-plane is tried, too. global: exhaustive search of scan pairs, without a first guess. FILE: poses (TUM, KITTI, or
+    x y theta)."""
     ordered: bool = True
-    """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
+    """Scans are in time order. --no-ordered ignores the order, and needs --init global."""
     refine: bool = True
     """Also align all scans together, point to line, from the start and from the fit."""
     steps: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
-    """Stop after N steps, rounded up to whole calls of the compiled program; without it, the preset decides."""
+    """Stop after N steps, rounded up to whole calls of the compiled program. Without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
-    """Stop the fit after S seconds of run time, compile time not counted."""
+    """Stop the fit after S seconds of run time, without compile time."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
-    """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
-    crowd: an office in which people walk about."""
+    """Built-in world, if no DATA is given. The numbered worlds have walls. grove: trees, bushes and rocks, no straight
+    wall. crowd: an office with walking people."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 

@@ -36,9 +36,9 @@ class RegisterOptions(cli.ModelOptions, cli.OutputOptions):
     source: Annotated[Positional[Path], arg(metavar="A")]
     """Scan whose points are moved."""
     target: Annotated[Positional[Path], arg(metavar="B")]
-    """Scan in whose frame they end."""
+    """Scan that gives the frame of the result."""
     columns: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
-    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    """Number of values of each point in .bin files (4: KITTI, 5: nuScenes). Without it, the values decide."""
     refine: bool = True
     """End with a fine point-to-plane alignment."""
 

@@ -278,7 +278,7 @@ def run_experiment(main: Callable[[Any, Run], Numbers]) -> NoReturn:
 
 
 def _finish(run: Run, numbers: Numbers) -> int:
-    """Writes the numbers, and says the verdict and where the results are."""
+    """Writes the numbers, and prints the verdict and the folder of the results."""
     if run.is_open:
         run.write_numbers(numbers)
     has_failed = numbers.get("status") == "failed" and not run.is_stopped
@@ -292,7 +292,7 @@ def _finish(run: Run, numbers: Numbers) -> int:
 
 
 def _explain(error: Exception, run: Run | None) -> int:
-    """Says in one line what went wrong, after the traceback where the program is at fault."""
+    """Prints the error in one line, after the traceback if the program is at fault."""
     text, code = f"{type(error).__name__}: {error}", EXIT_FAILED
     if run is not None and run.is_open:
         LOGGER.info("failed", exc_info=error)
@@ -319,7 +319,7 @@ def _say(message: str, exit_code: int) -> int:
 
 
 def _read_options(main: Callable[..., Numbers], name: str, description: str | None, arguments: list[str]) -> Any:
-    """Returns the options of the command line, with those of the earlier run where it is resumed."""
+    """Returns the options of the command line, with those of the earlier run if it is resumed."""
     options_type = get_type_hints(main)["options"]
     prog = f"dpmjax {name}" if name in program.COMMANDS else f"python -m experiments.{name}"
     options = parse_options(options_type, arguments, prog=prog, description=description)

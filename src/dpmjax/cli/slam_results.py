@@ -295,7 +295,8 @@ def status_of(numbers: Numbers) -> str:
 
     Returns:
         "done", "uncertain" or "failed". A run is uncertain if more than one scan and more than a tenth of all scans
-        were not aligned in all directions, or if no loop joins all parts of the map. It failed if no scan was aligned.
+        were not aligned in all directions. It is also uncertain if no loop joins all parts of the map. It failed if no
+        scan was aligned.
     """
     statuses = numbers["scan_statuses"]
     if why_failed(statuses) is not None:

@@ -122,7 +122,7 @@ def _cell(row: Row, column: str) -> str:
 
 
 def _parse(text: str) -> Any:
-    """Returns the value of a cell; None for an empty one and for NaN, and text where a number is written otherwise."""
+    """Returns the value of a cell: None for an empty one and for NaN, else a number if Python writes it so, or text."""
     if text in ("", "nan", "True", "False"):
         return {"True": True, "False": False}.get(text)
     for kind in (int, float):

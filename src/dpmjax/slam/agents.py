@@ -281,7 +281,7 @@ def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
 def _in_own_frames(
     joined: KeyframeMap, map_of_row: np.ndarray, components: Sequence[int], maps: Sequence[KeyframeMap]
 ) -> Poses:
-    """Moves each component, so that the first keyframe of its first map stays where it was."""
+    """Moves each component so that the first keyframe of its first map keeps its pose."""
     T_old = joined.T_world_keyframe
     _, first_rows, component = np.unique(np.array(components)[map_of_row], return_index=True, return_inverse=True)
     T_new_old = [maps[map_of_row[row]].T_world_keyframe[0] @ rigid.inverse(T_old[row]) for row in first_rows]

@@ -128,7 +128,7 @@ def find_loop_targets(
 
 
 def _is_rested(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
-    """Returns True where the last accepted loop of the same drive is far enough back along the path."""
+    """Returns True if the last accepted loop of the same drive is far enough back along the path."""
     last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
     keyframe = slam_map.keyframes[row]
     return last is None or last.segment != keyframe.segment or keyframe.path_m - last.path_m >= NEAR_M

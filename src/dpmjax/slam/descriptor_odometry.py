@@ -155,7 +155,7 @@ def _begin_part(
 def _accept(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, found: RegisteredScan, report: ScanReport
 ) -> Placed:
-    """Takes over the registration of a scan, which becomes a keyframe where it is far from all."""
+    """Accepts the registration of a scan, and makes it a keyframe if it is far from all keyframes."""
     config, ratio, match = methods.config.descriptors, state.keyframe_ratio or 0.0, found.match
     T_world_scan = slam_map.T_world_keyframe[found.target] @ match.T_target_source
     apart_m = slam_map.distances_to(T_world_scan[:3, 3])[neighbours_of(slam_map, len(slam_map) - 1)]

@@ -332,14 +332,14 @@ class _Search(NamedTuple):
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
-    """Returns the pose moved along an axis of the scan to where the guess is."""
+    """Returns the pose, moved along an axis of the scan to the position of the guess."""
     held, along = T_map_scan.copy(), T_map_scan[:3, :3] @ axis
     held[:3, 3] += along @ (guess - T_map_scan)[:3, 3] * along
     return held
 
 
 def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
-    """Returns `other` where its score is higher than that of `tracked`, at another place higher by the lead."""
+    """Returns `other` if its score beats that of `tracked`; at another place it must beat it by the lead."""
     is_same = are_near(tracked.T_map_scan, other.T_map_scan, PLACE_M, PLACE_RAD)
     return other if other.score > tracked.score + (0.0 if is_same else lead) else tracked
 

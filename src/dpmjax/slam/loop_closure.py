@@ -312,7 +312,7 @@ def _paths(slam_map: KeyframeMap) -> tuple[Float[np.ndarray, " k"], Int[np.ndarr
 
 
 def _path_since_m(path_m: Float[np.ndarray, " k"], segments: Int[np.ndarray, " k"], row: int) -> np.ndarray:
-    """Returns the path length from each keyframe to that of `row`; infinite where the track was lost between them."""
+    """Returns the path length from each keyframe to that of `row`; infinite if the track was lost between them."""
     return np.where(segments == segments[row], path_m[row] - path_m, np.inf)
 
 

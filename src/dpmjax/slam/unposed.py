@@ -167,7 +167,7 @@ def join_scans(motions: Sequence[PairMotion], count: int) -> tuple[Poses, Int[np
 
 
 def _best_supported(motions: Sequence[PairMotion], T_world: Poses, part: np.ndarray) -> PairMotion | None:
-    """Returns the motion between two parts that has most support; None where none has enough."""
+    """Returns the motion with most support between two parts; None if no motion has enough."""
     between: dict[tuple[int, ...], list[_Joint]] = {}
     for motion in motions:
         ends = part[motion.source], part[motion.target]
