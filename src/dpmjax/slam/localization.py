@@ -60,8 +60,8 @@ class LocalizationConfig:
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
         num_registered: largest number of these keyframes that are registered, in order of their overlap.
-        min_support: number of registrations that must end at the same place. At least one of them must
-            have agreeing scans. One registration suffices if no other keyframe is near.
+        min_support: number of registrations that must end at the same place. The scans of at least one registration
+            must agree. One registration suffices if no other keyframe is near.
         min_best: smallest P(correct) of the best registration of a place. Streets look alike, so several registrations
             may agree on a wrong place. A high limit rejects such places.
     """
