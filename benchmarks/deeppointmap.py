@@ -34,7 +34,7 @@ NOT_COMPILED = ("preprocess", "pyramid", "preprocess + encode")
 SCANS_IN_MAP = 8
 
 # The authors' program was measured once on two cores of an AMD EPYC with random weights (paper size, a KITTI scan of
-# 122,500 points): milliseconds by case, and GB of the one process that does all of it.
+# 122,500 points): milliseconds by case, and GB of the process that runs all cases.
 THEIRS = {
     "paper, KITTI scan: preprocess": 98.0,
     "paper, KITTI scan: pyramid": 990.0,

@@ -19,7 +19,7 @@ state = optimizer.init(model.params)
 
 
 def loss(model, rows):
-    """InfoNCE of two scans; positive is the nearest descriptor of the other scan within 2 m."""
+    """Returns InfoNCE of two scans; the positive is the nearest descriptor of the second scan within 2 m."""
     a, b = (dpmjax.encode_pyramid(model, jax.tree.map(lambda leaf, row=row: leaf[row], pyramids)) for row in rows)
     T_b_a = jnp.linalg.inv(T_world_scan[rows[1]]) @ T_world_scan[rows[0]]
     near = dpmjax.radius_search(rigid.transform_points(T_b_a, a.positions), b.positions, 2.0, 1, mask=b.mask)

@@ -27,7 +27,7 @@ for name, config in (("least squares", None), ("robust", dpmjax.PoseGraphConfig(
 
 
 def last_x(measurements):
-    """Where the last pose ends, as a function of all measurements."""
+    """Returns the x coordinate of the last pose as a function of all measurements."""
     return pose_graph.solve_dense(jnp.asarray(start), edges._replace(measurements=measurements)).poses[-1, 0]
 
 

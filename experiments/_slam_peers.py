@@ -6,8 +6,8 @@ its documentation, and half as large indoors. None of them corrects scans for th
 either.
 
 A program takes the scans in order by `step`, (n, 3) float64, not empty. `finish` returns (n, 4, 4) poses of all scans,
-and the loops. After it, `map_bytes` takes the scans again, because some drop far points on the way, and returns the
-bytes of the map of the whole way, with floats of 4 bytes.
+and the loops. Then `map_bytes` returns the bytes of the map of the whole way, with floats of 4 bytes. It takes the
+scans again, because some programs drop far points on the way.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@
 
 256 scans of a built-in world are fitted, and L-Net is trained on the poses of the fit. For each unseen scan L-Net
 proposes poses, and M-Net chooses. Headings are random and unknown. Beside it stands L-Net alone, as in the paper: the
-scans have the heading of the nearest scan of the fit, and the output of L-Net is the pose. That L-Net is the one of the
-fit where a single one moved all scans from zero poses, as with --preset paper; else it is trained on the poses of the
-fit. A pose is right within 20 px. The file table.md has the errors by the distance from the trajectory, places.npz
+scans have the heading of the nearest scan of the fit, and the output of L-Net is the pose. If a single L-Net moved all
+scans of the fit from zero poses, as with --preset paper, this L-Net is used. Otherwise L-Net is trained on the poses of
+the fit. A pose is right within 20 px. The file table.md has the errors by the distance from the trajectory, places.npz
 those of each scan.
 """
 

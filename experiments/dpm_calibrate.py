@@ -10,15 +10,19 @@ surfaces and the share of points in free space. Pairs whose walls hold one direc
 own, on two features, and so have matches of clouds of surface elements, without the scans. Ambiguous places add pairs:
 corridors, tunnels, halls, open fields and streets with queues of moving cars, by lidars of 16, 32 and 64 beams. Overlap
 is another regression, on the evidence of the match (similarities of descriptors, consensus support ...) of pairs of
-further towns, half of them less than 20 m apart. The file model.safetensors is the model with all regressions.
-metrics.json has the Brier scores, the calibration errors, and the AUC of overlap, of places that were left out of the
-fits; the reliability*.png show them. On drives of your own, `dpmjax train --stages overlap --weights MODEL` calibrates.
+further towns, half of them less than 20 m apart.
 
-With --check, the calibration of the model rates pairs of other ambiguous places. table.md has the shares of pairs that
-are right, sure (a confidence of 0.9 or more), and wrong though sure. With --evidence, all motions that `register` tries
-for pairs of simulated scenes are compared with the truth. A regression on `evidence_shares` predicts which are right;
-metrics.json has the weights for `dpmjax.deeppointmap.EvidenceWeights`, table.md the pairs whose right motion has the
-highest score, scene by scene, each by a fit without this scene.
+The file model.safetensors is the model with all regressions. The file metrics.json has the Brier scores, the
+calibration errors and the AUC of overlap. All are measured on places that were left out of the fits. The pictures
+reliability*.png show them. On drives of your own, `dpmjax train --stages overlap --weights MODEL` calibrates.
+
+With --check, the calibration of the model rates pairs of other ambiguous places. The file table.md has the shares of
+pairs that are right, sure (a confidence of 0.9 or more), and wrong though sure.
+
+With --evidence, all motions that `register` tries for pairs of simulated scenes are compared with the truth. A
+regression on `evidence_shares` predicts the right ones. The file metrics.json has the weights for
+`dpmjax.deeppointmap.EvidenceWeights`. The file table.md has, for each scene, the pairs whose right motion has the
+highest score, by a fit without this scene.
 """
 
 from __future__ import annotations

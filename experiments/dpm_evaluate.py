@@ -9,9 +9,12 @@ A path is any folder of scans with poses (KITTI, KITTI-360, MulRan, plain ...). 
 and 10 to 20 m (middle) apart and turned by any yaw, are registered. A registration within 2 m and 5 degrees is right.
 Two more methods see the same pairs: the search and the verification of `register` without the network, and KISS-Matcher
 (extra `kiss`). With --clouds, the pairs are registered from their descriptor clouds too, refined by N surface elements
-a scan; the scans themselves are not used again. rows.csv has every pair, overlap.csv the overlap probability of each
-drive, table.md the shares that are right (95 % intervals) and the median errors of right ones. pooled.md has all
-recorded drives together, and says which methods differ. reliability.png and failures.png are as by `dpmjax evaluate`.
+a scan. The scans themselves are not used again.
+
+The file rows.csv has every pair, overlap.csv the overlap probability of each drive. The file table.md has the shares of
+right registrations (95 % intervals) and the median errors of right ones. The file pooled.md has all recorded drives
+together, and names the methods that differ. The pictures reliability.png and failures.png are those of `dpmjax
+evaluate`.
 """
 
 from __future__ import annotations

@@ -10,14 +10,16 @@
 
 A path is any folder of scans with poses, or a file of poses (TUM, KITTI), along which a town is simulated; scans are
 kept in results/simulated. Methods are our settings ("whole", "paper" and parts left out, DeepPointMap Table 2), other
-programs (extra `peers`), and "agents": the drive is cut into three parts, and three agents map one each and join their
-maps (section 5.3). With --localize, random scans are looked for in the map of each drive's first half, as saved.
+programs (extra `peers`), and "agents". For "agents", the drive is cut into three parts. Three agents map one part each
+and join their maps (section 5.3). With --localize, random scans are localized in the saved map of each drive's first
+half.
 
-rows.csv has ATE, KITTI's t_rel, loops, bytes of the map and mean seconds a scan without compilation, also those of the
-first and the last tenth, which show whether they grow. A loop is wrong beyond 2 m or 5 degrees. A scan comes back where
-it is within 5 m (indoors 2 m) of an earlier one after 50 m (15 m) of way. The recall of loops is the share of these
-scans that have a right loop whose newer end is within 10 m (3 m) along the path. KISS-SLAM joins local maps of 100 m,
-and each of its loops counts for all scans of the newer one. drives/ has the trajectory of every method.
+The file rows.csv has ATE, KITTI's t_rel, loops, bytes of the map and mean seconds a scan without compilation. The means
+of the first and the last tenth of the scans show the growth of these seconds. A loop is wrong beyond 2 m or 5 degrees.
+A scan is a revisit if it is within 5 m (indoors 2 m) of an earlier one after 50 m (15 m) of way. The recall of loops is
+the share of revisits with a right loop whose newer end is within 10 m (3 m) along the path. KISS-SLAM joins local maps
+of 100 m, and each of its loops counts for all scans of the newer map. The folder drives/ has the trajectory of every
+method.
 """
 
 from __future__ import annotations

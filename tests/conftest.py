@@ -71,7 +71,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def drop_programs() -> Iterator[None]:
-    """Frees what was compiled, every few modules: the programs of all tests together take 4 GB."""
+    """Frees compiled programs every few modules, because the programs of all tests together take 4 GB."""
     yield
     global _num_kept
     if _num_compiled - _num_kept > MAX_PROGRAMS:
@@ -81,7 +81,7 @@ def drop_programs() -> Iterator[None]:
 
 @pytest.fixture
 def count_compilations() -> Callable[[], int]:
-    """How many programs XLA has compiled in this process so far."""
+    """Returns the number of programs that XLA has compiled in this process so far."""
     return lambda: _num_compiled
 
 

@@ -1,4 +1,4 @@
-"""Tests of what needs a package of an extra are skipped with the reason, also where the package is broken."""
+"""Tests that need a package of an extra are skipped with the reason, also if the package is broken."""
 
 from __future__ import annotations
 

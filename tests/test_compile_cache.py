@@ -54,7 +54,7 @@ def test_programs_are_kept_where_the_user_says(variables, expected, monkeypatch)
 @pytest.mark.slow
 @pytest.mark.parametrize("is_named", [True, False])
 def test_a_second_process_loads_what_the_first_has_compiled(tmp_path, is_named: bool) -> None:
-    """A pipeline keeps its programs without being asked."""
+    """A pipeline keeps its programs by default."""
     folder = tmp_path / "programs"
     variables = {name: value for name, value in os.environ.items() if "CACHE" not in name}
     numbers = []

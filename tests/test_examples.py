@@ -58,7 +58,7 @@ def test_code_of_a_guide_is_that_of_an_example_that_it_names(guide) -> None:
 
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
 def test_code_of_a_guide_defines_all_its_names(guide, tmp_path) -> None:
-    """Its blocks run one after the other, so no name may come from the example alone."""
+    """The blocks of a guide run in order, so no name may come from the example alone."""
     code = tmp_path / "guide.py"
     code.write_text("\n".join(_blocks(guide)))
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "concise"]

@@ -57,7 +57,7 @@ CASES = (
     Case("depth field_4/depth_turning", "ate_m", 0.1),
     *(Case(f"map2d field_4/{name}", "ate_m", largest) for name, largest in (
         ("silent_encoder.npz", 0.05), ("one_covered_scan.npz", 0.05), ("walk_48.npz", 0.01), ("sick_codes.npz", 0.01))),
-    # Bags have no true poses: a line of the table shows what is said of them.
+    # Bags have no true poses: the table shows only how their runs end.
     *(Case(f"map2d field_4/{name}", "ends") for name in ("clock_back_10s", "empty_bag", "renamed_bag")),
     *(Case(f"map2d field_2d/{name}.npz", "ate_m", 0.3) for name in (
         "aca_corridor", "aca_degrees", "aca_dup", "aca_inf", "aca_maxwall", "aca_mirror80", "aca_odo_degrees",

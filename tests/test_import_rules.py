@@ -39,7 +39,7 @@ ALLOWED: dict[str, set[str]] = {
     "viz": {"geometry"},
     "weights": {"geometry", "nets", "deeppointmap"},
 }
-# This file joins classical registration with DeepMapping; the rest of its room knows no network.
+# This file joins classical registration with DeepMapping; all other files of its room import no network.
 ALLOWED_IN_FILE: dict[str, set[str]] = {"registration2d/pipeline.py": {"deepmapping"}}
 # The command imports every room, and no room imports it.
 ALLOWED |= {"cli": set(ALLOWED) - EVERYBODY_MAY, "__main__": {"cli"}}
@@ -83,7 +83,7 @@ def test_module_imports_only_what_its_room_may(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def imported_rooms() -> dict[str, set[str]]:
-    """For each room the other rooms that its modules import in fact."""
+    """Returns for each room the rooms that its modules import."""
     rooms: dict[str, set[str]] = {room_of(path): set() for path in MODULES}
     for path in MODULES:
         names = (name.split(".") for name in imported_names(path))

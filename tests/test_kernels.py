@@ -44,7 +44,7 @@ WITH_GRADIENT = {name: kernel for name, kernel in KERNELS.items() if kernel.by}
 
 @pytest.fixture(autouse=True, scope="module")
 def _made_outside_of_programs() -> None:
-    """What is made once must hold no tracers of the program that asks for it first."""
+    """Makes shared objects outside of programs, because they must hold no tracers of a program that uses them."""
     kernel_table.model()
     kernel_table.toy_1d()
 

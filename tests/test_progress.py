@@ -1,4 +1,4 @@
-"""Bars of the pipelines: on a terminal, in no file, and not where the caller wants none."""
+"""Bars of the pipelines: on a terminal, in no file, and not with `progress=False`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """Traced programs kept on disk, so that a later process does not trace them again (`jax.export`).
 
-JAX's own cache keeps what XLA has compiled, but each process traces its functions before it looks there: 2 s for the
-matching of descriptors, 5 s for a fit of DeepMapping. Where `enable_compile_cache` keeps programs, functions of
-`kept_jit` are traced once for each shape of their arguments, static arguments and version of this package.
+JAX's own cache keeps compiled programs, but each process traces its functions before it looks there. Tracing takes 2 s
+for the matching of descriptors, and 5 s for a fit of DeepMapping. With `enable_compile_cache`, functions of `kept_jit`
+are traced only once. They are traced again for other shapes, other static arguments, or another version of this
+package.
 """
 
 from __future__ import annotations
@@ -135,8 +136,8 @@ def keep_result(name: str, key: Any, compute: Callable[[], Result]) -> Result:
     """Returns what a function computes, from its file where `enable_compile_cache` keeps programs.
 
     Args:
-        name: of the result.
-        key: everything that the result depends on, but for the source of this package; can be pickled.
+        name: name of the result.
+        key: everything that the result depends on except the source of this package; can be pickled.
         compute: computes the result, which can be pickled.
 
     Returns:

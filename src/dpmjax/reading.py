@@ -13,7 +13,7 @@ Reader = Literal[
 
 
 def read_path(value: Given | str | Path, reader: Reader) -> Given:
-    """Returns what a reader makes of a path; anything else is returned as it is.
+    """Reads the value if it is a path, and returns any other value unchanged.
 
     The reader is imported by name when a path is given, because algorithms do not depend on files.
 

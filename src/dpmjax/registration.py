@@ -1,6 +1,6 @@
 """Registration of scans of any sensor, by one name each: `register` for two, `register_scans` for a set.
 
-The shape of the arrays tells the sensor: planar scans are (n, 2), depth images (h, w, 3), lidar scans (n, 3).
+The shape of the arrays determines the sensor: planar scans are (n, 2), depth images (h, w, 3), lidar scans (n, 3).
 """
 
 from __future__ import annotations
@@ -106,13 +106,13 @@ def register_scans(
 
     Args:
         *scans: planar scans (n, b, 2) and perhaps their settings; or a model and a list of (n, 3) arrays, metres.
-        is_ordered: True where the scans are in the order of time. None: as the settings say for planar scans, and
-            False for 3-D scans, which `run_slam` maps in order.
+        is_ordered: True if the scans are in time order. None takes the setting of planar scans, and False for 3-D
+            scans. `run_slam` maps 3-D scans in time order.
         progress: False shows no bar; hooks of your own take its place.
         **options: of `registration2d.register_scans`: key, start, odometry, hooks.
 
     Returns:
-        Poses of all scans, and what is needed to trust them.
+        Poses of all scans, and the evidence for them.
 
     Raises:
         ValueError: see the two functions; or ordered 3-D scans.

@@ -1,4 +1,4 @@
-"""The DeepPointMap benchmark: each stage in a process of its own, each number beside what it is held against."""
+"""The DeepPointMap benchmark: each stage has a process of its own, and each number stands beside its rival."""
 
 from __future__ import annotations
 

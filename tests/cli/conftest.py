@@ -1,4 +1,4 @@
-"""What every command does with bad input."""
+"""A fixture that runs commands on bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run says what was decided about its input, and one without a result fails: log, metrics.json, last line, code."""
+"""A run reports decisions on its input, and a run without a result fails: log, metrics.json, last line, code."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def scans_of(case):
 
 @pytest.fixture
 def with_truth(case, monkeypatch) -> None:
-    """Registrations are those of the true poses, and sure ones but for the last scan: the networks are untrained."""
+    """Registers scans by their true poses, surely except the last one, because the networks are untrained."""
     methods = make_methods(dpmjax.load_model(case / "model.safetensors"))
     drive, truth = open_lidar_sequence(scans_of(case)), np.load(case / "poses.npy")
 

@@ -1,4 +1,4 @@
-"""Whole runs of the main command on tiny scans, what its help says, and what it says to bad input."""
+"""Whole runs of the main command on tiny scans, its help, and its answers to bad input."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_unit_of_the_fit_is_that_of_the_worlds_of_the_paper(walk, preset, unit, 
 
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own; interrupted after the first call of the step where asked."""
+    """Runs the command in a process of its own; `interrupt` stops it after the first call of the step."""
     command = ["-m", "dpmjax", "map2d"]
     if interrupt:
         code = (

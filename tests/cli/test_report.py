@@ -1,4 +1,4 @@
-"""The page of a run stands alone, says what the files say, and opens in a browser without an error."""
+"""The page of a run stands alone, agrees with the files, and opens in a browser without an error."""
 
 from __future__ import annotations
 

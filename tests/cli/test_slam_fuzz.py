@@ -110,7 +110,7 @@ DAMAGES = (bad_numbers, few_points, spoil, spoil, spoil)
 
 
 def damage(folder: Path, rng: np.random.Generator) -> list[str]:
-    """Damages one to three files; returns what was done."""
+    """Damages one to three files; returns the list of damages."""
     done = []
     for _ in range(int(rng.integers(1, 4))):
         files = sorted(path for path in folder.rglob("*") if path.is_file())

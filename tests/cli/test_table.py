@@ -1,4 +1,4 @@
-"""The table of an experiment: rows are computed once, and their summary counts what it says."""
+"""The table of an experiment: rows are computed once, and the counts of their summary are right."""
 
 from __future__ import annotations
 

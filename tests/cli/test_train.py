@@ -43,7 +43,7 @@ TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
 
 class StopAfter:
-    """Asks to stop after so many steps."""
+    """Stops training after a number of steps."""
 
     def __init__(self, num: int) -> None:
         self._left = num
@@ -81,7 +81,7 @@ def whole(tmp_path_factory):
 
 
 def assert_same_run(parts, folder: Path, whole) -> None:
-    """Parameters and history bit for bit, but for the seconds."""
+    """Checks that parameters and history are equal bit for bit, except the seconds."""
     toy.assert_trees_equal(parts.progress, whole[0].progress)
     toy.assert_trees_equal(parts.model.params, whole[0].model.params)
     rows = [run_in(where).read_table(HISTORY) for where in (whole[1], folder)]

@@ -30,7 +30,7 @@ from tests.deeppointmap import toy
 REPOSITORY = Path(__file__).parents[2]
 TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
-# The first process is asked to stop before its third step of four.
+# The first process gets a signal before its third step of four.
 PROCESS = """
 import signal, sys
 from dpmjax.deeppointmap.training.processes import is_first, join_processes

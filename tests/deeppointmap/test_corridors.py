@@ -55,7 +55,7 @@ def bare() -> list[Scan]:
 
 
 def confidence(found: VerifiedMotion) -> float:
-    """Of the shipped model."""
+    """Returns the confidence by the shipped model."""
     model = dpmjax.load_model("dpm_small").config.calibration.of_weak_scans
     return float(logistic_probability(model, weak_features(found.verification)))
 

@@ -36,14 +36,14 @@ def turn() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def clouds(model, turn) -> tuple[DescriptorCloud, DescriptorCloud]:
-    """Of a scan, and of the same scan after a turn about the vertical."""
+    """Returns descriptors of a scan, and of the same scan after a turn about the vertical."""
     pyramid = pyramid_of_scan(toy.drive().read_scan(3), toy.MODEL)
     levels = tuple(level.replace(positions=level.positions @ turn[:3, :3].T) for level in pyramid.levels)
     return encode_pyramid(model, pyramid), encode_pyramid(model, pyramid.replace(levels=levels))
 
 
 def offsets(model: Model, cloud: DescriptorCloud, *, in_ray_frame: bool = False) -> np.ndarray:
-    """From each descriptor to the one before it; what the head is fed with does not matter here."""
+    """Returns offsets from each descriptor to the one before it; any features serve here."""
     features = jnp.tile(cloud.features, (1, 2))[:, : model.config.decoder.model_channels]
     directions = None if in_ray_frame else directions_of(cloud)
     return np.asarray(predict_offsets(model, features, jnp.roll(features, 1, axis=0), directions))

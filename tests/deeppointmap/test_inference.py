@@ -1,4 +1,4 @@
-"""What users call: encode, register, overlap."""
+"""The public functions of inference: encode, register, overlap."""
 
 from __future__ import annotations
 

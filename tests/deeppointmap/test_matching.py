@@ -58,7 +58,7 @@ def test_best_pairs_have_the_highest_dual_softmax(shape: tuple[int, int]) -> Non
 
 
 def test_motion_is_the_best_one_of_its_inliers() -> None:
-    """Ten of eighty pairs are tens of metres off: what they leave behind is the least-squares motion, by SciPy."""
+    """Ten of eighty pairs are tens of metres off. The motion is the least-squares motion of the inliers, by SciPy."""
     match = jax.device_get(match_clouds(*clouds(1, num_outliers=10), config=MatchConfig(pair_ratio=1.0)))
     source, target, _ = clouds(1, num_outliers=10)
     p, q = source[match.source_indices][match.is_inlier], target[match.target_indices][match.is_inlier]
@@ -181,7 +181,7 @@ def test_merging_turns_elements_and_leaves_those_with_features_in_front() -> Non
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_union_describes_no_place_twice(seed: int) -> None:
-    """The oracle goes through the descriptors one cloud after the other and compares all distances."""
+    """The oracle goes through the descriptors cloud by cloud and compares all distances."""
     rng, num = np.random.default_rng(seed), 30
     positions = rng.uniform(0, 20, (4, num, 3)).astype(np.float32)
     positions[1, :10] = positions[0, :10] + 0.01

@@ -1,4 +1,4 @@
-"""What overlap rests on, and how it becomes a probability."""
+"""The evidence of overlap, and the probability that it gives."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def test_the_true_motion_is_better_than_any_other(scans) -> None:
 
 
 def test_two_scans_on_each_other_gain_nothing_by_their_ground() -> None:
-    # 16 m apart, each sees 20 m: half of the truth lies where only one of them sees, and all ground meets anywhere.
+    # The scans are 16 m apart and reach 20 m, so half of the points are in view of one scan. Ground meets anywhere.
     poses = motion(0, (-8, 0, 0)), motion(0, (8, 0, 0))
     points = [seen_from(street(seed, 40_000), T) for seed, T in enumerate(poses)]
     scans = [measure_scan(some[np.linalg.norm(some, axis=1) < 20]) for some in points]

@@ -16,5 +16,5 @@ def run(module: ModuleType, *options: object) -> int:
 
 
 def read_rows(folder: Path, name: str = "rows.csv") -> list[dict[str, str]]:
-    """Returns the rows as they are in the file."""
+    """Returns the rows of the file, unchanged."""
     return list(csv.DictReader((folder / name).read_text(encoding="utf-8").splitlines()))

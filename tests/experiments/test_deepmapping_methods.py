@@ -1,4 +1,4 @@
-"""The suite and the logs: each method on a tiny walk, what the rows hold, and that a killed run goes on."""
+"""The suite and the logs: each method on a tiny walk, the content of the rows, and the resume of a killed run."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_suite_has_a_row_a_method_and_the_bound_and_simulates_a_walk_once(tmp_pa
 
 
 def flaser_lines(walk, poses, odometry) -> list[str]:
-    """The half of each scan that lies ahead, 2 cm a pixel, one second after the other."""
+    """Returns the front half of each scan as a line of a log, 2 cm a pixel, one second apart."""
     bearings = np.arctan2(walk.points[0, :, 1], walk.points[0, :, 0])
     ahead = np.argsort(bearings)[90:270]
     lines = []

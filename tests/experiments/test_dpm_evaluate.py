@@ -37,7 +37,7 @@ def test_evaluation_measures_every_pair_and_resumes(weights, tmp_path, monkeypat
     assert "KISS-Matcher was not run: it is not installed." in capsys.readouterr().out
     rows, metrics = read_rows(out), load_json(out / "metrics.json")
     assert [row["band"] for row in rows] == [band for band in ("near", "middle", "far") for _ in range(2)]
-    # Pairs far apart have no overlap: others are not asked.
+    # Pairs far apart have no overlap, so other methods do not register them.
     assert [bool(row["search_right"] and row["clouds_32_right"]) for row in rows] == [True] * 4 + [False] * 2
     assert 0 <= metrics["brier"] <= 1
     assert {row["band"] for row in metrics["table"]} == {"near", "middle"}

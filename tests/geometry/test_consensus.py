@@ -67,7 +67,7 @@ def test_moving_both_frames_moves_the_motion() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_two_motions_are_both_found_in_the_order_of_their_support(seed: int) -> None:
-    """As in repetitive places: two sets of pairs, each of which agrees with another motion."""
+    """Two sets of pairs agree with two motions, as in repetitive places."""
     many, few = pairs_with_outliers(seed, 40, 0), pairs_with_outliers(100 + seed, 20, 0)
     noise = pairs_with_outliers(200 + seed, 0, 40)
     sides = (np.concatenate([part[side] for part in (few, noise, many)]) for side in (0, 1))
@@ -109,7 +109,7 @@ def test_too_few_pairs_give_a_finite_motion_with_little_support(num_pairs: int) 
 
 
 def test_pairs_of_one_point_tell_nothing() -> None:
-    """Many pairs of one descriptor agree in all distances, 0; that must not outvote the others."""
+    """Many pairs of one descriptor agree in all distances, which are 0. They must not outvote the true pairs."""
     source, target, T, _ = pairs_with_outliers(4, 12, 20)
     crowd = np.tile(source[:1], (40, 1)), np.tile(target[:1] + 15, (40, 1))
     found = find_consensus(np.concatenate([source, crowd[0]]), np.concatenate([target, crowd[1]]))

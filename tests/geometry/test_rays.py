@@ -29,7 +29,7 @@ def test_wrong_shapes_are_named(as_user) -> None:
 
 
 def test_typical_range_is_what_nine_beams_in_ten_stay_below() -> None:
-    # Beam k of scan s ends at range s * k, k from 0 to 100; what is masked does not count, nor does an empty scan.
+    # Beam k of scan s ends at range s * k, k from 0 to 100. Masked beams and empty scans do not count.
     ranges = np.arange(101.0) * np.array([[1], [2], [7], [0]])
     points = ranges[..., None] * np.array([0.6, 0.8])
     mask = np.broadcast_to(np.array([[True]] * 3 + [[False]]), ranges.shape)

@@ -45,7 +45,7 @@ def test_walls_are_no_shell(dim: int) -> None:
     angles = np.linspace(-0.6, 0.6, 500)
     wall = np.stack([30.0 * np.ones(500), 30.0 * np.tan(angles), *np.zeros((dim - 2, 500))], axis=1)
     assert shell_radius(np.concatenate([room(dim), wall])) is None
-    # Ranges that are cut off end as densely as they are.
+    # Ranges that are cut off have the same density up to their end.
     cut = room(dim, half=50.0, count=20000) * np.random.default_rng(2).uniform(0, 1, (20000, 1))
     assert shell_radius(cut[np.linalg.norm(cut, axis=1) < 20.0]) is None
 

@@ -1,4 +1,4 @@
-"""Bags of ROS: clouds of all drivers, planar scans with odometry, topics, and what is refused."""
+"""Bags of ROS: clouds of all drivers, planar scans with odometry, topics, and refusals."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_a_laser_upside_down_is_turned(tmp_path: Path) -> None:
         for index, pose in enumerate(POSES):
             stamp = EPOCH_NS + index * STEP_NS
             bag.write_transform(("odom", "base_link"), pose, stamp)
-            # Seen from below, the beams run the other way round.
+            # Seen from below, the beams run in the opposite direction.
             ranges = room(se2.compose(pose, T_BASE_LASER))
             bag.write_scan(np.roll(ranges[::-1], 1), stamp)
     scans = read_sequence(bag.path)

@@ -1,4 +1,4 @@
-"""Laws of grid maps: walls are occupied, what beams passed is free, the rest unknown, in the world's frame."""
+"""Laws of grid maps in the world's frame: walls are occupied, cells on beams free, all further cells unknown."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_ignored_pairs_and_masked_queries_are_left_out(seed: int) -> None:
 
 def test_positive_is_never_ignored() -> None:
     queries, keys, positives = example(4)
-    # With everything else ignored, the positive is all that is left: a certain match.
+    # All keys but the positive are ignored, so the match is certain.
     loss = info_nce(queries, keys, positives, ignore=np.ones((6, 9), bool))
     np.testing.assert_allclose(loss, 0, atol=1e-6)
 

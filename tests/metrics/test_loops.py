@@ -33,7 +33,7 @@ def twice_round(side_m: float = 50.0) -> np.ndarray:
 def test_the_way_back_is_a_revisit_from_the_other_side() -> None:
     poses = there_and_back()
     found = find_revisits(poses, distance_m=5.0, min_path_m=50.0)
-    # About the turn, what is near was passed less than 50 m of way ago.
+    # About the turn, the path to all near poses is shorter than 50 m.
     assert found.is_revisit[100 + 30 :].all()
     assert not found.is_revisit[: 100 + 15].any()
     np.testing.assert_array_equal(found.is_opposite, found.is_revisit)

@@ -39,7 +39,7 @@ def test_value_with_and_without_gradient(k: int) -> None:
 
 @pytest.mark.parametrize("argument", range(4))
 def test_gradient_is_the_slope(argument: int) -> None:
-    """Of each argument, beside central differences in float64."""
+    """The gradient by each argument equals central differences in float64."""
     floats, neighbours = problem(1)
     weights = np.random.default_rng(9).normal(size=(12, 7))
     arrays = [jnp.asarray(x, jnp.float32) for x in floats]

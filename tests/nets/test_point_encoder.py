@@ -30,7 +30,7 @@ def points(seed: int, num_points: int = 40) -> np.ndarray:
 
 
 def pyramid_of(cloud: np.ndarray, capacity: int | None = None, config: ModelConfig = CONFIG) -> PointPyramid:
-    """Of the cloud in front of `capacity` rows."""
+    """Returns the pyramid of a cloud that is padded to `capacity` rows."""
     capacity = len(cloud) if capacity is None else capacity
     front = np.zeros((capacity, 3), np.float32)
     front[: len(cloud)] = cloud
@@ -93,7 +93,7 @@ def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
     high = encode_pyramid(model, pyramid)
     np.testing.assert_array_equal(low.positions, high.positions)
     assert low.features.dtype == jnp.float32
-    # bfloat16 has 8 bits: 0.4 % a product, a few of them one after the other.
+    # bfloat16 has 8 bits, so each product in a chain has an error of 0.4 %.
     assert jnp.linalg.norm(low.features - high.features) < 0.03 * jnp.linalg.norm(high.features)
 
 

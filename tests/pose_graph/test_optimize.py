@@ -37,7 +37,7 @@ def rotations(turn: np.ndarray) -> np.ndarray:
 
 
 def mean_rotation(turn: np.ndarray) -> np.ndarray:
-    """Rotations from none to all of it, in the mean: what makes a translation out of that of a twist."""
+    """Returns the mean rotation from none to the whole turn; it maps the translation of a twist to the motion's."""
     return rotations((np.arange(40)[:, None] + 0.5) / 40 * turn).mean(axis=0)
 
 

@@ -21,7 +21,7 @@ from dpmjax.registration2d.pair_search import (
 from dpmjax.simulation import simulate_sequence
 from tests.registration2d.conftest import ate, scans_of
 
-# Coarse, so that a test takes a second: what is law does not depend on it.
+# Coarse, so that a test takes a second. The laws do not depend on it.
 COARSE = CorrelativeConfig(num_cells=64, cell=0.075, num_turns=72, block=8, num_levels=5, num_candidates=3)
 CONFIG = GlobalConfig(search=COARSE)
 

@@ -1,4 +1,4 @@
-"""Global registration of sequences, and what the search of many pairs costs."""
+"""Global registration of sequences, and the cost of the search of many pairs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def register_as_set(scans: PlanarScans, config: GlobalConfig, monkeypatch: pytes
 @pytest.mark.slow
 @pytest.mark.parametrize("num_torn", [1, 12])
 def test_torn_steps_are_healed_from_the_scans_alone(there, monkeypatch: pytest.MonkeyPatch, num_torn: int) -> None:
-    """Of few scans all pairs are searched as soon as one step is weak; of many, where many steps are."""
+    """One weak step starts the search of all pairs of few scans. Many scans need many weak steps."""
     walk, max_keyframes = (there.take(slice(0, None, 2)), 32) if num_torn == 1 else (there, 6)
     truth = np.asarray(walk.reference_poses)
     torn = se2.relative(truth[0], truth)

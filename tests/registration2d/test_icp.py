@@ -25,7 +25,7 @@ def apply(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def surface(dim: int, seed: int = 0) -> np.ndarray:
-    """The sides of a box with a step in one of them: nothing that slides or turns onto itself."""
+    """Returns points on the sides of a box with a step in one side, so that it does not slide or turn onto itself."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1.0, 1.0, (NUM_POINTS, dim))
     side = rng.integers(0, dim, NUM_POINTS)

@@ -52,7 +52,7 @@ def scan_set(sequence: ScanSequence) -> ScanSet:
 
 
 class Untrained:
-    """Makes an engine that returns its start; notes the rows, and what the engine was called with."""
+    """Makes an engine that returns its start; records the rows and the arguments of the engine."""
 
     def __init__(self, num_steps: int = 1) -> None:
         self.num_steps = num_steps

@@ -84,9 +84,9 @@ def test_misfit_is_the_share_of_the_visible_beams_in_a_square_room() -> None:
     scans = planar_scans(*scan_world(room, poses))
     assert view_misfit(scans, poses) < 0.1
     moved = poses + np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    # A quarter of the beams ends 5 px before a wall, and a quarter behind one, where the other scan cannot see.
+    # A quarter of the beams ends 5 px before a wall, and a quarter behind one, out of view.
     assert view_misfit(scans, moved) == pytest.approx(1 / 3, abs=0.05)
-    # A scan a world away sees nothing of the other.
+    # Two scans a world apart share no visible surface.
     assert view_misfit(scans, poses + np.array([[0.0, 0.0, 0.0], [5000.0, 0.0, 0.0]])) == pytest.approx(1.0)
 
 

@@ -72,7 +72,7 @@ def test_two_views_of_one_place_do_not_contradict(shift: tuple[float, float]) ->
 
 
 def test_a_wall_that_is_seen_through_is_a_contradiction() -> None:
-    # The target's beams go on to 10 where the source has a wall at 6; what the source hides is not visible.
+    # The target's beams go on to 10 where the source has a wall at 6. Points behind that wall are not visible.
     assert compare(round_room(6.0), round_room(10.0)) == (pytest.approx(0.0, abs=1e-6), NUM_BEAMS, NUM_BEAMS)
 
 

@@ -1,4 +1,4 @@
-"""Whole recordings: which scans are registered, and where the others end."""
+"""Whole recordings: the choice of the registered scans, and the poses of the scans between."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laws of saved maps: what is saved is loaded again, and anything else is refused in one line."""
+"""Laws of saved maps: a loaded map equals the saved one, and any other file is refused in one line."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_int8_leaves_out_keyframes_that_others_cover(tmp_path) -> None:
     scans = [keyframe.scan for keyframe in load_map(save_map(path, joined, "int8")).keyframes]
     assert scans == [keyframe.scan for keyframe in MAP.keyframes[:3]]
     assert len(load_map(save_map(path, joined))) == 4
-    # What is counted is what is written.
+    # The counted bytes are those of the file.
     assert len(map_bytes(joined, "int8")) == save_map(path, joined, "int8").stat().st_size
 
 

@@ -1,4 +1,4 @@
-"""Laws of deskewing: what a moving lidar measures becomes what it would have measured standing still."""
+"""Laws of deskewing: the scan of a moving lidar becomes the scan of the same lidar at rest."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def test_both_forms_agree(case: str) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_outliers_of_a_large_scan_are_those_of_all_neighbours(seed: int) -> None:
-    """Neighbours of few points are searched: only points near the limit may be judged otherwise."""
+    """Neighbours of few points are searched, so only points near the limit may differ from the full search."""
     lonely = np.random.default_rng(seed).uniform(-60, 60, (60, 3))
     points = np.concatenate([street(seed, 8000), lonely])
     assert len(points) > 4 * NUM_SPACED

@@ -23,7 +23,7 @@ def test_normals_are_those_of_the_device() -> None:
 
 
 def test_a_sparse_scan_has_normals_too() -> None:
-    """Of 240 points on the street, hardly any has four neighbours within 1.5 m."""
+    """Hardly any of 240 points on the street has four neighbours within 1.5 m."""
     sparse = street(0, 240, noise_m=0.0)
     fixed, adapted = (scan_surface(sparse, SurfaceConfig(sparse_radius_share=share)) for share in (0.0, 1.5))
     assert len(fixed.samples) < 0.3 * len(sparse)

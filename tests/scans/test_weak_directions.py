@@ -45,7 +45,7 @@ def test_sigma_covers_alignments_whose_cubes_disagree() -> None:
         variances.append(sigma_along(scattered_information(pairs, IDENTITY), np.array([1.0, 0, 0])) ** 2 - before[-1])
         errors.append(step[0])
     assert np.sqrt(np.mean(before)) < np.std(errors)
-    # One cube of many disagrees with the rest as the motion does, so that the scatter is some percent too small.
+    # The fitted motion absorbs a share of the scatter of the cubes, so that it is a few percent too small.
     np.testing.assert_allclose(np.sqrt(np.mean(variances)), SCATTER_FACTOR * np.std(errors), rtol=0.2)
 
 

@@ -16,7 +16,7 @@ def building(request):
 
 
 def inside_of_rooms(plan, points, margin=0.0):
-    """Whether each point is in some room or in a doorway: the slow way."""
+    """Returns True for each point in a room or in a doorway, the slow way."""
     found = np.zeros(len(points), bool)
     for room in plan.rooms:
         found |= ((points[:, :2] > np.array(room.low) + margin) & (points[:, :2] < np.array(room.high) - margin)).all(1)

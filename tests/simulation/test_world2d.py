@@ -80,7 +80,7 @@ def test_a_person_is_a_disc_in_front_of_what_is_farther():
     bearing = angles + 0.5
     hits = poses[0, :2] + ranges[0, :, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     is_met = ranges[0] < 200.0
-    # Only the first: the second is behind what the beams have met, the third has stepped out of the way.
+    # Beams meet only the first person. The second is behind the walls, and the third stands too near to the sensor.
     np.testing.assert_allclose(np.linalg.norm(hits[is_met] - people[0, 0], axis=1), 11.0, atol=1e-9)
     assert (ranges[0, is_met] < 100.0).all()
     width = np.rad2deg(2 * np.arcsin(11.0 / 100.0))

@@ -171,7 +171,7 @@ def test_maps_of_different_days_are_merged() -> None:
     np.testing.assert_allclose(both.T_world_keyframe[0], a.T_world_keyframe[0], atol=1e-9)
     rows = [number_of(keyframe.compact) for keyframe in both.keyframes]
     assert absolute_trajectory_error(both.T_world_keyframe[:, :3, 3], TRUTH[rows][:, :3, 3]) < 1.0
-    # A third drive extends what was merged.
+    # A third drive extends the merged map.
     extended = dpmjax.run_slam(methods, scans_of(PARTS[2]), slam_map=both)
     rows = [number_of(keyframe.compact) for keyframe in extended.map.keyframes]
     found = extended.map.T_world_keyframe[:, :3, 3]

@@ -25,7 +25,7 @@ EXTENT_M = SPACING_M / RECENT_SHARE
 
 
 def chain(T_world_keyframe: np.ndarray, missing_edge: int | None = None) -> KeyframeMap:
-    """A chain of keyframes; the edge from one of them to that before may be missing."""
+    """Returns a chain of keyframes; `missing_edge` leaves out the edge from this keyframe to the one before it."""
     slam_map = KeyframeMap()
     for row, T in enumerate(T_world_keyframe):
         edge = MapEdge(row, row - 1, np.eye(4), np.eye(6), "odometry") if row not in (0, missing_edge) else None

@@ -126,7 +126,7 @@ def test_keyframes_that_an_optimisation_brings_together_are_compared_then() -> N
         assert loop.T_target_source is not None
         apart = rigid.inverse(truth[loop.target]) @ truth[loop.source]
         assert np.linalg.norm(apart[:3, 3] - loop.T_target_source[:3, 3]) < 0.6
-    # Nothing is compared twice, and what is compared ends.
+    # No pair is compared twice, and the comparisons end.
     for _ in range(100):
         before, after = after, search_again(methods, slam_map, after)
         pairs = [(loop.source, loop.target) for loop in after.loops]
@@ -144,7 +144,7 @@ def test_right_loops_agree_and_wrong_ones_do_not() -> None:
     assert are_consistent(slam_map, *right)
     assert not are_consistent(slam_map, right[0], wrong)
     assert not are_consistent(slam_map, right[0], turned)
-    # A keyframe is no witness for itself, and far loops tell nothing of each other.
+    # A loop does not support itself, and far loops do not support each other.
     assert not are_consistent(slam_map, right[0], right[0])
     assert not are_consistent(slam_map, right[0], loop_between(truth, half + 60, 60))
 

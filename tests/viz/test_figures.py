@@ -1,4 +1,4 @@
-"""Panels and layers: what is drawn lies where it should, in one frame, whatever the data are like."""
+"""Panels and layers: all layers lie at their places in one frame, for any data."""
 
 from __future__ import annotations
 

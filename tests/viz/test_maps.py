@@ -1,4 +1,4 @@
-"""Pictures of SLAM, of registered scans and of pairs show what they are given."""
+"""Pictures of SLAM, of registered scans and of pairs show all of their data."""
 
 from __future__ import annotations
 

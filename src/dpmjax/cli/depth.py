@@ -6,11 +6,13 @@
     dpmjax depth images --jump 10        every tenth image
     dpmjax depth --resume                continue the latest run
 
-Depth is 16 bit, millimetres, 0 or 65535 for nothing. Where each image has a NAME.pose.txt, the result is measured by
-these poses. Results go to results/depth/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI
-and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png. Each image is placed by the
-last motion, or by a search where this is not clear. DeepMapping then adjusts the keyframes; the poses of higher
-consistency, the share of pixels that other images confirm, are kept. The verdict names images that no other explains.
+Depth is 16 bit, millimetres, 0 or 65535 for nothing. If each image has a NAME.pose.txt, these poses measure the errors
+of the result. Results go to results/depth/<time>/ (latest links to the newest): metrics.json, trajectories as TUM,
+KITTI and npy (T_world_camera, metres), map.ply, and pictures: map.png (from above) and loss.png.
+
+The last motion gives the pose of each image. If this pose is not clear, a search finds it. DeepMapping then adjusts the
+keyframes. Of the poses before and after DeepMapping, those of higher consistency are kept: the share of pixels that
+further images confirm. The verdict names images that no further image explains.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ class DepthOptions(cli.ScanOptions, cli.RunOptions):
     """Options of the run."""
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Folder of NAME.depth.png with an intrinsics file, and poses or none. Without it: a simulated apartment."""
+    """Folder of NAME.depth.png with an intrinsics file, with or without poses. Default: a simulated apartment."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: networks and sampling of the paper."""
 

@@ -37,14 +37,14 @@ class DriveOptions(ScanOptions, ModelOptions, RunOptions):
     """Options of every command that reads the scans of whole drives."""
 
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
-    """Which clouds of a bag of ROS, where it holds several topics of them."""
+    """Topic of the clouds, if a bag of ROS holds several."""
     columns: Annotated[int | None, arg(metavar="N"), Bound(3)] = None
-    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    """Number of values of each point in .bin files (4: KITTI, 5: nuScenes). Without it, the values decide."""
     kitti_angle_correction: FlagCreatePairsOff[bool] = False
     """Raise the beams by 0.205 degrees, as KITTI's HDL-64E needs."""
 
     def check_data(self, data: object, sequence: str | None) -> None:
-        """Raises a ValueError where options belong to files and no folder is given."""
+        """Raises a ValueError for options of files if no folder is given."""
         if data or self.resume:  # a resumed run has its own
             return
         uses = {
@@ -64,13 +64,14 @@ def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = 
     Args:
         data: folder of scans, a bag of ROS, or a file of poses along which a town is simulated; None for any town.
         options: selection of scans of the drive, and seed of a simulated town.
-        sequence: name of the drive, where the folder holds several.
+        sequence: name of the drive, if the folder holds several.
 
     Returns:
         The drive.
 
     Raises:
-        InputError: no such folder, drive or poses, a file that is missing or truncated, or a damaged first scan.
+        InputError: the folder, the drive or the poses do not exist, a file is missing or truncated, or the first scan
+            is damaged.
     """
     if data is None:
         drive = demo_drive(options.seed)
@@ -104,7 +105,7 @@ def with_raised_beams(drive: LidarSequence) -> LidarSequence:
 
 
 def demo_drive(seed: int) -> LidarSequence:
-    """Simulates a drive once round a town and on over known streets, with an HDL-64 of half the columns."""
+    """Simulates a drive once round a town and on over the first streets, with an HDL-64 of half the columns."""
     town = simulation.TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
     driving = simulation.DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
     sensor = simulation.HDL64E.with_azimuths(TOWN_AZIMUTHS)
@@ -114,18 +115,18 @@ def demo_drive(seed: int) -> LidarSequence:
 def route_drive(path: Path, seed: int) -> LidarSequence:
     """Simulates a town along a trajectory, and a drive through it; scans are simulated when they are first read.
 
-    Streets follow the trajectory, and the ground its slopes; all passes of a place have one height. The car drives in
-    its lane at constant speed and tilts with the ground; rotations and times of the file are ignored.
+    Streets follow the trajectory, and the ground follows its slopes. All passes of a place have one height. The car
+    drives in its lane at constant speed and tilts with the ground. Rotations and times of the file are ignored.
 
     Args:
         path: poses of a lidar or of a camera as TUM or KITTI, metres.
-        seed: of the town.
+        seed: seed of the town.
 
     Returns:
         The drive with exact poses and times.
 
     Raises:
-        InputError: no such poses, or a trajectory shorter than 20 m.
+        InputError: the poses do not exist, or the trajectory is shorter than 20 m.
     """
     T_world_lidar = io.read_lidar_trajectory(path)
     T_world_lidar[:, :3, 3] -= T_world_lidar[0, :3, 3]  # float32 holds no centimetres at the coordinates of a country
@@ -145,7 +146,7 @@ def keep_scans(drive: LidarSequence, folder: Path = RESULTS / "simulated") -> Li
 
     Args:
         drive: the drive; points within 128 m.
-        folder: a folder in it, named after the drive and its content, gets one file a scan.
+        folder: parent of the cache. A folder in it, named after the drive and its content, gets one file a scan.
 
     Returns:
         The same drive, with rounded points.
@@ -178,19 +179,19 @@ Source = Callable[[], LidarSequence]
 
 
 def open_with_poses(path: Path, name: str | None) -> LidarSequence:
-    """Opens a drive, or simulates a town along a file of poses; scans without a pose of its reference are left out."""
+    """Opens a drive, or simulates a town along a file of poses, and leaves out scans without a reference pose."""
     return with_reference_only(open_path(path, 0, sequence=name))
 
 
 def with_reference_only(drive: LidarSequence) -> LidarSequence:
-    """Leaves out the scans without a pose of the reference, where the drive has one."""
+    """Leaves out the scans without a reference pose, if the drive has a reference."""
     return drive if drive.T_world_lidar is None else drive.take(drive.has_reference)
 
 
 def find_sources(
     data: Sequence[str], towns: Sequence[Source], sampling: deeppointmap.SamplingConfig | None = None
 ) -> list[Source]:
-    """Returns the checked drives of the entries of a command line, with those of the towns for the entry `town`.
+    """Opens and checks the drives that a command line names; the entry `town` stands for all towns.
 
     Args:
         data: folders or files of poses, or `town` for the towns.
@@ -222,7 +223,7 @@ def find_sources(
 
 
 def check_names_differ(drives: Iterable[LidarSequence]) -> None:
-    """Raises a ValueError where two drives have the same name."""
+    """Raises a ValueError if two drives have the same name."""
     names = sorted(drive.name for drive in drives)
     if len(set(names)) < len(names):
         raise ValueError(f"two drives have the same name ({', '.join(names)}); evaluate them one by one")
@@ -261,7 +262,7 @@ class ScanReader:
         return slam.TimedScan(points, offsets)
 
     def _interval_s(self, index: int) -> float | None:
-        """Returns the time of the motion by which a scan is deskewed; None where it is unknown."""
+        """Returns the time of the motion by which a scan is deskewed; None if it is unknown."""
         times, last = self.sequence.times, max(index - 1, 1)
         if times is None or len(times) < 2:
             return None

@@ -7,11 +7,12 @@
 
 Random pairs of scans, 2 to 10 m (near) and 10 to 20 m (middle) apart, are registered, each scan turned by any yaw. A
 registration within 2 m and 5 degrees is right. Results go to results/evaluate/<time>/ (latest links to the newest).
-table.md has the shares that are right by the network alone, after the verification by the scans, and after the final
-alignment, with 95 % intervals, and the median errors of right ones. rows.csv has every pair. reliability.png shows the
-share of right registrations for each confidence, pairs more than 60 m apart (far) included. failures.png shows wrong
-registrations from above. The AUC of overlap compares pairs less than 20 m apart (revisits where the drive has some)
-with pairs more than 40 m apart; overlap.csv has that of the overlap head on the same pairs.
+The file table.md has the shares of right registrations, with 95 % intervals, and the median errors of right ones. It
+has them for the network alone, after the verification by the scans, and after the final alignment. The file rows.csv
+has every pair. The picture reliability.png shows the share of right registrations for each confidence, also for pairs
+more than 60 m apart (far). The picture failures.png shows wrong registrations from above. The AUC of overlap compares
+pairs less than 20 m apart (revisits, if the drive has any) with pairs more than 40 m apart. The file overlap.csv has
+the AUC of the overlap head on the same pairs.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class EvaluateOptions(cli.ModelOptions, cli.RunOptions):
     pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 15
     """Pairs for each distance."""
     num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1
-    """Number of towns, where town is among the data; a suburb first, then other kinds of place."""
+    """Number of towns, if town is among the data. The first one is a suburb; other kinds of place follow."""
 
     def __post_init__(self) -> None:
         """Checks bounds, and that there are data."""
@@ -105,7 +106,7 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> 
 
 
 class PairReader:
-    """Random pairs of scans of some drives, by the name of the drive, the band of distances and a number.
+    """Random pairs of scans of several drives. The keys are the drive's name, the band of distances and a number.
 
     Attributes:
         drawn: numbers of the two scans of each pair, by drive and band.
@@ -137,7 +138,7 @@ class PairReader:
 def fill_pairs(
     run: cli.Run, model: deeppointmap.Model, pairs: PairReader, matchers: Mapping[str, Matcher] = MappingProxyType({})
 ) -> list[cli.Row]:
-    """Fills rows.csv: errors of each pair after each stage, confidence and seconds, and those of further methods.
+    """Fills rows.csv with errors of each pair after each stage, confidence and seconds, also of further methods.
 
     Args:
         run: the open run.
@@ -178,7 +179,7 @@ def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.Sca
 def fill_overlap(
     run: cli.Run, model: deeppointmap.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int
 ) -> list[cli.Row]:
-    """Fills overlap.csv: AUC and Brier score of the overlap probability of each drive; None where it lacks pairs."""
+    """Fills overlap.csv with AUC and Brier score of the overlap probability of each drive; None without pairs."""
     by_name = {drive.name: drive for drive in drives}
 
     def work(drive: str) -> cli.Row:
@@ -199,7 +200,7 @@ def fill_overlap(
 def summarize_pairs(
     rows: Sequence[cli.Row], overlap: Sequence[cli.Row], methods: Sequence[str], columns: Sequence[str]
 ) -> list[cli.Row]:
-    """Returns the shares that are right and the median errors of right motions, by drive and band, and the AUC."""
+    """Returns the shares of right motions and their median errors, by drive and band, and the AUC."""
     auc = {row["drive"]: row["auc"] for row in overlap}
     errors = {f"{name}_m": f"{name}_right" for name in methods}
     of_right = [
@@ -210,7 +211,7 @@ def summarize_pairs(
 
 
 def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.Row:
-    """Returns the Brier score of the confidence, over all pairs and those of each band, and a verdict."""
+    """Returns the Brier scores of the confidence for all pairs and for each band, and a verdict."""
 
     def brier(some: Sequence[cli.Row]) -> float:
         confidence, is_right = (np.array([row[name] for row in some]) for name in ("confidence", "refined_right"))
@@ -229,7 +230,7 @@ def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.R
 def draw_evaluation(
     run: cli.Run, model: deeppointmap.Model, pairs: PairReader, rows: Sequence[cli.Row], title: str
 ) -> None:
-    """Draws reliability.png, and failures.png: wrong registrations of overlapping pairs of the highest confidence."""
+    """Draws reliability.png and failures.png: wrong registrations of overlapping pairs, with the highest confidence."""
     confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))
     viz.save_figure(viz.reliability_figure(confidence, is_right, title=f"{title}, all pairs"), run / "reliability.png")
     wrong = [row for row in rows if row["band"] != "far" and not row["refined_right"]]

@@ -1,7 +1,7 @@
 """Several drives or agents at once: processes of a cluster map them, and their maps are merged two by two.
 
-Dask gives the tasks of a worker that dies to another one, which goes on from the saved state of the drive. Ray would
-do so, too, but needs a running service on each machine, and is ten times as large.
+If a worker dies, Dask gives its tasks to another worker. This one continues from the saved state of the drive. Ray does
+so, too, but needs a running service on each machine, and is ten times as large.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dpmjax.sequences import counted
 
 
 class DrivePlan(NamedTuple):
-    """What each worker does.
+    """Settings that all workers share.
 
     Attributes:
         options: selection of the scans of a drive, and the weights.
@@ -42,7 +42,7 @@ class MappedAway(NamedTuple):
 
     Attributes:
         T_world_scan: (n, 4, 4) poses of its scans.
-        content: its map as an int8 file, as it travels.
+        content: its map as an int8 file, which the worker sends.
         seconds: time of the worker.
     """
 
@@ -55,10 +55,10 @@ def map_drives(client: Any, drives: Sequence[Path], plan: DrivePlan, run: Run) -
     """Maps drives, each on a worker, and merges their maps as a tree.
 
     Args:
-        client: of `distributed`.
+        client: client of `distributed`.
         drives: folders that every worker sees.
         plan: work on each.
-        run: folder of the results, that every worker sees, too.
+        run: folder of the results, which every worker sees, too.
 
     Returns:
         Numbers of the run.
@@ -98,7 +98,7 @@ def map_drives(client: Any, drives: Sequence[Path], plan: DrivePlan, run: Run) -
 
 
 def map_away(place: tuple[Path, Path], plan: DrivePlan) -> MappedAway:
-    """Maps a drive in its folder, from the state there where an earlier worker has left one."""
+    """Maps a drive in its folder, and continues from the state of an earlier worker if there is one."""
     began, (data, folder) = time.perf_counter(), place
     folder.mkdir(parents=True, exist_ok=True)
     name = plan.options.weights

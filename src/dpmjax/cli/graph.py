@@ -4,8 +4,8 @@
     dpmjax graph city.g2o --outlier-chi2 10       wrong edges are rejected (Geman-McClure)
     dpmjax graph edges.g2o --nearest-psd          mends information matrices that are not positive semidefinite
 
-The initial poses are those of the file or of the chordal relaxation, whichever have the lower cost; a file of edges
-alone gets poses along a spanning tree. Results go to results/graph/<time>/ (latest links to the newest): graph.g2o,
+The initial poses are those of the file or of the chordal relaxation, and the lower cost decides. A file of edges alone
+gets poses along a spanning tree. Results go to results/graph/<time>/ (latest links to the newest): graph.g2o,
 trajectory_tum.txt (stamps are the numbers of the nodes), metrics.json and trajectory.png.
 """
 
@@ -32,11 +32,11 @@ class GraphOptions(cli.OutputOptions):
     graph: Annotated[Positional[Path], arg(metavar="GRAPH")]
     """Pose graph, a file of g2o or TORO."""
     outlier_chi2: Annotated[float | None, arg(metavar="X"), cli.Bound(0, is_allowed=False)] = None
-    """The most that a contradicted edge costs; without it, all edges count fully."""
+    """Largest cost of a contradicted edge. Without it, all edges count fully."""
     nearest_psd: FlagCreatePairsOff[bool] = False
-    """Replace information matrices that are not positive semidefinite by the nearest ones that are."""
+    """Replace information matrices that are not positive semidefinite by the nearest positive semidefinite ones."""
     iterations: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 100
-    """At most N linear solves."""
+    """Largest number of linear solves."""
 
 
 def main(options: GraphOptions, run: cli.Run) -> cli.Numbers:

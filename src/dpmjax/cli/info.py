@@ -2,7 +2,7 @@
 
     dpmjax info
 
-A bug report begins with what this prints.
+Put this output at the beginning of a bug report.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def device_name() -> str | None:
 
 
 def git_hash() -> str | None:
-    """Returns the commit of this checkout, with `+changes` where it is not clean; None where it is installed."""
+    """Returns the commit of this checkout, with `+changes` if it is not clean; None for an installed package."""
     root = Path(__file__).parents[3]
     if not (root / "src" / "dpmjax").is_dir():  # a checkout around site-packages is another project's
         return None
@@ -130,16 +130,16 @@ def peak_rss_gb() -> float:
 
 
 def why_not_importable(module: str) -> str | None:
-    """Returns the reason why a module cannot be imported; None where it can.
+    """Returns the reason why a module cannot be imported; None if it can.
 
-    The module is imported, because an installed package may be broken. A missing library of the system, or a compiled
-    part for another version of NumPy, raises an error at the import only, and of any kind.
+    The module is imported, because an installed package may be broken. For example, a library of the system may be
+    missing, or a compiled part may be built for another version of NumPy. Only the import shows this, by any error.
 
     Args:
         module: name of a package or of a module in it.
 
     Returns:
-        One line: the package that is not installed and the command that installs it, or the error of the import.
+        One line: the missing package and the command that installs it, or the error of the import.
     """
     try:
         with warnings.catch_warnings():
@@ -156,6 +156,6 @@ def why_not_importable(module: str) -> str | None:
 
 
 def require_importable(module: str, option: str) -> None:
-    """Raises a ValueError that names the option, where a module that the option needs cannot be imported."""
+    """Raises a ValueError that names the option if its module cannot be imported."""
     if (reason := why_not_importable(module)) is not None:
         raise ValueError(f"{option}: {reason}")

@@ -1,13 +1,13 @@
-"""Finds single scans in a saved map without a first guess, or says that they are not in it.
+"""Finds single scans in a saved map without a first guess, or reports that they are not in it.
 
     dpmjax localize map.npz path/to/scans
     dpmjax localize map.npz path/to/scans --map-poses poses.txt    compare with a reference
     dpmjax localize --resume                                       go on where the last run stopped
 
-The map is a file of `dpmjax.save_map`, such as map.npz of `dpmjax slam`. Each scan is looked for by itself. Results go
-to results/localize/<time>/: localizations.csv (a row for each scan: status, pose, probability, reason),
-trajectory_tum.txt (the scans that were found), map.png, metrics.json. Errors are measured where the scans have
-reference poses and --map-poses gives those of the drive that made the map, in the same world.
+The map is a file of `dpmjax.save_map`, such as map.npz of `dpmjax slam`. Each scan is searched by itself. Results go to
+results/localize/<time>/: localizations.csv (a row for each scan: status, pose, probability, reason), trajectory_tum.txt
+(the scans that were found), map.png, metrics.json. To measure errors, the scans need reference poses, and --map-poses
+must give the reference poses of the drive that made the map. Both must be in the same world.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class LocalizeOptions(cli.DriveOptions):
     scans: Annotated[Positional[Path], arg(metavar="SCANS", help_behavior_hint="required")] = Path()
     """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
-    """Which drive of a folder that holds several."""
+    """Name of the drive, if the folder holds several."""
     map_poses: Annotated[Path | None, arg(metavar="FILE")] = None
     """Reference poses of all scans of the drive that made the map, in the world of the scans' reference."""
 
@@ -60,7 +60,7 @@ class Case(NamedTuple):
         slam_map: the map.
         drive: the scans.
         T_reference_keyframe: (k, 4, 4) reference poses of the keyframes; None without a reference.
-        is_calibrated: True where the probabilities are calibrated; else they are scores of the matches.
+        is_calibrated: True for calibrated probabilities; False for scores of the matches.
     """
 
     slam_map: slam.KeyframeMap
@@ -92,7 +92,7 @@ def main(options: LocalizeOptions, run: cli.Run) -> cli.Numbers:
 
 
 def reference_of(options: LocalizeOptions, slam_map: slam.KeyframeMap, drive: LidarSequence) -> np.ndarray | None:
-    """Returns the reference poses of the keyframes; raises a `ValueError` where they cannot be used."""
+    """Returns the reference poses of the keyframes; raises a `ValueError` if they cannot be used."""
     if options.map_poses is None:
         return None
     if drive.T_world_lidar is None:
@@ -105,7 +105,7 @@ def reference_of(options: LocalizeOptions, slam_map: slam.KeyframeMap, drive: Li
 
 
 def _check_map_poses(path: Path, reference: np.ndarray, slam_map: slam.KeyframeMap) -> None:
-    """Raises a `ValueError` where the motions between keyframes are not those of the map."""
+    """Raises a `ValueError` if the motions between keyframes are not those of the map."""
     edges = slam_map.edges_of("odometry")
     if not edges:
         return
@@ -120,7 +120,7 @@ def _check_map_poses(path: Path, reference: np.ndarray, slam_map: slam.KeyframeM
 
 
 def as_row(case: Case, result: slam.Localization, seconds: float) -> cli.Row:
-    """Returns the cells of a scan; those of a pose are empty where it was not found."""
+    """Returns the cells of a scan; the cells of the pose are empty if the scan was not found."""
     row = dict.fromkeys(COLUMNS) | {name: getattr(result, name) for name in ("status", "probability", "reason")}
     row["seconds"] = seconds
     if result.T_world_scan is None or result.keyframe is None:

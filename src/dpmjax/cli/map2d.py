@@ -9,10 +9,12 @@
     dpmjax map2d --resume                     continue the latest run
 
 Results go to results/map2d/<time>/ (latest links to the newest): metrics.json, trajectories as TUM, KITTI and
-npy, and pictures: map.png, occupancy.png, loss.png. Without --init the start is the odometry, where there is one, else
-incremental point-to-line ICP. There are four candidates: the start and DeepMapping, each with and without refinement.
-The one whose map fits the beams best is kept, chosen without ground truth; metrics.json and map.png name it. Of a whole
-recording, scans half a metre or 20 degrees apart are registered, and all others follow the odometry between them.
+npy, and pictures: map.png, occupancy.png, loss.png.
+
+Without --init, the start is the odometry. If there is none, it is incremental point-to-line ICP. There are four
+candidates: the start and DeepMapping, each with and without refinement. The candidate whose map fits the beams best is
+kept, without ground truth. The files metrics.json and map.png name it. In a whole recording, only scans half a metre or
+20 degrees apart are registered. The scans between them follow the odometry.
 """
 
 from __future__ import annotations
@@ -50,26 +52,26 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"seconds"})
 
     data: Annotated[Positional[Path | None], arg(metavar="[DATA]")] = None
-    """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Without it: the built-in world."""
+    """Scans: a folder or .tar of .pcd, a CARMEN log, a bag of ROS, .npy or .npz. Default: the built-in world."""
     topic: Annotated[str | None, arg(aliases=["-t"], metavar="NAME")] = None
-    """Which scans of a bag, where it holds several topics of them."""
+    """Topic of the scans, if a bag holds several."""
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
-    """Where the poses start; auto: odometry if there is any, else icp-plane; if the map from odometry cannot be
-    trusted, icp-plane is tried, too; global: exhaustive search of scan pairs, needs no guess; FILE: poses (TUM, KITTI,
-    or x y theta)."""
+    """Initial poses. auto: odometry if there is any, else icp-plane. If the map from odometry cannot be trusted,
+    icp-plane is tried, too. global: exhaustive search of scan pairs, without a first guess. FILE: poses (TUM, KITTI, or
+    x y theta)."""
     ordered: bool = True
-    """Scans lie in the order of time; --no-ordered makes no use of it, and needs --init global."""
+    """Scans are in time order. --no-ordered ignores the order, and needs --init global."""
     refine: bool = True
     """Also align all scans together, point to line, from the start and from the fit."""
     steps: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
-    """Stop after N steps, rounded up to whole calls of the compiled program; without it, the preset decides."""
+    """Stop after N steps, rounded up to whole calls of the compiled program. Without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
-    """Stop the fit after S seconds of run time, compile time not counted."""
+    """Stop the fit after S seconds of run time, without compile time."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
-    """Which built-in world, where no DATA is given: three with walls; grove: trees, bushes and rocks, no straight wall;
-    crowd: an office in which people walk about."""
+    """Built-in world, if no DATA is given. The numbered worlds have walls. grove: trees, bushes and rocks, no straight
+    wall. crowd: an office with walking people."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 
@@ -111,7 +113,7 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
-    """Registers the scans, with the recorder as engine of the fit, and prints each stage and a bar of all."""
+    """Registers the scans with the recorder as engine of the fit, and prints each stage and one bar."""
     import jax
 
     bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}]", desc="registration")
@@ -181,7 +183,7 @@ def read_scans(options: Map2dOptions) -> ScanSequence:
 
 
 def starting_poses(options: Map2dOptions, sequence: ScanSequence) -> str | FloatArray:
-    """Returns the name of the initial poses, or the poses of the file that `--init` names, for all scans."""
+    """Returns the name of the initial poses, or the poses of the file of `--init` for all scans."""
     init = options.init
     if init == "odometry" and sequence.odometry_poses is None:
         raise ValueError(
@@ -216,7 +218,7 @@ def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.D
 
 
 def ate_of(sequence: ScanSequence, unit: float) -> Callable[[FloatArray], float]:
-    """Returns a function to the ATE of poses whose lengths are multiples of `unit`; NaN without a reference."""
+    """Returns a function that computes the ATE of poses with lengths in `unit`; NaN without a reference."""
     reference = sequence.reference_poses
     if reference is None:
         return lambda _: math.nan
@@ -241,13 +243,13 @@ def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArra
 
 
 def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
-    """Returns errors under their names for the initial poses, such as ate_initial_m for ate_m; counts are left out."""
+    """Renames errors for the initial poses, such as ate_m to ate_initial_m, and leaves out counts."""
     errors = {name: value for name, value in numbers.items() if not name.startswith("num_")}
     return {"_initial_".join(name.rsplit("_", 1)): value for name, value in errors.items()}
 
 
 def trust_verdict(assessment: Mapping[str, Any]) -> str:
-    """Returns whether the map can be trusted, why, the fault of the odometry, and the uncertain scans."""
+    """Returns the verdict on trust with its reason, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
     weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     # Near zero the difference of two shares has either sign.
@@ -269,7 +271,7 @@ def spans_of(rows: Sequence[int]) -> list[str]:
 
 
 def report(unit: str, numbers: Mapping[str, Any]) -> str:
-    """Returns errors and scores of each candidate, which one was kept, and errors against further references."""
+    """Returns errors and scores of each candidate, the kept candidate, and errors against further references."""
     candidates = numbers["candidates"]
     width = max(map(len, candidates))
     has_ate = all(f"ate_{unit}" in found for found in candidates.values())
@@ -295,7 +297,7 @@ def scan_set_of(sequence: ScanSequence) -> ScanSet:
 def draw_map(
     run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
 ) -> viz.Limits:
-    """Draws map.png: the start, DeepMapping if it was trained, the kept one, the reference; returns its limits."""
+    """Draws map.png: the start, DeepMapping if it was trained, the kept map, the reference. Returns its limits."""
     scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
     poses, anchor = {}, None
     titles = dict(zip(result.candidates, numbers["candidates"], strict=True))

@@ -1,4 +1,4 @@
-"""Merges saved maps into one where they show the same places (DeepPointMap, section 4).
+"""Merges saved maps into one if they show common places (DeepPointMap, section 4).
 
     dpmjax merge monday/map.npz tuesday/map.npz -o both
     dpmjax merge robot_1.npz robot_2.npz robot_3.npz
@@ -9,8 +9,8 @@ them are found by the appearance of places; no position is needed. A merged map 
 
 Results go to results/merge/<time>/ (latest links to the newest): map.npz, loops.csv, graph.g2o, metrics.json and
 map.png. The file loops.csv has each candidate of a loop between two maps and its outcome. The picture map.png shows all
-maps from above, each in its colour, with the loops. Where some maps show no common place, the maps are map_1.npz,
-map_2.npz and so on.
+maps from above, each in its colour, with the loops. Maps without a common place stay separate, as map_1.npz, map_2.npz
+and so on.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def layers_of(path: Path, merged: slam.MergedMaps, number: int) -> list[viz.Laye
 
 
 def merge_text(metrics: cli.Numbers) -> str:
-    """Returns the verdict: what has become of each map."""
+    """Returns the verdict: one phrase for each part, with the maps in it."""
     names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
     texts = [
         f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"

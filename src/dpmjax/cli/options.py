@@ -1,4 +1,4 @@
-"""Options of commands: those that several share, the parser, and checks of ranges and names."""
+"""Options of commands: common options, the parser, and checks of ranges and names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 
 class Bound(NamedTuple):
-    """The least value of an option that is a number, or of each of its numbers; it stands in the option's type.
+    """The least value of a number option, or of each number of a list option; it stands in the option's type.
 
     Attributes:
         least: the value.
@@ -43,9 +43,9 @@ class OutputOptions:
     output: Annotated[Path | None, arg(aliases=["-o"], metavar="OUT")] = None
     """Folder for the results, instead of results/<command>/<time>."""
     force: FlagCreatePairsOff[bool] = False
-    """Replace OUT and everything in it, where it holds an earlier run."""
+    """Replace OUT and everything in it, if it holds an earlier run."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Where to compute; without it, JAX chooses."""
+    """Device for the computation. Without it, JAX chooses."""
 
     def __post_init__(self) -> None:
         """Checks the bounds of all options."""
@@ -66,9 +66,10 @@ class RunOptions(OutputOptions):
     may_change: ClassVar[frozenset[str]] = frozenset()
 
     seed: Annotated[int, Bound(0)] = 0
-    """Seed of everything random."""
+    """Seed of all random numbers."""
     resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run, the latest or that in OUT; options not given are the same as then."""
+    """Continue an interrupted run: the latest one, or the one in OUT. Options that you do not give keep
+    their earlier values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +77,7 @@ class ScanOptions:
     """Options of every command that reads scans or images in a row."""
 
     n_scans: Annotated[int | None, arg(aliases=["-n"], metavar="N"), Bound(1)] = None
-    """Use the first N scans, after --jump; without it, all."""
+    """Use the first N scans, after --jump. Without it, all."""
     jump: Annotated[int, arg(aliases=["-j"], metavar="N"), Bound(1)] = 1
     """Use every Nth scan."""
 
@@ -91,7 +92,7 @@ class ModelOptions:
     """Options of every command that uses trained weights."""
 
     weights: Annotated[str, arg(metavar="NAME|FILE")] = "dpm_small"
-    """Name of a shipped model, or a .safetensors file; a saved map needs the weights that made it."""
+    """Name of a shipped model, or a .safetensors file. A saved map needs the weights that made it."""
 
 
 def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -> Any:
@@ -131,7 +132,7 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
 
 
 def check_names(option: str, names: Sequence[str], allowed: Iterable[str]) -> None:
-    """Raises a ValueError where a name is not allowed, or no name is given."""
+    """Raises a ValueError if a name is not allowed, or if no name is given."""
     unknown = [name for name in names if name not in allowed]
     if unknown or not names:
         raise ValueError(f"{option}: expected some of {', '.join(allowed)}, got {', '.join(unknown) or 'none'}")

@@ -1,4 +1,4 @@
-"""The program `dpmjax`: loads and runs the subcommand only."""
+"""The program `dpmjax`: loads and runs only the subcommand."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def run() -> NoReturn:
 def end_process(exit_code: int) -> NoReturn:
     """Ends the process; after a signal at once.
 
-    A stopped process may leave a compilation in a thread of XLA, which Python's orderly end waits for and crashes.
+    A stopped process may leave a compilation in a thread of XLA. Python's orderly end would wait for it and crash.
 
     Args:
         exit_code: exit code; after a stop, `EXIT_BY_SIGNAL` and the number of the signal.

@@ -1,6 +1,6 @@
 """Registers two 3-D lidar scans without a first guess (DeepPointMap): the motion and the probability that it is right.
 
-    dpmjax register a.pcd b.pcd                   where points of a lie in the frame of b
+    dpmjax register a.pcd b.pcd                   the points of a in the frame of b
     dpmjax register 000000.bin 000010.bin -o out  KITTI's files
     dpmjax register a.npy b.ply --no-refine       without the final point-to-plane alignment
 
@@ -36,9 +36,9 @@ class RegisterOptions(cli.ModelOptions, cli.OutputOptions):
     source: Annotated[Positional[Path], arg(metavar="A")]
     """Scan whose points are moved."""
     target: Annotated[Positional[Path], arg(metavar="B")]
-    """Scan in whose frame they end."""
+    """Scan that gives the frame of the result."""
     columns: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
-    """Numbers a point has in .bin files (4: KITTI, 5: nuScenes); without it, the values decide."""
+    """Number of values of each point in .bin files (4: KITTI, 5: nuScenes). Without it, the values decide."""
     refine: bool = True
     """End with a fine point-to-plane alignment."""
 
@@ -58,7 +58,7 @@ def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     points = np.concatenate([source @ T[:3, :3].T + T[:3, 3], target])
     colors = np.repeat(np.array([SOURCE_COLOR, TARGET_COLOR], np.uint8), [len(source), len(target)], axis=0)
     io.write_ply(run / "aligned.ply", points, colors=colors)
-    # Files of the same name are told apart by their folders.
+    # Files of the same name are shown with their folders.
     num_parts = 1 if options.source.name != options.target.name else 2
     files = (str(Path(*options.source.parts[-num_parts:])), str(Path(*options.target.parts[-num_parts:])))
     is_calibrated = model.config.calibration is not None

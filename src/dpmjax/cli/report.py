@@ -28,11 +28,11 @@ table {{display: block; overflow-x: auto}}
 
 
 def write_report(folder: Path, read_table: ReadTable) -> Path:
-    """Writes the page from the files of a finished run: verdict, map, pictures, decisions, numbers.
+    """Writes the page of a finished run from its files: verdict, map, pictures, decisions, numbers.
 
     Args:
         folder: folder of the run, with `metrics.json`.
-        read_table: called with the name of a table in it; returns its rows, none where there is no table.
+        read_table: called with the name of a table in the folder; returns its rows, none if there is no table.
 
     Returns:
         The page.

@@ -67,11 +67,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Run:
-    """The folder of one run, and the wish to stop it.
+    """The folder of one run, and its stop by signals.
 
     Attributes:
         path: the folder; it exists after `open`.
-        is_resumed: True where an earlier run is continued.
+        is_resumed: True if an earlier run is continued.
     """
 
     def __init__(self, name: str, options: Any) -> None:
@@ -109,16 +109,16 @@ class Run:
 
     @property
     def is_stopped(self) -> bool:
-        """Returns True after the first signal or failure: what is done is written, and the run ends."""
+        """Returns True after the first signal or failure: the run writes its results and ends."""
         return bool(self._stops)
 
     def check_stop(self) -> None:
-        """Ends the run after a signal, in the middle of work of which nothing can be kept."""
+        """Ends the run after a signal, in the middle of work whose results cannot be kept."""
         if self._stops:
             raise self._stops[0]
 
     def fail(self, error: Exception) -> None:
-        """Stops the run as a signal does: what is done is written before the error ends the command."""
+        """Stops the run as a signal does: the run writes its results before the error ends the command."""
         self._stops.append(error)
 
     def open(self, notes: Iterable[Note] = ()) -> None:
@@ -167,7 +167,7 @@ class Run:
         self._handler = self._lock = None
 
     def part(self, *names: str) -> Run:
-        """Makes a folder inside, such as that of one drive, or continues in it; a signal stops both."""
+        """Makes or continues a folder inside, such as one for a drive; a signal stops both runs."""
         part = object.__new__(Run)
         part.__dict__ |= self.__dict__
         part.path, part.is_resumed = self.path.joinpath(*names), True
@@ -187,7 +187,7 @@ class Run:
         write_json(self / METRICS, {**numbers, "status": status, **after})
 
     def read_table(self, name: str) -> list[dict[str, str]]:
-        """Reads the rows of a table, without a last line that a crash has cut off; none where there is no table."""
+        """Reads the rows of a table, without a last line that a crash has cut off; none if there is no table."""
         path = self / name
         text = path.read_text(encoding="utf-8", errors="surrogateescape") if path.exists() else ""
         return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
@@ -207,7 +207,7 @@ class Run:
         return rows
 
     def append_row(self, name: str, **row: object) -> None:
-        """Adds a row to a table, whose columns are those of its first row; a column that is not given stays empty."""
+        """Adds a row to a table. The first row defines the columns; a missing column stays empty."""
         path = self / name
         is_new = not path.exists()
         with path.open("a+", newline="", encoding="utf-8", errors="surrogateescape") as file:
@@ -235,9 +235,9 @@ def run_command(
     was opened, or numbers with the status "failed". Codes 130 and 143 are stops by Ctrl-C or SIGTERM, with results.
 
     Args:
-        main: takes the options, a frozen dataclass by its annotation, and the run; returns the numbers of
-            `metrics.json`, among them `verdict`, one sentence, and `status` if it is not "done".
-        name: name of the subcommand of `dpmjax`, or of the module in `experiments`; and of the folder in `results`.
+        main: takes the options and the run. Its annotation names the frozen dataclass of the options. It returns the
+            numbers of `metrics.json`, with `verdict`, one sentence, and with `status` if that is not "done".
+        name: name of the subcommand of `dpmjax` or of the module in `experiments`, and of the folder in `results`.
         description: the module's docstring; `--help` begins with it.
         args: the command line; None takes that of the process.
 
@@ -278,7 +278,7 @@ def run_experiment(main: Callable[[Any, Run], Numbers]) -> NoReturn:
 
 
 def _finish(run: Run, numbers: Numbers) -> int:
-    """Writes the numbers, and says the verdict and where the results are."""
+    """Writes the numbers, and prints the verdict and the folder of the results."""
     if run.is_open:
         run.write_numbers(numbers)
     has_failed = numbers.get("status") == "failed" and not run.is_stopped
@@ -292,7 +292,7 @@ def _finish(run: Run, numbers: Numbers) -> int:
 
 
 def _explain(error: Exception, run: Run | None) -> int:
-    """Says in one line what went wrong, after the traceback where the program is at fault."""
+    """Prints the error in one line, after the traceback if the program is at fault."""
     text, code = f"{type(error).__name__}: {error}", EXIT_FAILED
     if run is not None and run.is_open:
         LOGGER.info("failed", exc_info=error)
@@ -319,7 +319,7 @@ def _say(message: str, exit_code: int) -> int:
 
 
 def _read_options(main: Callable[..., Numbers], name: str, description: str | None, arguments: list[str]) -> Any:
-    """Returns the options of the command line, with those of the earlier run where it is resumed."""
+    """Returns the options of the command line, with those of the earlier run if it is resumed."""
     options_type = get_type_hints(main)["options"]
     prog = f"dpmjax {name}" if name in program.COMMANDS else f"python -m experiments.{name}"
     options = parse_options(options_type, arguments, prog=prog, description=description)

@@ -1,4 +1,4 @@
-"""The folder of a run: found, refused before any work, named by `latest`, locked; and its files of common formats."""
+"""The folder of a run: finds it, refuses it before any work, links `latest` to it, locks it, and writes its files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def load_options(path: Path, options_type: Any) -> Any:
         The options.
 
     Raises:
-        ValueError: its `config.json` holds an option that `options_type` does not have, or is no JSON.
+        ValueError: its `config.json` is no JSON, or has an option that `options_type` lacks.
     """
     from dpmjax.weights.config_json import config_from_json
 
@@ -68,7 +68,7 @@ def find_run(name: str, output: Path | None) -> Path:
 
 
 def check_same_options(path: Path, options: Any) -> None:
-    """Raises a ValueError where a resumed run would have other options than the earlier one."""
+    """Raises a ValueError if a resumed run would have other options than the earlier one."""
     if options.force:
         raise ValueError("--resume continues a run and --force starts it over: give one of them")
     stored, now = load_json(path / CONFIG), as_json(options)
@@ -82,7 +82,7 @@ def check_same_options(path: Path, options: Any) -> None:
 
 
 def check_replaceable(path: Path, options: Any) -> None:
-    """Raises a ValueError for a folder that cannot be written, is not empty, or that --force must not remove."""
+    """Raises a ValueError for a folder that is not writable or not empty, or that --force must not remove."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise ValueError(cannot_write(path, "permission denied" if existing.is_dir() else f"{existing} is a file"))
@@ -106,7 +106,7 @@ def cannot_write(path: Path, reason: str) -> str:
 
 
 def make_latest(path: Path) -> Path:
-    """Makes a new folder, and lets the link `latest` beside it point there."""
+    """Makes a new folder, and points the link `latest` beside it there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names = itertools.chain([path.name], (f"{path.name}_{number}" for number in itertools.count(2)))
     path = next(new for new in map(path.with_name, names) if not new.exists())
@@ -118,7 +118,7 @@ def make_latest(path: Path) -> Path:
 
 
 def lock_folder(path: Path) -> int | None:
-    """Keeps other processes out of a folder, where the system can lock folders."""
+    """Keeps other processes out of a folder, if the system can lock folders."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -166,7 +166,7 @@ def as_json(value: Any) -> Any:
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes a CSV file atomically: these columns, numbers with six digits, truth values as 0 and 1, None as empty."""
+    """Writes these columns as CSV, atomically: numbers with six digits, truth values as 0 and 1, None as empty."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -196,7 +196,7 @@ def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum
 
 @contextmanager
 def counting_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Shows a bar while the block runs; yields a callback with the number of finished items and of all.
+    """Shows a bar while the block runs; yields a callback that takes the numbers of finished and of all items.
 
     Args:
         description: shown before the bar.

@@ -39,18 +39,18 @@ class SlamOptions(cli.DriveOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans"})
 
     data: Annotated[Positional[tuple[Path, ...]], arg(metavar="[DATA ...]")] = ()
-    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Without it: any town. Several
-    with --cluster."""
+    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Default: a simulated town. Give
+    several with --cluster."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
-    """Which drive, where DATA holds several."""
+    """Name of the drive, if DATA holds several."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
     """A saved map (map.npz of an earlier run) that this drive extends."""
     preset: Literal["default", "paper"] = "default"
-    """Settings of SLAM: the default ones, or the paper's own method, by the decoder alone."""
+    """Settings of SLAM: the default, or the method of the paper, by the decoder alone."""
     odometry: Annotated[str | None, arg(metavar="prediction|network|FILE")] = None
-    """Source of the first guess of a pose: the motion of before, the network for every scan, or the robot's own
-    odometry, poses by time (TUM) or one a scan; those of the robot's frame with --base-from-lidar. Without it, the
-    preset decides."""
+    """Source of the first guess of a pose: the previous motion, the network for every scan, or a file of odometry. The
+    file has poses by time (TUM), or one pose for each scan. Poses of the robot's frame need --base-from-lidar. Without
+    it, the preset decides."""
     max_rmse: float | None = None
     """With --preset paper: largest error of an accepted registration, metres. The published 0.5 needs a decoder with
     exact offsets; 2.5 suits dpm_small."""
@@ -59,13 +59,13 @@ class SlamOptions(cli.DriveOptions):
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     base_from_lidar: Annotated[tuple[float, ...], arg(metavar="X Y Z QX QY QZ QW")] = ()
-    """Pose of the lidar in the frame of the robot, metres and a quaternion, as of ROS: the trajectory of the robot is
-    written too, as trajectory_base."""
+    """Pose of the lidar in the frame of the robot, metres and a quaternion, as of ROS. The run then also writes the
+    trajectory of the robot, as trajectory_base."""
     cluster: Annotated[str | None, arg(metavar="local|HOST:PORT")] = None
-    """Map each of several drives on a worker of this Dask cluster (extra cluster), and merge their maps; local: as many
-    processes here as there are drives, at most one a core."""
+    """Map each of several drives on a worker of this Dask cluster (extra cluster), and merge their maps. local: one
+    process here for each drive, at most one a core."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
-    """Show the run in the live viewer (extra viewer); without a screen, OUT gets a recording, slam.rrd."""
+    """Show the run in the live viewer (extra viewer). Without a screen, OUT gets a recording, slam.rrd."""
 
     def __post_init__(self) -> None:
         """Checks ranges."""
@@ -86,7 +86,7 @@ class SlamOptions(cli.DriveOptions):
 
     @property
     def T_base_lidar(self) -> np.ndarray | None:
-        """Pose of the lidar in the frame of the robot; None where it was not given."""
+        """Pose of the lidar in the frame of the robot; None if it was not given."""
         if not self.base_from_lidar:
             return None
         from scipy.spatial.transform import Rotation
@@ -177,7 +177,7 @@ def slam_methods(options: SlamOptions) -> slam.SlamMethods:
 
 
 def odometry_of(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarray | None, tuple[Note, ...]]:
-    """Returns poses of the lidar by the odometry of --odometry FILE, None without a file; and notes."""
+    """Returns poses of the lidar from --odometry FILE (None without a file), and notes."""
     if options.odometry is None or options.odometry in PROPOSERS:
         return None, ()
     poses, notes = io.read_odometry(options.odometry, sequence)
@@ -187,11 +187,11 @@ def odometry_of(options: SlamOptions, sequence: LidarSequence) -> tuple[np.ndarr
 def write_map_results(
     run: cli.Run, sequence: LidarSequence, start: slam.SlamState, result: slam.SlamResult, numbers: cli.Numbers
 ) -> cli.Numbers:
-    """Writes all files but metrics.json, and returns further numbers of it; pictures come last."""
+    """Writes all files except metrics.json, pictures last, and returns further numbers for it."""
     slam_map, num_before = result.map, len(start.slam_map)
 
     def read_keyframe(row: int) -> np.ndarray:
-        """Reads the points of a keyframe; those of the extended map are the points of its surface."""
+        """Reads the points of a keyframe; a keyframe of the extended map has only the points of its surface."""
         if row < num_before:
             return slam.keyframe_points(slam_map, row)
         return sequence.read_points(slam_map.keyframes[row].scan - start.front_end.num_scans)

@@ -1,4 +1,4 @@
-"""Results of SLAM: files, pictures, and numbers with status and verdict; and the reading of saved maps."""
+"""Results of SLAM: files, pictures, and numbers with status and verdict. Saved maps are read here, too."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Cloud(NamedTuple):
     Attributes:
         points: (n, 3) in the world, m.
         heights_m: (n,) heights above the lidar that measured the point.
-        voxel_m: one point was kept in each voxel of this side.
+        voxel_m: side of a voxel; each voxel has one point.
     """
 
     points: np.ndarray
@@ -62,7 +62,7 @@ def write_graph(folder: Path, result: slam.SlamResult) -> None:
 
 
 def odometry_numbers(odometry: np.ndarray, sequence: LidarSequence, result: slam.SlamResult, run: Run) -> Numbers:
-    """Returns how far the given odometry is from the result, and says it; stamps that are late or early are named."""
+    """Returns and prints the errors of the given odometry against the result, and the delay of its stamps."""
     found = slam.compare_odometry(odometry, result.T_world_scan)
     text = f"odometry: {found.step_m:.2g} m off a step in the median"
     if found.delay_scans:
@@ -77,12 +77,12 @@ def odometry_numbers(odometry: np.ndarray, sequence: LidarSequence, result: slam
 
 
 def write_loops(path: Path, loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> None:
-    """Writes every candidate of a loop: its two keyframes, its source and outcome, and the numbers of that.
+    """Writes every candidate of a loop: its two keyframes, its source, its outcome, and the numbers behind it.
 
     Args:
         path: the file.
         loops: the candidates.
-        ends: cells of each keyframe, in the order of the rows of the map; names of the target begin with `other_`.
+        ends: cells of each keyframe, in the order of the map. Columns of the target begin with `other_`.
     """
     others = [{f"other_{name}": cell for name, cell in end.items()} for end in ends]
     rows = [{**ends[loop.source], **others[loop.target], **loop._asdict(), "rmse_m": loop.rmse} for loop in loops]
@@ -108,7 +108,7 @@ def accepted_ends(loops: Sequence[slam.Loop]) -> np.ndarray:
 
 
 def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray]) -> Cloud:
-    """Transforms scans to the world frame with one point for each voxel; larger maps have larger voxels.
+    """Transforms scans to the world frame and keeps one point for each voxel; larger maps have larger voxels.
 
     Args:
         T_world_scan: (n, 4, 4) poses.
@@ -185,7 +185,7 @@ def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
         The map.
 
     Raises:
-        ValueError: no such file, no map, or a map of other weights.
+        ValueError: the file does not exist, is no map, or is a map of other weights.
     """
     slam_map = saved_maps.load_map(path)
     require_same_weights(path, slam_map, methods, "name the weights that made it with --weights")
@@ -193,7 +193,7 @@ def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
 
 
 def require_same_weights(path: Path, slam_map: slam.KeyframeMap, methods: slam.SlamMethods, advice: str) -> None:
-    """Raises a ValueError with the advice where other weights than those of the methods made a map."""
+    """Raises a ValueError with advice if other weights than those of the methods made a map."""
     made_by, given = slam_map.origin, methods.origin
     if made_by is not None and made_by.fingerprint != given.fingerprint:
         raise ValueError(f"{path}: made with weights {made_by}, these are {given}; {advice}")
@@ -204,9 +204,9 @@ class LocalizationErrors(NamedTuple):
 
     Attributes:
         is_found: (n,) bool.
-        is_right: (n,) True where the scan was found within 2 m and 5 degrees.
-        translation_m: (n,) NaN where it was not found.
-        rotation_deg: (n,) NaN where it was not found.
+        is_right: (n,) True for scans that were found within 2 m and 5 degrees.
+        translation_m: (n,) NaN for scans that were not found.
+        rotation_deg: (n,) NaN for scans that were not found.
         keyframe_distance_m: (n,) distance of the true position to the nearest keyframe.
     """
 
@@ -270,7 +270,7 @@ def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
 
 
 def why_failed(statuses: Mapping[str, int]) -> str | None:
-    """Returns the reason why a finished run has no result; None where it has one.
+    """Returns the reason why a finished run has no result; None if it has one.
 
     Args:
         statuses: number of scans by status.
@@ -294,8 +294,9 @@ def status_of(numbers: Numbers) -> str:
         numbers: of the run.
 
     Returns:
-        done; uncertain: more than one scan and a tenth of all were not aligned in all directions, or no loop joins all
-        parts of the map; failed: none aligned.
+        "done", "uncertain" or "failed". A run is uncertain if more than one scan and more than a tenth of all scans
+        were not aligned in all directions. It is also uncertain if no loop joins all parts of the map. It failed if no
+        scan was aligned.
     """
     statuses = numbers["scan_statuses"]
     if why_failed(statuses) is not None:
@@ -313,7 +314,7 @@ def count_parts(slam_map: slam.KeyframeMap) -> int:
 
 
 def verdict_of(numbers: Numbers) -> str:
-    """Returns what was mapped, and what is uncertain or wrong about it."""
+    """Returns the verdict: the size of the map, and its uncertain or wrong parts."""
     if (reason := why_failed(numbers["scan_statuses"])) is not None:
         return f"{reason}: check that the scans are 3-D, in metres, and follow each other"
     counts = (("scan", "num_scans"), ("keyframe", "num_new_keyframes"), ("loop closure", "num_loops"))

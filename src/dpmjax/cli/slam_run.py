@@ -22,12 +22,12 @@ from dpmjax.sequences import LidarSequence, counted
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
 SAVE_EVERY_S = 10.0
-# A scan as it was read, and as it is placed.
+# A scan from its file, and the same scan prepared for SLAM.
 _Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
 
 
 class DriveFolder(NamedTuple):
-    """Folder of a drive that is mapped without a run of its own; no signal stops it."""
+    """Folder of a drive without a run of its own; no signal stops its mapping."""
 
     path: Path
     is_stopped: bool = False
@@ -36,7 +36,7 @@ class DriveFolder(NamedTuple):
         return self.path / name
 
     def fail(self, error: Exception) -> None:
-        """Raises the error: the worker gives it back."""
+        """Raises the error, which the worker sends back."""
         raise error
 
 
@@ -116,7 +116,7 @@ def run_scans(
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
         viewer: shows the run.
-        odometry: (n, 4, 4) poses of the lidar, the first guesses; None without them.
+        odometry: (n, 4, 4) poses of the lidar, as first guesses; None without odometry.
 
     Returns:
         The run.

@@ -21,13 +21,13 @@ Row = dict[str, Any]
 
 
 def fill_table(run: Run, cases: Iterable[Row], work: Callable[..., Row | None], name: str = "rows.csv") -> list[Row]:
-    """Computes the rows of a table that are missing; each one is in the file as soon as it is computed.
+    """Computes the missing rows of a table, and writes each row at once.
 
     Args:
         run: the open run.
         cases: entries that identify each row, the same names in each.
-        work: makes the remaining entries of a row, the same names in each, from those of its case as keywords; None
-            where a signal has stopped it before its end.
+        work: called with the entries of a case as keywords. It returns the remaining entries of the row, with the same
+            names in each row; or None after a signal.
         name: the file.
 
     Returns:
@@ -37,7 +37,7 @@ def fill_table(run: Run, cases: Iterable[Row], work: Callable[..., Row | None], 
     cases, commit = list(cases), git_hash() or "unknown"
 
     def key(row: Row) -> tuple[str, ...]:
-        """Returns what identifies a row, as it stands in the file."""
+        """Returns the identity of a row, in the form of the file."""
         return tuple(str(row[column]) for column in cases[0])
 
     done = {key(row) for row in run.continue_table(name)}
@@ -57,7 +57,7 @@ def summarize(rows: Iterable[Row], by: Sequence[str], columns: Sequence[str]) ->
     Args:
         rows: from `fill_table`.
         by: columns whose values make the groups.
-        columns: columns to summarize; their empty cells are left out.
+        columns: columns to summarize, without their empty cells.
 
     Returns:
         A row for each group: its values, the number of its rows, medians of numbers, and shares of truth values with
@@ -103,7 +103,7 @@ def write_summary(run: Run, summary: Sequence[Row], *notes: str, name: str = "ta
 
 
 def format_table(rows: Sequence[Row]) -> str:
-    """Returns rows as Markdown; numbers have four digits, a share stands with its interval, None is a dash."""
+    """Returns rows as Markdown. Numbers have four digits, a share has its interval, None is a dash."""
     if not rows:
         return "no row is finished"
     columns = [name for name in rows[0] if not name.endswith(("_low", "_high"))]
@@ -122,7 +122,7 @@ def _cell(row: Row, column: str) -> str:
 
 
 def _parse(text: str) -> Any:
-    """Returns the value of a cell; None for an empty one and for NaN, and text where a number is written otherwise."""
+    """Returns the value of a cell: None for an empty one and for NaN, else a number if Python writes it so, or text."""
     if text in ("", "nan", "True", "False"):
         return {"True": True, "False": False}.get(text)
     for kind in (int, float):

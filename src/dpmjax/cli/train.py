@@ -13,9 +13,9 @@
 
 Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
 last.safetensors, metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of
-pairs of held-out places, turned by any yaw, that are registered within 2 m and 5 degrees. Held out is the last tenth
-of the path of each drive, with all scans near it. The model is the one of the step with the best mean recall
-(metrics.json: best_step, chosen_by); `paper` takes the last one, as published. Then the overlap head is trained, and
+pairs of held-out places, turned by any yaw, that are registered within 2 m and 5 degrees. The last tenth of the path of
+each drive is held out, with all scans near it. The model of the step with the best mean recall is kept (metrics.json:
+best_step, chosen_by). With `paper`, the last model is kept, as published. Then the overlap head is trained, and
 confidence and overlap are calibrated, so that SLAM can use the model.
 """
 
@@ -56,45 +56,45 @@ class TrainOptions(RunOptions):
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """Go on from these weights at a fifth of the learning rate; their network takes the place of that of the preset.
-    Without it, begin from random ones."""
+    """Continue from these weights at a fifth of the learning rate. Their network replaces the network of the preset.
+    Without it, begin from random weights."""
     stages: tuple[Literal["registration", "overlap"], ...] = ("registration", "overlap")
-    """Stages of the training: all networks but the overlap head, then this head alone. overlap alone trains the head of
-    --weights."""
+    """Stages of the training. registration: all networks except the overlap head; overlap: this head alone. If overlap
+    is the only stage, the head of --weights is trained."""
     calibrate: bool = True
     """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
-    """Leave these out, to see what each is worth (the paper's Table 2); tiny and small have no offset head."""
+    """Leave these parts out, to measure their benefit (the paper's Table 2). tiny and small have no offset head."""
     frame: Literal["lidar", "local"] | None = None
-    """Frame of the encoder's features: of the lidar, or of the wall at each point; without it, the preset decides."""
+    """Frame of the encoder's features: the lidar, or the wall at each point. Without it, the preset decides."""
     steps: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
-    """Train for about N steps in all, stages in proportion; without it, the preset decides."""
+    """Train for about N steps in all, divided in proportion to the stages. Without it, the preset decides."""
     epochs: Annotated[float | None, arg(metavar="N"), cli.Bound(0, is_allowed=False)] = None
-    """Train until each scan was N times the first of a group, instead of --steps; `paper` takes 12, as published."""
+    """Train until each scan was N times the first of a group, instead of --steps. `paper` takes 12, as published."""
     groups: Annotated[tuple[int, ...], arg(metavar="N ..."), cli.Bound(2)] = ()
-    """Largest group of scans of each stage of the curriculum, such as 8 16 8 16; without it, the preset decides."""
+    """Largest group of scans in each stage of the curriculum, such as 8 16 8 16. Without it, the preset decides."""
     scans: Annotated[int | None, arg(metavar="N"), cli.Bound(2)] = None
-    """How many scans a step takes; more keep a GPU busy, which computes all of them at once. Without it, the preset
-    decides."""
+    """Number of scans of a step. More scans keep a GPU busy, because it computes all of them at once. Without it, the
+    preset decides."""
     num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
-    """How many towns to train on, where town is among the data."""
+    """Number of towns for training, if town is among the data."""
     town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
     """Length of the drive through each town."""
     refine_labels: FlagCreatePairsOff[bool] = False
-    """Align the scans of each group by point-to-plane ICP, from the given poses: for drives whose poses are decimetres
-    off between neighbours."""
+    """Align the scans of each group by point-to-plane ICP, from the given poses. Use it if the poses of neighbours are
+    decimetres off."""
     hours: Annotated[float | None, arg(metavar="H"), cli.Bound(0, is_allowed=False)] = None
-    """Train for about H hours, at most the steps of the preset: the learning rate falls until then. Without it, the
-    steps decide."""
+    """Train for about H hours, with at most the steps of the preset. The learning rate falls until the end. Without it,
+    the steps decide."""
     finish: FlagCreatePairsOff[bool] = False
-    """Let the learning rate fall faster from here on, and end: with --resume, a run that was planned longer ends
-    after a quarter of the steps it has done."""
+    """Let the learning rate fall faster, and end. With --resume, a longer run ends after a quarter of the steps that it
+    has done."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
-    """Folder where prepared scans are kept between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The needed
-    and the free space are printed first."""
+    """Folder that keeps prepared scans between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The run prints
+    the needed and the free space first."""
     variants: Annotated[int | None, arg(metavar="N"), cli.Bound(0)] = None
-    """Prepare each scan N times and choose among these; fewer need less disk, 0.8 MB for each of `paper`. 0: prepare it
-    anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
+    """Prepare each scan N times; steps choose among these variants. Each one needs disk, 0.8 MB for `paper`. 0: prepare
+    it anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
     held_out_pairs: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 32
     """Pairs of scans at each distance that choose the model, all drives together."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
@@ -102,11 +102,11 @@ class TrainOptions(RunOptions):
     recall_every: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 100
     """Measure recall every N steps, and at the end."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT|auto")] = None
-    """Train in several processes as one, at this address of process 0; auto: as Slurm, Open MPI or a TPU pod says."""
+    """Address of process 0, to train in several processes. auto: the address of Slurm, Open MPI or a TPU pod."""
     num_processes: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
-    """How many processes there are."""
+    """Number of processes."""
     process_id: Annotated[int | None, arg(metavar="I"), cli.Bound(0)] = None
-    """Which of them this one is, from 0; process 0 alone writes and prints."""
+    """Number of this process, from 0. Process 0 alone writes and prints."""
 
     def __post_init__(self) -> None:
         """Checks bounds, and options that do not go together."""
@@ -124,7 +124,7 @@ class TrainOptions(RunOptions):
 
 
 def main(options: TrainOptions, run: Run) -> Numbers:
-    """Trains, evaluates, and writes the files; one of several processes writes."""
+    """Trains, evaluates, and writes the files; of several processes, only the first one writes."""
     from dpmjax.deeppointmap.training.processes import is_first, join_processes
 
     join_processes(options.coordinator, options.num_processes, options.process_id)
@@ -174,7 +174,7 @@ def main(options: TrainOptions, run: Run) -> Numbers:
 
 
 def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfig) -> list[cli.Source]:
-    """Returns the drives of --data; a drive of --validate or --data that has no pairs of scans raises a ValueError."""
+    """Returns the drives of --data; raises a ValueError if a drive of --validate or --data has no pairs of scans."""
     sampling = settings.sampling
     town = partial(simulation.simulate_drive, length_m=options.town_length_m, mixture=simulation.TRAINING_MIXTURE)
     towns: list[cli.Source] = [partial(town, options.seed + number) for number in range(options.num_towns)]
@@ -188,19 +188,19 @@ def training_sources(options: TrainOptions, settings: deeppointmap.TrainingConfi
 
 
 def kept_drive(source: cli.Source, folder: Path) -> LidarSequence:
-    """Returns a drive whose scans are kept in a folder from their first reading on."""
+    """Returns a drive that keeps its scans in a folder after their first reading."""
     return cli.keep_scans(source(), folder)
 
 
 def for_devices(settings: deeppointmap.TrainingConfig, num_scans: int) -> deeppointmap.TrainingConfig:
-    """Returns settings whose epochs are steps: all devices together pass once over the scans in an epoch."""
+    """Converts epochs to steps: in an epoch, all devices together use each scan once."""
     import jax
 
     return settings.for_scans(num_scans, num_samples=jax.device_count())
 
 
 def chosen_sources(sources: Sequence[cli.Source]) -> list[cli.Source]:
-    """Returns the drives by which models are chosen and calibrated: those of the user, or else the towns."""
+    """Returns the drives for the choice and the calibration of models: those of the user, or else the towns."""
     return [source for source in sources if not is_town(source)] or list(sources)
 
 
@@ -215,7 +215,7 @@ def select_pairs(
     sources: Sequence[cli.Source],
     on_wait: Callable[[], object],
 ) -> Selection:
-    """Returns the pairs that choose the model: of --validate, else of held-out places of the drives or of the towns."""
+    """Returns the pairs that choose the model, of --validate or else of held-out places of the drives or towns."""
     from dpmjax.cli.train_run import Selection, draw_selection, part_of_drive
 
     if "registration" not in options.stages:
@@ -233,7 +233,7 @@ def select_pairs(
 def without_impossible_stage(
     settings: deeppointmap.TrainingConfig, store: deeppointmap.ScanStore
 ) -> deeppointmap.TrainingConfig:
-    """Leaves out the stage of overlap, with a line, where the scans cannot teach it.
+    """Leaves out the stage of overlap if the scans cannot train it, and prints a line.
 
     Args:
         settings: settings of training.
@@ -270,7 +270,7 @@ def calibrate_on_sources(
 
 
 def training_settings(options: TrainOptions, first: deeppointmap.Model | None = None) -> deeppointmap.TrainingConfig:
-    """Returns the preset, with the options applied; the network is that of the first weights, if there are any."""
+    """Returns the preset with the options applied; given first weights determine the network."""
     import jax
 
     settings = deeppointmap.training_preset(options.preset)
@@ -315,7 +315,7 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers
 
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, Numbers]:
-    """Returns recall and errors of the trained and of the untrained network, of the latter for pairs of scans alone."""
+    """Returns recall and errors of the trained network, and of the untrained one for pairs of scans alone."""
     from dpmjax.cli.train_run import KIND_NAMES
 
     pairs, of_scans = records.selection.pairs, records.selection.of_scans

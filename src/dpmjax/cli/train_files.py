@@ -26,7 +26,7 @@ def write_training(
     *,
     origin: str,
 ) -> None:
-    """Writes all files of a run; numbers first, so that they are written even if a picture fails."""
+    """Writes all files of a run, numbers first, because a picture may fail."""
     from dpmjax.cli.train_run import with_params
 
     run, pairs = records.run, records.selection.pairs
@@ -43,7 +43,7 @@ def write_training(
 
 
 def write_model(path: Path, model: deeppointmap.Model, metrics: Numbers, *, origin: str) -> None:
-    """Writes a model with a description of its training, which begins with the preset and the data."""
+    """Writes a model with a description of its training; the preset and the data come first."""
     best = "" if metrics["best_step"] is None else f" (best recall after {metrics['best_step']})"
     card = f"{origin} ({metrics['num_scans']} scans), {metrics['steps']} steps{best}, seed {metrics['seed']}. "
     card += f"Trained: {', '.join(model.config.trained) or 'nothing to its end'}; chosen by {metrics['chosen_by']}. "
@@ -69,7 +69,7 @@ def draw_curves(run: Run) -> None:
 
 
 def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:
-    """Draws matches.png: of the pairs left out of the training, the one of the median error."""
+    """Draws matches.png: the held-out pair with the median error."""
     errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
     number = int(np.argsort(errors)[len(errors) // 2])
     a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
@@ -87,7 +87,7 @@ def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppoint
 
 
 def training_verdict(numbers: Numbers) -> str:
-    """Returns the recall, the overlap, and the scans that were left out."""
+    """Returns the verdict: the recall, the overlap, and the scans that were left out."""
     at = "" if numbers["best_step"] is None else f" (best, after step {numbers['best_step']})"
     text = f"ended after step {numbers['steps']}{at}; not evaluated"
     if "recall" in numbers:

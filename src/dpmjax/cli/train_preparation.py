@@ -1,4 +1,4 @@
-"""Preparation of the drives of a training: all processors share the scans, also those of one long drive."""
+"""Preparation of the drives of a training. All processors share the scans, even the scans of one long drive."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PlannedDrive(NamedTuple):
         source: opens the drive.
         T_world_lidar: true poses of its scans, metres.
         path: file of its prepared scans.
-        found: the drive, where the file is there already.
+        found: the prepared drive if the file exists already; None otherwise.
     """
 
     source: cli.Source
@@ -51,7 +51,7 @@ def prepare_sources(
     seed: int,
     on_wait: Callable[[], object] = lambda: None,
 ) -> list[dpm.PreparedDrive]:
-    """Prepares all drives by all processors and keeps them in a folder for later runs.
+    """Prepares all drives on all processors and keeps them in a folder for later runs.
 
     Args:
         sources: the drives.
@@ -93,7 +93,7 @@ def prepare_sources(
 
 
 def check_space(num_scans: int, settings: dpm.TrainingConfig, folder: Path) -> None:
-    """Prints the size of the prepared scans; raises a ValueError where the disk has less free space."""
+    """Prints the size of the prepared scans; raises a ValueError if the disk has less free space."""
     each = dpm.stored_bytes(settings)
     needed = num_scans * each
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())

@@ -1,4 +1,4 @@
-"""A DeepPointMap training: its drives and evaluations, and the table, the bar and the checkpoints that it writes."""
+"""A DeepPointMap training: its drives, evaluations, table, progress bar and checkpoints."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Selection(NamedTuple):
     """Pairs that choose the model.
 
     Attributes:
-        pairs: pairs of scans and of maps; None where no drive has held-out places: the last model is taken.
+        pairs: pairs of scans and of maps. None if no drive has held-out places; then the last model is kept.
         chosen_by: a name of the pairs, for `metrics.json`.
     """
 
@@ -78,11 +78,11 @@ def draw_selection(
         settings: settings of training.
         num_pairs: number of pairs of each kind, all drives together.
         drives: held-out places, or drives of `--validate`.
-        chosen_by: a name of these.
+        chosen_by: a name of the pairs, for `metrics.json`.
         on_wait: called before each drive; an error of it ends the preparation.
 
     Returns:
-        The pairs; none where no drive has any.
+        The pairs; none if no drive has any.
     """
 
     def opened() -> Iterator[LidarSequence]:
@@ -98,7 +98,7 @@ def draw_selection(
 
 
 class Records:
-    """The table, the progress bar, the checkpoints and the evaluation of a run; one process has them.
+    """The table, the progress bar, the checkpoints and the evaluation of a run, in the first process only.
 
     Attributes:
         run: the run; its folder gets the files.
@@ -107,7 +107,7 @@ class Records:
         start: progress to start from: the latest checkpoint of a resumed run.
         earlier_s: run time of the steps of earlier calls of `train`.
         overlap_start: state of the second stage to start from; None for its beginning.
-        takes_last: True to take the last model, as published, instead of the best.
+        takes_last: True keeps the last model, as published, instead of the best one.
     """
 
     def __init__(
@@ -178,9 +178,9 @@ class Records:
         self.run.append_row(HISTORY, **dict.fromkeys(COLUMNS, "") | row)
 
     def steps_left(self, step: int, *, total_s: float) -> int:
-        """Returns the number of steps in the seconds that remain of `total_s`; 0 where the plan stays as it is.
+        """Returns the number of steps in the seconds that remain of `total_s`; 0 does not change the plan.
 
-        Where `total_s` is 0, a quarter of the steps that were done before this call remain.
+        If `total_s` is 0, training ends after a quarter of the steps that were done before this call.
         """
         if total_s == 0:
             first, end = int(self.start.state.step), int(self.start.state.end)
@@ -190,7 +190,7 @@ class Records:
         return max(1, round((total_s - self.run_s) / self._pace_s))
 
     def train_head(self, trained: dpm.Trained, store: dpm.ScanStore, stop: Callable[[], int], seed: int) -> dpm.Trained:
-        """Trains the overlap head, or continues; the rows follow those of the first stage, and checkpoints its own."""
+        """Trains the overlap head, or continues; with rows after those of the first stage, and its own checkpoints."""
         before = int(trained.progress.state.step)
         earlier_s, begun = self.run_s, time.perf_counter()
         first = 0 if self.overlap_start is None else int(self.overlap_start.step)
@@ -217,7 +217,7 @@ class Records:
         return trained._replace(model=model, overlap=state, stopped_by=stopped_by)
 
     def save(self, progress: dpm.TrainingProgress) -> None:
-        """Writes a checkpoint, and the best parameters where they have changed since the last one."""
+        """Writes a checkpoint, and the best parameters if they have changed since the last one."""
         if int(progress.best_step):
             self._best.save(int(progress.best_step), progress.best_params)
         self._checkpoints.save(int(progress.state.step), replace(progress, best_params={}))
@@ -256,10 +256,10 @@ def run_training(
     seed: int,
     total_s: float = math.inf,
 ) -> dpm.Trained:
-    """Returns the result of both stages, after saving their last states; one process has records, and trains the head.
+    """Returns the result of both stages, and saves their last states; only the process with records trains the head.
 
-    Training ends after about `total_s` seconds of steps, compilation and evaluation, those of earlier calls included;
-    with 0 it ends after a quarter of the steps that are done.
+    Training ends after about `total_s` seconds of steps, compilation and evaluation, with those of earlier calls. If
+    `total_s` is 0, it ends after a quarter of the steps that were done before.
     """
     trains_first, trains_head = "registration" in settings.stages, "overlap" in settings.stages
     settings = replace(settings, stages=("registration",))
@@ -281,7 +281,7 @@ def run_training(
 
 
 def with_params(model: dpm.Model, params: Any) -> dpm.Model:
-    """Returns the model with the parameters of another step, which training gives back to the device."""
+    """Returns the model with the parameters of another step, on the device."""
     return model.replace(params=jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), params))
 
 

@@ -33,16 +33,16 @@ class PhaseConfig:
         num_free: number of free samples on each beam, drawn between sensor and hit.
         num_epochs: number of times that all scans are used, from which the number of scans gives the number of steps;
             0: `num_steps` counts.
-        is_as_published: True for batches that follow each other in time, the last one shorter; for free samples at the
-            same share of every beam; and for means of each scan (eq. 4), then over scans. Otherwise the batches and
-            the samples of each beam are random, and all points have the same weight.
+        is_as_published: True: batches follow each other in time, and the last one is shorter. Free samples lie at the
+            same share of every beam. Means are taken of each scan (eq. 4), then over scans. False: the batches and the
+            samples of each beam are random, and all points have the same weight.
         surface_distance: distance of one more free sample from the hit, at the start and at the end of the phase;
             None: no such sample.
-        chamfer_limit: distance to which the Chamfer distances of pairs of scans are clipped, at the start and at the
-            end of the phase, so that points outside the overlap have no gradient; None: no limit.
-        projective_tolerance: pairs of depth images are compared by projection instead of the Chamfer distance, with
-            this tolerance of matching points as a share of the depth, at the start and at the end of the phase. Offsets
-            in time wrap around at the end of the sequence then. None for other scans.
+        chamfer_limit: largest Chamfer distance of a point, at the start and at the end of the phase. Larger ones are
+            clipped, so that points outside the overlap have no gradient. None: no limit.
+        projective_tolerance: tolerance of matching points as a share of the depth, at the start and at the end of the
+            phase. Pairs of depth images are then compared by projection instead of the Chamfer distance, and offsets in
+            time wrap around at the end of the sequence. None for other scans.
         scans_per_window: for planar scans, number of neighbours in time in a window. Each window has its own L-Net (or
             free poses), and windows are joined at the scans that they share. A step has all windows. None: one L-Net
             for the whole set.

@@ -107,8 +107,8 @@ def mapping_data(
         Data of the problem, and the unit of length, in the unit of the scans.
 
     Raises:
-        ValueError: the scans or the poses have a wrong shape or are not finite, a scan has no valid beam, or the unit
-            is more than ten times smaller or larger than the typical range.
+        ValueError: the scans or the poses have a wrong shape or are not finite. Also if a scan has no valid beam, or
+            if the unit is more than ten times smaller or larger than the typical range.
     """
     checked = scans if isinstance(scans, DepthScans) else as_scan_set(scans)
     reach = typical_range(checked.points, checked.mask)
@@ -195,13 +195,13 @@ def register_depth(
 ) -> Registered:
     """Registers depth images by a search of initial poses and DeepMapping (section 4.2), and keeps the better poses.
 
-    DeepMapping adjusts the keyframes of the search; all images where the poses are given.
+    DeepMapping adjusts the keyframes of the search. If you give the poses, it adjusts all images.
 
     Initial poses and fit are compared by `projective_consistency`, without ground truth.
 
     Args:
         images: (n, h, w, 3) points in the camera frames (x right, y down, z forward), DepthScans, or a
-            DepthSequence or its folder; metres, or any unit where a start is given.
+            DepthSequence or its folder. Lengths are in metres. With a start they may be in any unit.
         config: settings of the fit, and `motion` of the search; None: `preset("fast", "depth")`.
         key: key of the search and of the fit.
         start: (n, 4, 4) initial T_world_camera, or the result of `initialize_depth`, which is called for None.

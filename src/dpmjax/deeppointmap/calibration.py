@@ -275,9 +275,9 @@ def fit_confidence(
     Each regression is fitted on the pairs that it rates: scans on those whose walls hold all directions.
 
     Args:
-        rows: measured pairs, each with the number of its `place`; where `is_end` is set, scans and clouds of the pair
-            are left out, because the two ends of an ambiguous place may look alike.
-        tested: pairs of other places, that the numbers are of; None takes each place by a fit without it.
+        rows: measured pairs, each with the number of its `place`. Scans and clouds of a pair with `is_end` are left
+            out, because the two ends of an ambiguous place may look alike.
+        tested: pairs of other places, on which the numbers are measured. None measures each place by a fit without it.
 
     Returns:
         The calibration, its numbers, and the confidence and the labels of the tested pairs. No calibration if all

@@ -58,8 +58,8 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     places. Where overlap is rarer, the probability is too high. A model without calibration uses the trained head of
     its decoder, as published ones do (DeepPointMap section 3.2).
 
-    Raises a `ValueError` if the model has neither, if the points are no real numbers (n, 3), if features have another
-    width than the model, or if the scans have different scales.
+    Raises a `ValueError` if the model has neither, or if the points are no real numbers (n, 3). It is also raised if
+    features have another width than the model, or if the scans have different scales.
 
     Args:
         model: encoder and decoder.
@@ -83,8 +83,8 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 
-    Raises a `ValueError` if the model has neither a fit nor a trained head, if the lengths differ or are 0, or if the
-    scans of a pair have different scales.
+    Raises a `ValueError` if the model has neither a calibration nor a trained head. It is also raised if the lengths
+    differ or are 0, or if the scans of a pair have different scales.
 
     Args:
         model: encoder and decoder.

@@ -41,8 +41,9 @@ def register(
     scans agree best is taken. Descriptor clouds have no points: the best motion of the descriptors is taken, and
     refined by their surface elements.
 
-    With a calibrated model the result is the inverse of that of the exchanged scans, and as probable: one of the two
-    is registered with the other, and below P 0.9 the other with the first, too; the more probable motion is taken.
+    With a calibrated model, exchanged scans give the inverse motion with the same probability. The library chooses
+    which scan is the source. If the probability is below 0.9, it exchanges the scans and registers them again, and
+    takes the more probable motion.
 
     Args:
         model: encoder and decoder.
@@ -59,12 +60,12 @@ def register(
     Returns:
         `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
         (`model.config.calibration`) is the probability that the motion is right within 2 m and 5 degrees. Without
-        calibration it is the mean score of the pairs, which is no probability. Two clouds of single scans that are
-        refined, of 512 elements or more, have the agreement of their elements as evidence, too; in corridors, whose
-        ends may look alike in all elements, the confidence of clouds is at most 0.88. A motion that only the views from
-        above suggested has no inliers, and without calibration the confidence 0. Failure is data: without any pair and
-        without a view, or with fewer than 20 descriptors on either side, the motion is the identity and the confidence
-        0; with fewer than three distinct pairs `rmse` is infinite.
+        calibration it is the mean score of the pairs, which is no probability. Refined clouds of single scans with 512
+        elements or more have the agreement of their elements as evidence, too. The ends of corridors may look alike in
+        all elements, so the confidence of clouds is at most 0.88 there. A motion that only the views from above
+        suggested has no inliers, and without calibration the confidence 0. Failure is data. The motion is the identity
+        and the confidence 0 if there is neither a pair nor a view, or if either side has fewer than 20 descriptors.
+        With fewer than three distinct pairs, `rmse` is infinite.
 
     Raises:
         ValueError: if the model is none, the points are no real numbers (n, 3), features have another width than the
@@ -116,7 +117,7 @@ def _register_either_way(
     scale: float,
     **options: MatchConfig | None,
 ) -> list[Registration]:
-    """Registers each pair one way, and those that are not sure the other way; without calibration as it is given."""
+    """Registers each pair one way, and unsure pairs both ways. Without calibration, the given way is the only one."""
     require_type("model", model, Model, "load_model")
     if model.config.calibration is None:
         return register_each(model, pairs, refine=refine, scale=scale, **options)

@@ -73,8 +73,8 @@ class VerificationConfig:
         plane_radius_m: largest distance of a point from the nearest point of a plane that it meets.
         max_weak_share: motions along an axis are tried if its share of the information of the walls is smaller. The
             share is 0.25 or more in streets and rooms, 0.07 to 0.21 in corridors. 0 switches the search off.
-        num_lookalikes: largest number of motions to other places that compete with a clearly right one: the scans look
-            alike from above under them, too, as in bare rooms and in rows of equal houses. 0 switches this off.
+        num_lookalikes: largest number of motions to other places that compete with a clearly right one. Under them the
+            scans look alike from above, too, as in bare rooms and in rows of equal houses. 0 switches this off.
     """
 
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)

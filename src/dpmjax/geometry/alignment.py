@@ -1,8 +1,8 @@
 """The best rigid motion between paired points, in closed form, with a derivative that is finite everywhere.
 
-With weighted means removed, the rotation that maximises trace(R H) for the cross covariance H = sum_i w_i s_i t_i^T
-comes from H = U S V^T as R = V diag(1, .., det) U^T (Kabsch 1976, Umeyama 1991; DeepPointMap section 3.3). The
-derivative of the singular vectors has poles wherever two singular values meet. That of R has poles only where their
+The weighted means are removed first. The cross covariance is H = sum_i w_i s_i t_i^T = U S V^T. The rotation that
+maximises trace(R H) is R = V diag(1, .., det) U^T (Kabsch 1976, Umeyama 1991; DeepPointMap section 3.3). The derivative
+of the singular vectors has poles wherever two singular values meet. The derivative of R has poles only where their
 signed *sum* is zero, and there R itself is ambiguous. So R carries a derivative of its own.
 """
 
@@ -31,10 +31,10 @@ def weighted_svd(
 ) -> Float[Array, "d1 d1"]:
     """Computes the rigid motion `T_target_source` that minimises sum_i weights[i] * |T source[i] - target[i]|^2.
 
-    The rotation is proper (determinant +1) even where a reflection would fit better. Where several motions fit equally
-    well (all points on one line in 3-D; one pair; a perfect mirror image), it is one of them near the identity. One
-    valid pair gives a translation, none the identity. Value and gradient are finite in all these cases: along
-    directions that the data leave open the derivative is zero.
+    The rotation is proper (determinant +1) even if a reflection would fit better. Several motions may fit equally well:
+    all points on one line in 3-D, one pair, or a perfect mirror image. The result is then a motion near the identity.
+    One valid pair gives a translation, no pair gives the identity. Value and gradient are finite in all these cases.
+    The derivative is zero along directions that the data leave open.
 
     Args:
         source: (n, 2) or (n, 3), in the source frame.

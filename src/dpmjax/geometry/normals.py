@@ -27,8 +27,9 @@ class Normals(NamedTuple):
 
     Attributes:
         normals: unit vectors that face the origin of the frame (the sensor); zero where `mask` is False.
-        flatness: linearity (2-D) or planarity (3-D) of the neighbourhood in [0, 1]: with the eigenvalues of its
-            covariance, smallest first, (l2 - l1) / l2 in 2-D and (l2 - l1) / l3 in 3-D. Zero where `mask` is False.
+        flatness: linearity (2-D) or planarity (3-D) of the neighbourhood in [0, 1]. With l1, l2, l3 the eigenvalues of
+            its covariance, smallest first, it is (l2 - l1) / l2 in 2-D. It is (l2 - l1) / l3 in 3-D. Zero where `mask`
+            is False.
         mask: True where the point is valid and has d valid neighbours or more (itself included) that do not coincide.
     """
 

@@ -91,8 +91,8 @@ def build_pyramid(
 
     Args:
         points: normalised coordinates, n >= 1.
-        mask: False for points that are not there; they may hold anything. All are there for None, but for those with a
-            coordinate that is not a number from -1e15 to 1e15.
+        mask: False for missing points, which may hold anything. None: only points with a coordinate that is not a
+            number from -1e15 to 1e15 are missing.
         config: sizes and radii; hashable, so that a second call with it compiles nothing.
 
     Returns:
@@ -177,8 +177,8 @@ def build_pyramid_on_host(
 
     Args:
         points: normalised coordinates, n >= 1, float32.
-        mask: False for points that are not there; they may hold anything. All are there for None, but for those with a
-            coordinate that is not a number from -1e15 to 1e15.
+        mask: False for missing points, which may hold anything. None: only points with a coordinate that is not a
+            number from -1e15 to 1e15 are missing.
         config: sizes and radii.
         num_threads: number of threads of the neighbour search.
 

@@ -43,8 +43,8 @@ def log(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6"]:
 def log_jacobian(T: Float[AnyArray, "... 4 4"]) -> Float[Array, "... 6 6"]:
     """The derivative of log(T @ rigid.exp(step)) by the step, at zero: the inverse right Jacobian.
 
-    With ad, the adjoint of the twist, it is I + ad / 2 + a ad^2 + b ad^4, a closed form of the series of Bernoulli
-    numbers (Barfoot 2017, section 7.1.5).
+    It is I + ad / 2 + a ad^2 + b ad^4, where ad is the adjoint of the twist. This is a closed form of the series of
+    Bernoulli numbers (Barfoot 2017, section 7.1.5).
 
     Args:
         T: (..., 4, 4), of angle below pi.

@@ -52,7 +52,7 @@ def refusing(source: str | Path, found: str, advice: str, kinds: tuple[type[Exce
         Nothing.
 
     Raises:
-        InputError: an error of one of these kinds was raised within; an InputError stays as it is.
+        InputError: the block raised an error of one of these kinds. An InputError passes unchanged.
     """
     try:
         yield
@@ -332,7 +332,7 @@ def read_depth_png(path: str | Path) -> NDArray[np.int64]:
     from matplotlib.image import imread
 
     content = read_bytes(path)
-    # Pillow raises many kinds of errors, one of them for pictures that would fill the memory.
+    # Pillow raises many kinds of errors, also for pictures that would fill the memory.
     with refusing(path, "not a readable PNG ({error})", "copy the picture again", (Exception,)):
         image = np.asarray(imread(io.BytesIO(content), format="png"), np.float64)
     found = f"pixels are {image.shape} of {content[24]} bits"

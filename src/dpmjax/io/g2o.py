@@ -1,9 +1,9 @@
 """Pose graphs as files of g2o and TORO, in the plane and in space.
 
 An edge `a b` holds `T_a_b`: node a is the target, node b the source. Its information matrix is the upper triangle,
-translation first. In space the order is x y z qx qy qz; the block of the quaternion is used for the rotation vector, as
-in GTSAM. g2o itself weights the vector part of the quaternion by it, about half the rotation vector: there rotations
-count a quarter, and chi2 is another. In the plane chi2 is that of g2o. Quaternions stand as x y z w.
+translation first. In space the order is x y z qx qy qz. The block of the quaternion weights the rotation vector, as in
+GTSAM. In g2o itself it weights the vector part of the quaternion, which is about half the rotation vector. So rotations
+count a quarter there, and chi2 differs. In the plane chi2 is that of g2o. Quaternions stand as x y z w.
 """
 
 from __future__ import annotations

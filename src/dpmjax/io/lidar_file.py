@@ -70,9 +70,10 @@ def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDAr
     A scan with hardly any point within 120 m, or with an unclear number of columns, is read with a warning.
 
     Args:
-        path: `.bin` (float32 rows of x, y, z and more, as of KITTI; or NCLT's), `.npy` (n, 3 or more), `.npz` (key
-            `lidar_pcd`, `points`, `xyz` or `arr_0`), `.pcd`, `.ply`, `.las`, `.laz`, or columns of text (`.xyz`,
-            `.csv`, `.txt`). All but `.npy` and `.npz` may be packed (`.gz`).
+        path: a file of one of these formats. Binary rows: `.bin` (float32 x, y, z and more, as of KITTI; or NCLT's).
+            NumPy: `.npy` (n, 3 or more) or `.npz` (key `lidar_pcd`, `points`, `xyz` or `arr_0`). Clouds: `.pcd`,
+            `.ply`, `.las`, `.laz`. Columns of text: `.xyz`, `.csv`, `.txt`. All but `.npy` and `.npz` may be packed
+            (`.gz`).
         bin_columns: numbers a point has in a `.bin` file: 4 with KITTI and MulRan, 5 with nuScenes; None
             infers it from the values.
 
@@ -242,7 +243,7 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
         why = f": all {len(points)} are zero or not finite" if len(points) else ""
         raise EmptyScanError(source, f"no point in the scan{why}", "remove the file, or copy it again")
     ranges = np.sqrt(squared[is_kept])
-    # Some points tell the unit as well as all.
+    # A sample of the points suffices for the median range.
     some = slice(None, None, max(1, len(kept) // _NUM_MEDIAN))
     median_m = np.median(ranges[some])
     found, advice = f"the median range is {median_m:.4g} m", "convert millimetres or centimetres to metres"
@@ -299,8 +300,8 @@ def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[
         given: number of columns; None infers it.
 
     Returns:
-        The number of values of each point, x, y and z first; and a note where it is not KITTI's four, where the values
-        fit another as well, or where they contradict the given one.
+        The number of values of each point (x, y and z first), and a note. There is a note if the number is not KITTI's
+        four, if the values fit another number as well, or if they contradict the given one.
 
     Raises:
         Float64Error: the file holds float64, and no layout is given.

@@ -164,7 +164,7 @@ class _Bag:
     def places(self, topic: str) -> tuple[list[_Place], str | None]:
         """Finds the messages of a topic, which begin with a header, in the order of the times of their headers.
 
-        Where a header has no time, or a clock was set back, the times of the recording are taken.
+        The times of the recording are taken if a header has no time, or if a clock was set back.
 
         Returns:
             The places, and the fault of the headers' times, if any.

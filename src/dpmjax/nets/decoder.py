@@ -29,8 +29,7 @@ class DecoderConfig:
         shares_layers: True for the same weights in all layers, as in the paper; False for the published networks.
         is_crossed: True as in the published networks: positions are embedded, and descriptors attend to those of both
             clouds. With False they attend to the features of their own cloud alone, which describe the surroundings
-            already. The result then depends neither on the other cloud nor on positions, and training needs fewer
-            steps.
+            already. The result then depends on one cloud and not on positions, and training needs fewer steps.
         predicts_offsets: False leaves all offsets at 0, as in `tiny` and `small`, and in the ablation of Table 2.
         compute_dtype: type of the matrix products.
     """

@@ -1,10 +1,10 @@
 """The maximum over neighbours of normalised differences: the inner loop of the encoder, with its own derivative.
 
 The automatic derivative of gather, norm and maximum over (m, k, f) numbers takes fifteen times as long as the value on
-a CPU. Where a derivative is asked for, the value here comes from a loop over the neighbours, on (m, f) numbers that
-stay in the cache. The derivative handles (m, f) winners and (m, k) pairs, never both at once: the length |x| of each
-pair is stored, and its derivative is a mean of products of x = of_points + offset kernel, which is a sum of a few
-numbers for each point and each pair. The rule is linear in the tangents, so JAX makes the backward pass from it.
+a CPU. Here a loop over the neighbours computes the value for a derivative, on (m, f) numbers that stay in the cache.
+The derivative handles (m, f) winners and (m, k) pairs, never both at once. The length |x| of each pair is stored, where
+x = of_points + offset kernel. Its derivative is a mean of products of x, which is a sum of a few numbers for each point
+and each pair. The rule is linear in the tangents, so JAX makes the backward pass from it.
 """
 
 from __future__ import annotations

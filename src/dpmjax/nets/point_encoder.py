@@ -35,7 +35,7 @@ class EncoderConfig:
         output_channels: channels of a descriptor.
         frame: frame of the offsets between points. With "lidar" it has the axes of the lidar, as in the published
             networks, which learn rotations by augmentation. With "local" it lies along and across the normal of the
-            wall at each point: descriptors are invariant to rotations of the scan about the vertical, and the offsets
+            wall at each point. Descriptors are then invariant to rotations of the scan about the vertical, and offsets
             between descriptors are predicted in these frames, too.
         compute_dtype: type of the matrix products over features.
     """

@@ -25,7 +25,7 @@ def pose_covariances(graph: PoseGraph) -> Float[np.ndarray, "n d d"]:
 
     Returns:
         (n, 3, 3) or (n, 6, 6) covariances of the step in the frame of each pose, translation first, metres and
-        radians; zero for held nodes, infinite where the edges leave nodes free.
+        radians. They are zero for held nodes, and infinite for nodes that the edges leave free.
 
     Raises:
         ValueError: an array is traced.

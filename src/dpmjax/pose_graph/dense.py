@@ -55,8 +55,8 @@ def solve_dense(
     Padding nodes are those without a valid edge. They stay, and may hold anything.
 
     The gradient is that of the solution, by the implicit function theorem, so it is right where `converged` is True.
-    It is by measurements, information and the poses of fixed nodes, and zero by the initial poses of the other ones and
-    along motions that no edge measures.
+    It has derivatives by measurements, by information and by the poses of fixed nodes. The derivatives by initial poses
+    of free nodes, and along motions that no edge measures, are zero.
 
     Args:
         poses: initial `T_world_node`; (n, 3) x, y, heading in the plane, (n, 4, 4) in space.

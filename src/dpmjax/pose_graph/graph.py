@@ -73,7 +73,7 @@ def label_parts(size: int, source: NDArray[np.integer], target: NDArray[np.integ
     Args:
         size: number of nodes.
         source: (e,) rows of the nodes at one end of the edges.
-        target: (e,) rows of the nodes at the other end.
+        target: (e,) rows of the nodes at the opposite end.
 
     Returns:
         (size,) number of the part of each node.
@@ -116,8 +116,8 @@ class PoseGraph:
             The graph, in float64.
 
         Raises:
-            ValueError: the shapes do not match, a number is not finite, an edge joins no two nodes of the graph, an
-                information matrix is not symmetric and positive semidefinite, or an array is traced.
+            ValueError: the shapes do not match, a number is not finite, or an edge joins no two nodes of the graph.
+                Also if an information matrix is not symmetric and positive semidefinite, or if an array is traced.
         """
         poses = np.asarray(poses, np.float64)
         source, target = (np.asarray(rows, np.int64) for rows in edges[:2])

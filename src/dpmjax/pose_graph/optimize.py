@@ -163,11 +163,11 @@ def optimize_pose_graph(
 
 
 def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floats, config: PoseGraphConfig) -> _State:
-    """Returns the state after one damped solve, whose step is taken where it lowers the cost.
+    """Returns the state after one damped solve, whose step is taken if it lowers the cost.
 
-    From a step that raises the cost, further ones are tried as long as they lower it fast, and all are taken where the
-    last one arrives below. Where one edge is far stiffer than the others, the first step follows it along a tangent,
-    and the others return to it.
+    After a step that raises the cost, further steps are tried as long as they lower it fast. All are taken if the last
+    one ends below the cost before them. This serves graphs with one very stiff edge: the first step follows it along a
+    tangent, and the further steps return to it.
     """
     at, is_narrow = state.at, state.widening <= 1.0
     width = width * state.widening
@@ -216,7 +216,7 @@ def spanning_tree_poses(num_nodes: int, edges: Edges) -> Floats:
     """
     is_planar = edges.measurements.ndim == 2
     T_target_source = se2.to_matrix(edges.measurements) if is_planar else edges.measurements
-    # Each edge in both directions, one after the other; of several edges between two nodes, the first one counts.
+    # Each edge stands in both directions, in this order. The first of several edges between two nodes counts.
     ends = np.stack([edges.target, edges.source, edges.source, edges.target], axis=1).reshape(-1, 2)
     motions = np.stack([T_target_source, rigid.inverse(T_target_source)], axis=1).reshape(
         -1, *T_target_source.shape[1:]

@@ -3,9 +3,10 @@
 With Z the measured and X the present `T_target_source`, a residual describes the motion Z^-1 X: the pose of the source
 in the frame where the edge puts it.
 
-* In the plane it is that pose itself, x, y and heading, as in g2o and in GTSAM up to 4.2 (4.3 takes the logarithm).
-* In space it is the twist of that motion (its logarithm), translation first, as in GTSAM. g2o takes the translation and
-  the vector part of the quaternion instead, which is half the rotation vector to first order. SE-Sync takes chords.
+In the plane it is that pose itself, x, y and heading, as in g2o and in GTSAM up to 4.2 (4.3 takes the logarithm).
+
+In space it is the twist of that motion (its logarithm), translation first, as in GTSAM. The residual of g2o is the
+translation and the vector part of the quaternion, to first order half the rotation vector. SE-Sync takes chords.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Classical registration of planar scans: ICP, chains of it, loop closure, refinement, global search, and trust."""
+"""Classical registration of planar scans: ICP, chains of ICP, loop closure, refinement, global search, and trust."""
 
 import lazy_loader as _lazy
 

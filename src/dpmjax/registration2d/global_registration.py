@@ -1,9 +1,9 @@
-"""Global registration: poses of all scans without a first guess, and if need be without an order.
+"""Global registration: poses of all scans without a first guess, also without an order.
 
-Scans in the order of time are registered as a sequence (`sequence_search.py`). Without an order, or where steps are
-weak or noisy, a few dozen keyframes are searched against each other exhaustively and assembled into one map. The
-keyframes are spread evenly in time; without an order they are the scans most similar to all scans. The remaining scans
-are then searched against some of the keyframes and placed in the map.
+Scans in time order are registered as a sequence (`sequence_search.py`). If there is no order, or if steps are weak or
+noisy, a few dozen keyframes are chosen. All pairs of keyframes are searched exhaustively, and the keyframes are
+assembled into one map. Keyframes are spread evenly in time. Without an order, the scans most similar to all scans are
+keyframes. The remaining scans are then searched against similar keyframes and placed in the map.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class GlobalConfig:
     """Settings of the global registration. Lengths are in typical ranges of the scans.
 
     Attributes:
-        max_keyframes: largest number of keyframes, which are searched all against all.
+        max_keyframes: largest number of keyframes. All pairs of keyframes are searched.
         search: settings of the search of pairs.
     """
 
@@ -69,7 +69,7 @@ class GlobalRegistration(NamedTuple):
 
     Attributes:
         poses: (n, 3) T_world_scan, the first one zero.
-        keyframes: rows of the scans that were searched all against all; none where a sequence needs no such search.
+        keyframes: rows of the keyframes; none if the sequence needed no search of all pairs.
     """
 
     poses: Floats
@@ -139,7 +139,7 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
 
 
 def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
-    """Selects `count` columns greedily, which maximise the summed similarity of each scan to its most similar one.
+    """Selects columns greedily to maximise the sum of the similarity of each scan to its most similar column.
 
     Args:
         similarity: of n scans to m candidates.
@@ -221,10 +221,10 @@ def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> F
 
 
 def find_unregistered(scans: PlanarScans, poses: Floats) -> Indices:
-    """Finds unregistered scans: they match far fewer beams than usual with any scan outside their cluster.
+    """Finds unregistered scans, which match far fewer beams than usual with any scan outside their cluster.
 
-    A small cluster of scans that match each other and no other scan is unregistered too: its scans must not support
-    each other.
+    A small cluster of scans that match only each other is unregistered, too, because its scans must not support each
+    other.
 
     Args:
         scans: n scans.
@@ -250,7 +250,7 @@ def find_unregistered(scans: PlanarScans, poses: Floats) -> Indices:
 
 
 def nearest_tour(poses: Floats) -> Indices:
-    """Orders scans so that neighbours are near each other: from each pose to the nearest one not yet visited.
+    """Orders scans so that neighbours are near each other. The nearest unvisited pose comes next.
 
     Args:
         poses: (n, 3) x, y, heading.

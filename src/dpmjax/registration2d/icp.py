@@ -37,10 +37,10 @@ class IcpResult(NamedTuple):
 
     Attributes:
         T_target_source: homogeneous transform of source points into the target's frame.
-        rmse: root mean square distance of the inlier pairs, to the point, or to the target's line or plane; infinite
-            without any.
-        num_inliers: pairs within three robust deviations.
-        converged: True where the last step was smaller than a millionth of the cloud.
+        rmse: root mean square distance of the inlier pairs, to the point, or to the target's line or plane. Infinite
+            without inliers.
+        num_inliers: number of pairs within three robust deviations.
+        converged: True if the last step was smaller than a millionth of the cloud.
     """
 
     T_target_source: Float[Array, "d1 d1"]
@@ -81,9 +81,9 @@ def icp(
         IcpResult. With too few points to constrain the motion, the result stays near `T_init`, with `converged` True.
 
     Raises:
-        ValueError: wrong shapes, unknown metric, an empty cloud, and where not traced: numbers that are not finite,
-            float32 points far from the origin, or a `T_init` that is no rigid motion. In a traced call a point with a
-            coordinate that is not a number from -1e15 to 1e15 counts as invalid.
+        ValueError: wrong shapes, unknown metric, or an empty cloud. Outside of traced calls also: numbers that are not
+            finite, float32 points far from the origin, or a `T_init` that is no rigid motion. In a traced call a point
+            with a coordinate that is not a number from -1e15 to 1e15 counts as invalid.
     """
     source = as_points("source", source, dimensions=(2, 3))
     target = as_points("target", target, dimensions=source.shape[1:]).astype(source.dtype)

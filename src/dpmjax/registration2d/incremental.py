@@ -1,4 +1,4 @@
-"""Incremental ICP: each scan is aligned with the one before, and the steps are chained."""
+"""Incremental ICP: aligns each scan with the previous one, and chains the steps."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ class IncrementalResult(NamedTuple):
 def incremental_icp(
     scans: PlanarScans, metric: Metric = "plane", *, odometry: Floats | None = None, prior: StepPrior | None = None
 ) -> IncrementalResult:
-    """Registers each scan to the one before and chains the steps.
+    """Registers each scan to the previous one, and chains the steps.
 
-    Without odometry, steps that are not clear are searched, and the poses are those of the best sequence of hypotheses
+    Without odometry, unclear steps are searched, and the best sequence of hypotheses gives the poses
     (`sequence_search.py`). Scans that fit no scan around them (a swapped line of the log) are interpolated.
 
     Args:
         scans: n scans in time order.
         metric: distance to lines ("plane") or to points ("point").
-        odometry: (n, 3) raw poses, whose steps are initial values; None: the steps are searched.
-        prior: of the steps; None: the odometry, if there is any, with the usual deviations.
+        odometry: (n, 3) raw poses; their steps are initial values. None: the steps are searched.
+        prior: prior of the steps; None: the odometry, if there is any, with the usual deviations.
 
     Returns:
         IncrementalResult.
@@ -82,9 +82,9 @@ def incremental_icp(
 def scan_odometry(scans: PlanarScans) -> Floats:
     """Chains coarse alignments of each scan with the one before, from zero motion.
 
-    These poses select scans of a dense recording that lie apart, for a robot without odometry. Steps that are long or
-    unconstrained in some direction are wrong. A step without a match gets the length of one typical range. Zero
-    motion would look like a standing robot, and the scan would be left out.
+    These poses serve to select scans that lie apart, from a dense recording without odometry. Steps that are long or
+    unconstrained in a direction are wrong. A step without a match gets the length of one typical range, because a zero
+    step would look like a standing robot, and the scan would be left out.
 
     Args:
         scans: n scans in time order.

@@ -1,11 +1,11 @@
 """Joint alignment of each scan with its neighbours in time and in space: sparse Gauss-Newton over all poses.
 
-A pair of scans in a corridor constrains the direction across the corridor alone. Along it, the posterior of the shift
-constrains open steps, and torn steps are put at their most probable shift (see `Slides`).
+A pair of scans in a corridor constrains only the direction across the corridor. Along the corridor, the posterior of
+the shift constrains open steps, and torn steps are set to their most probable shift (see `Slides`).
 
 A loop over a long step, or a wrong pair in space, moves single scans away from their neighbours, beyond the basin of
-convergence of an alignment. These steps are torn, too: the relative poses of two scans that fit each other before a
-refinement and not after it. The pose graph is solved again with the previous relative poses of these steps.
+convergence of an alignment. These steps are torn, too: their two scans fit each other before a refinement but not
+after it. The pose graph is solved again with the previous relative poses of these steps.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
 
 
 def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: float, prior: StepPrior) -> Floats:
-    """Restores relative poses along their unconstrained directions after an adjustment without constraints there.
+    """Restores relative poses along unconstrained directions after an adjustment that has changed them.
 
     Args:
         scans: n scans in time order.
@@ -101,10 +101,10 @@ def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float
         steps: (n - 1, 3) T_scan_next before the refinement.
         poses: (n, 3) T_world_scan after the refinement.
         radius: largest distance of neighbours in space, typical ranges.
-        prior: of the steps; a step that is torn in `Slides` with this prior is shifted to its mode.
+        prior: prior of the steps. If a step is torn in `Slides` with this prior, it is shifted to its mode.
 
     Returns:
-        (n, 3) T_world_scan, to be aligned again; None where no step is torn.
+        (n, 3) T_world_scan, to be aligned again; None if no step is torn.
     """
     later, kept = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
     before, after = (pair_scores(scans, later, later - 1, found) for found in (steps, kept))
@@ -127,11 +127,11 @@ def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: floa
     Args:
         scans: n scans in time order.
         poses: (n, 3) T_world_scan.
-        slides: of their steps, from `slid_steps`.
+        slides: slides of their steps, from `slid_steps`.
         radius: largest distance of neighbours in space, typical ranges.
 
     Returns:
-        (n, 3) T_world_scan; to align them again would let the steps slide again.
+        (n, 3) T_world_scan. Do not align them again, because the steps would slide again.
     """
     later, steps = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
     is_moved = slides.is_torn & (slides.scores > WEAK_SCORE)
@@ -209,7 +209,7 @@ def solve_step(num_poses: int, edges: Edges, gradient: Floats) -> Floats:
 
     Args:
         num_poses: n.
-        edges: the relative poses at which the system was linearised, with J^T W J as information.
+        edges: relative poses of the linearised system, with J^T W J as information.
         gradient: (e, 3) J^T W r of each edge in the tangent of its source frame.
 
     Returns:

@@ -164,7 +164,7 @@ def _linearise(
 def _choose_around(poses: Floats, radius: float) -> Indices:
     """Returns the row of each scan and those of neighbours within the radius, spread evenly by nearness.
 
-    Where there are too few neighbours, the row of the scan itself fills the remaining places.
+    If there are too few neighbours, the row of the scan itself fills the remaining places.
     """
     num_scans = len(poses)
     count = min(_NUM_NEIGHBOURS, num_scans - 1)
@@ -187,7 +187,7 @@ def adjust_to_lines(scans: PlanarScans, poses: Floats) -> Floats:
         poses: (n, 3) initial poses T_world_scan, within a few standard deviations of the noise.
 
     Returns:
-        (n, 3) poses; the first is the initial one. Without noise all are the initial ones, since weights are undefined.
+        (n, 3) poses; the first pose does not change. Without noise no pose changes, because weights are undefined.
     """
     if len(poses) < 2 or scans.noise <= 0:
         return poses

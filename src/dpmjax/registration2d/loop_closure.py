@@ -1,8 +1,8 @@
-"""Loop closure: matches of scans far apart in time, independent of drift, and a pose graph with these.
+"""Loop closure: matches scans far apart in time, independent of drift, and solves a pose graph with the matches.
 
-A single pair of half-circle scans in a corridor fits in many wrong ways. Three checks make a loop reliable: the target
-is a small submap of several scans, neighbouring loops agree with it, and the robust graph rejects loops that still
-contradict it.
+A single pair of half-circle scans in a corridor fits at many wrong poses. Three measures make a loop reliable. The
+target is a small submap of several scans. Neighbouring loops must agree. The robust graph rejects loops that contradict
+it.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class LoopConfig:
     """Settings of the loop search. Lengths are in typical ranges of the scans.
 
     Attributes:
-        num_rounds: number of searches, each from the corrected poses of the search before.
-        drift: error of a relative pose as a share of the distance travelled; it bounds the search for loops.
+        num_rounds: number of searches. Each search starts from the corrected poses of the previous one.
+        drift: error of a relative pose as a share of the travelled distance. It limits the search for loops.
     """
 
     num_rounds: int = 3

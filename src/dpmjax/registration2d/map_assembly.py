@@ -1,13 +1,13 @@
-"""One map from scored relative poses of pairs, built scan by scan; each new pose is scored against all placed scans.
+"""Assembly of one map from scored relative poses of pairs, scan by scan, each scored against all placed scans.
 
 A wrong relative pose may have a high score for its two scans, but rarely against all other scans. So the best pair
 starts a map, and each remaining scan has the pose hypotheses of its pairs. The hypothesis with the best score against
 all placed scans is added next. Once all scans are placed, each may move to a better hypothesis. A robust pose graph
 over all pairs that agree then averages their small errors.
 
-A single wrong connection between similar places misplaces a consistent block of scans. No scan alone has a better score
-at another pose then. So the map is cut at its weakest connections, and the smaller block moves to the best of the poses
-that pairs across the cut propose.
+A single wrong connection between similar places misplaces a consistent block of scans. Then no single scan has a better
+score at another pose. So the map is cut at its weakest connections. Pairs across the cut propose poses for the smaller
+block, and the block moves to the best of them.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class PoseScorer(NamedTuple):
 
     Attributes:
         scans: n scans.
-        chance: number of beams that two scans of different places match by chance, which is subtracted.
-        noisy_share: share of visible beams that range noise makes contradictory, which is subtracted.
-        is_ordered: True where neighbours in the array are neighbours in time.
+        chance: number of beams that two scans of different places match by chance. Scores subtract it.
+        noisy_share: share of visible beams that range noise makes contradictory. Scores subtract it.
+        is_ordered: True if neighbours in the array are neighbours in time.
     """
 
     scans: PlanarScans
@@ -108,7 +108,7 @@ class PoseScorer(NamedTuple):
 
 
 def add_up(scores: Floats) -> Floats:
-    """Sums pairwise scores: negative ones with weight 1, the k-th best positive one with weight 1 / k.
+    """Sums pairwise scores. Negative scores have weight 1, the k-th best positive score has weight 1 / k.
 
     A pose needs a few scans that match it well. Equal weights would favour overlap and put rooms that look alike on
     top of each other.
@@ -133,8 +133,8 @@ def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) ->
 
     Args:
         scans: n scans.
-        candidates: of pairs that connect all scans.
-        is_ordered: True where neighbours in the array are neighbours in time, so likely to overlap.
+        candidates: candidates of pairs that connect all scans.
+        is_ordered: True if neighbours in the array are neighbours in time, and so probably overlap.
 
     Returns:
         (n, 3) T_world_scan; the first pose is zero.
@@ -152,7 +152,7 @@ def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) ->
 
 
 def agreeing_edges(poses: Floats, candidates: Candidates, scans: PlanarScans) -> Edges:
-    """Returns edges of the pairs with a candidate that agrees with the map; of each pair the nearest candidate."""
+    """Returns an edge for each pair with a candidate that agrees with the map: its nearest candidate."""
     typical_range, num_beams = scans.typical_range, scans.mask.sum(1)
     beams = num_beams[candidates.source] + num_beams[candidates.target]
     shares = candidates.scores / np.maximum(beams, 1.0)[:, None]

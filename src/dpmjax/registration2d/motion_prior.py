@@ -1,4 +1,4 @@
-"""Prior of the motion of a robot from scan to scan: the usual length of a step, and how far it goes straight ahead."""
+"""Prior of the motion of a robot from scan to scan: the usual length of a step, and its forward share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class MotionPrior(NamedTuple):
     """The usual motion from one scan to the next.
 
     Attributes:
-        length: of a step, in the unit of the points.
+        length: length of a step, in the unit of the points.
         forward: share of the length that is straight ahead, -1 to 1.
     """
 

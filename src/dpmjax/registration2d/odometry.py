@@ -63,7 +63,7 @@ class ClearSteps(NamedTuple):
     """Steps between neighbours in time that the scans alone constrain.
 
     Attributes:
-        rows: (m,) step i leads from scan i to scan i + 1.
+        rows: (m,) numbers of the steps; step i leads from scan i to scan i + 1.
         steps: (m, 3) T_scan_next.
     """
 
@@ -77,7 +77,7 @@ class Odometry(NamedTuple):
     Attributes:
         poses: (n, 3) T_world_scan, corrected for a fault of its axes or units.
         prior: the steps at the scale of the scans, with their standard deviations.
-        fault: sentence on a wrong axis or unit; None: none found.
+        fault: sentence on a wrong axis or unit; None without a fault.
     """
 
     poses: Floats
@@ -86,7 +86,7 @@ class Odometry(NamedTuple):
 
     @property
     def is_mirrored(self) -> bool:
-        """True where the scans are mirrored against the odometry; either of the two may be wrong."""
+        """True if the scans are mirrored against the odometry; either of them may be wrong."""
         return self.fault == MIRRORED
 
 
@@ -98,7 +98,7 @@ def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
         poses: (n, 3) raw x, y, heading.
 
     Returns:
-        Odometry; with the usual deviations where few steps are clear.
+        Odometry; with the usual deviations if few steps are clear.
     """
     unit, clear = scans.typical_range, match_clear_steps(scans, poses)
     fault = _find_fault(clear, poses, unit)
@@ -108,7 +108,7 @@ def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
 
 
 def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
-    """Aligns each scan with the one before, from zero motion and from that of the odometry under each fault.
+    """Aligns each scan with the previous one, from zero motion and from the odometry under each possible fault.
 
     Args:
         scans: n scans in time order.

@@ -35,8 +35,8 @@ class Schedule:
     Attributes:
         gate: largest distance of matched points, first and last iteration.
         kernel: scale of the robust weight, first and last iteration; never below twice the range noise.
-        num_iterations: iterations of Gauss-Newton.
-        source_beams: about this number of beams of the source is used, evenly spread; None: all.
+        num_iterations: number of iterations of Gauss-Newton.
+        source_beams: approximate number of used beams of the source, evenly spread; None: all.
         target_beams: the same for the target.
     """
 
@@ -52,7 +52,7 @@ class Schedule:
         return np.maximum(scales, np.array([4.0, 2.0]) * noise)
 
     def source_share(self, scans: PlanarScans) -> float:
-        """Returns the share of the beams of these sources that is used."""
+        """Returns the share of used beams of these sources."""
         return 1.0 / _stride(scans, self.source_beams)
 
 
@@ -92,7 +92,7 @@ class PairMatches(NamedTuple):
 
 
 def fan(turns: Sequence[float] | Floats, radii: Sequence[float] = (0.0,), num_ways: int = 1) -> Floats:
-    """Returns guesses (h, 3) of a motion: every turn at shifts by `radii` in `num_ways` directions."""
+    """Returns guesses (h, 3) of a motion: all turns, each with shifts by `radii` in `num_ways` directions."""
     ways = 2 * np.pi * np.arange(num_ways) / num_ways
     shifts = [(r * np.cos(w), r * np.sin(w)) for r in radii for w in (ways if r else ways[:1])]
     return np.array([(x, y, turn) for turn in turns for x, y in shifts])
@@ -133,7 +133,7 @@ def linearise_pair(
         source: one scan, (b, 2) arrays.
         target: one scan.
         pose: T_target_source (x, y, heading).
-        scale: gate and kernel, in the unit of the points: pairs farther apart than the gate do not count; the kernel is
+        scale: gate and kernel, in the unit of the points. Pairs farther apart than the gate do not count. The kernel is
             the scale of the Geman-McClure weight on the residual.
         metric: distance to the target's line ("plane") or to its nearest point.
 
@@ -251,7 +251,7 @@ def match_pairs(
     source: PlanarScans, target: PlanarScans, guesses: Floats, schedule: Schedule, prior: PairPrior | None = None,
     *, metric: Metric = "plane",
 ) -> PairMatches:  # fmt: skip
-    """Aligns source scan p to target scan p from each of its guesses and keeps the best.
+    """Aligns source scan p to target scan p from each guess, and keeps the best result.
 
     Args:
         source: p scans.

@@ -1,7 +1,8 @@
 """Registration of two planar scans without a first guess, and the probability that the motion is right.
 
 All turns and shifts are searched (`pair_search.py`), the best distinct motions are aligned finely, and the one with the
-best score of the views is kept. Its lead over the best other motion and its freedom to slide tell how sure it is.
+best score of the views is kept. Its probability follows from its lead over the best other motion and from its freedom
+to slide.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Exhaustive search of the relative pose of two planar scans: all turns, all shifts, hits and free space, by FFT.
 
-Each scan is drawn twice: where it has hit, and as evidence (positive at its surfaces, negative in its free space). The
-score of a pose is the sum of the evidence of each scan at the hits of its partner. One inverse FFT computes this score
-for all shifts of one turn. The best poses are then refined on ever finer local grids, by the views of both scans.
+Each scan is drawn twice, as hits and as evidence (positive at its surfaces, negative in its free space). The score of a
+pose is the sum of the evidence of each scan at the hits of its partner. One inverse FFT computes this score for all
+shifts of one turn. The views of both scans then refine the best poses on ever finer local grids.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class CorrelativeConfig:
         num_peaks: number of shifts kept for each turn, from different blocks of cells.
         block: number of cells along a block.
         num_candidates: number of poses kept for each pair.
-        num_levels: number of local grids, each with half the spacing of the one before.
+        num_levels: number of local grids. Each has half the spacing of the previous grid.
         max_shift: largest shift; None: half the side of the images.
     """
 
@@ -108,7 +108,7 @@ class Hypotheses(NamedTuple):
         return cls(candidates.source[row], candidates.target[row], poses, scores)
 
     def in_both_directions(self) -> Hypotheses:
-        """Returns each hypothesis, then each with its scans exchanged."""
+        """Returns all hypotheses, then all of them with exchanged scans."""
         return join_rows(self, Hypotheses(self.target, self.source, se2.inverse(self.poses), self.scores))
 
     def take(self, rows: NDArray[Any]) -> Hypotheses:
@@ -121,7 +121,7 @@ class Hypotheses(NamedTuple):
 
 
 def poses_apart(poses: Floats, scores: Floats, typical_range: float, count: int) -> Indices:
-    """Selects the best poses (m, 3) of a pair that lie apart; returns their rows, the best one first."""
+    """Selects the best distinct poses (m, 3) of a pair; returns their rows, the best one first."""
     return apart(scores, lambda best: se2.is_within(poses - poses[best], APART * typical_range, APART), count)
 
 
@@ -181,10 +181,10 @@ def search_pairs(
 
     Args:
         scans: n scans.
-        source: (p,) rows; these scans are turned, so fewer distinct rows are quicker.
+        source: (p,) rows. These scans are turned, so few distinct rows are faster.
         target: (p,) rows.
         config: settings.
-        turns: (p, num_turns) True for headings of T_target_source to try, multiples of 2 pi / num_turns; None: all.
+        turns: (p, num_turns) True for headings of T_target_source to try. Turn k is k 2 pi / num_turns. None: all.
 
     Returns:
         Candidates.
@@ -244,7 +244,7 @@ def refine_candidates(scans: PlanarScans, found: Candidates, config: Correlative
 
     Args:
         scans: n scans.
-        found: candidates of p pairs; those without a finite score stay out.
+        found: candidates of p pairs. Candidates without a finite score are not refined.
         config: settings of the grids.
 
     Returns:

@@ -68,11 +68,12 @@ class RegistrationConfig:
     """Settings of `register_scans`.
 
     Attributes:
-        is_ordered: True where the scans are in the order of time.
-        refine: True to refine the initial poses and the fit, and to keep the best map.
+        is_ordered: True if the scans are in time order.
+        refine: True refines the initial poses and the fit, and keeps the best map.
         fit: settings of DeepMapping; presets are `dpmjax.deepmapping.preset`.
-        min_distance: least distance of two registered scans of a recording, in the unit of the scans, unless they are
-            turned by `min_turn`. The remaining scans follow the motion between these. None: all are registered.
+        min_distance: least distance of two registered scans of a recording, in the unit of the scans. Nearer scans are
+            registered only after a turn by `min_turn`. The remaining scans follow the motion between registered ones.
+            None: all are registered.
         min_turn: least turn between two registered scans nearer than `min_distance`, radians.
 
     Raises:
@@ -101,13 +102,13 @@ class RegistrationHooks(NamedTuple):
     """Functions that `register_scans` calls.
 
     Attributes:
-        on_progress: called with the name of a stage and the share of it that is done. The calls come where the stage
-            begins, after each call of the step of the fit, and after the parts of a refinement.
-        stop: called before each stage that may be left out and before each call of the step of the fit. Where it
-            returns True, the fit ends, and the best of the candidates so far is kept.
+        on_progress: called with the name of a stage and its finished share. The calls come at the beginning of a stage,
+            after each call of the step of the fit, and after the parts of a refinement.
+        stop: called before each optional stage and before each call of the step of the fit. If it returns True, the fit
+            ends, and the best of the candidates so far is kept.
         engine: called with the rows of the scans that are fitted, in the order of the fit; returns the `engine` of
             `fit_deepmapping`, which must report progress and handle stops. None: `deepmapping.fit`.
-        on_share: called with the share of the whole registration that is done, which never falls.
+        on_share: called with the finished share of the whole registration, which never falls.
     """
 
     on_progress: Callable[[str, float], None] = lambda _stage, _share: None
@@ -116,7 +117,7 @@ class RegistrationHooks(NamedTuple):
     on_share: Callable[[float], None] = lambda _share: None
 
     def report(self, stage: _Stage, name: str, share: float = 0.0) -> None:
-        """Reports the share of a stage that is done, and that of the registration."""
+        """Reports the finished share of a stage, and of the registration."""
         begins, ends = stage
         self.on_progress(name, share)
         self.on_share(begins + (ends - begins) * share)
@@ -127,7 +128,7 @@ class Candidate(NamedTuple):
 
     Attributes:
         poses: (k, 3) T_world_scan of the registered scans.
-        score: of the map, by the scans alone.
+        score: score of the map, by the scans alone.
     """
 
     poses: Floats
@@ -140,11 +141,11 @@ class RegisteredScans(NamedTuple):
 
     Attributes:
         poses: (n, 3) T_world_scan of all scans, x, y, heading, in the unit of the scans.
-        kept: name of the candidate that the poses come from.
-        start: name of the candidate that the fit started from.
+        kept: name of the candidate with these poses.
+        start: name of the candidate at which the fit started.
         candidates: all candidates by name; with DeepMapping if it has done a step.
-        assessment: of the kept candidate; `uncertain_scans` are rows of all scans.
-        fitted: DeepMapping of the registered scans; untrained where the fit was stopped before its first step.
+        assessment: assessment of the kept candidate; `uncertain_scans` are rows of all scans.
+        fitted: DeepMapping of the registered scans; untrained if the fit was stopped before its first step.
         recording: all scans, and the rows of those that were registered.
     """
 
@@ -175,19 +176,19 @@ def register_scans(
 ) -> RegisteredScans:
     """Registers planar scans from initial poses by DeepMapping and refinement, and keeps the best map.
 
-    The map is chosen and assessed by the scans alone. Where the start was "auto", it was the odometry, and the map
-    cannot be trusted, the scans are registered without odometry, too.
+    The map is chosen and assessed by the scans alone. With the start "auto", the scans are registered without odometry,
+    too, if the map from odometry cannot be trusted.
 
     Args:
         scans: (n, b, 2) beam end points in the sensor frames, any unit; all-zero or non-finite beams are left out. Or a
-            ScanSet, a ScanSequence or its file; their odometry is an argument of its own. An ordered scan without any
-            beam is put between its neighbours.
+            ScanSet, a ScanSequence or its file; pass their odometry separately. An ordered scan without any beam gets a
+            pose between its neighbours.
         config: settings.
         key: of the fit.
         start: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, or a name. The name "odometry" is the given
             odometry, "zero" sets all poses to zero, and "icp-plane" and "icp-point" are incremental ICP. The name
-            "global" is an exhaustive search of scan pairs, which needs no order. The name "auto" is the odometry where
-            there is one, else incremental point-to-line ICP; it is "global" for scans without an order.
+            "global" is an exhaustive search of scan pairs, which needs no order. The name "auto" is the odometry if
+            there is one. Without odometry it is "icp-plane" for ordered scans, and "global" for scans without an order.
         odometry: (n, 3) or (n, 3, 3) raw odometry of ordered scans.
         hooks: functions that are called: progress, a request to stop, the engine of the fit.
 
@@ -345,15 +346,15 @@ def fit_in_order(
     is_ordered: bool,
     engine_of: EngineOf = lambda _order: fit,
 ) -> Fitted:
-    """Fits scans by DeepMapping in an order with near neighbours: that of time, or a tour of the initial poses.
+    """Fits scans by DeepMapping in an order with near neighbours: time order, or a tour of the initial poses.
 
     Args:
         scans: the scans.
         config: settings of the fit.
         key: of the fit.
         start: (n, 3) initial x, y, heading; None: cold start, in the given order.
-        is_ordered: True where the scans are in the order of time.
-        engine_of: called with the order, rows of the scans; returns the `engine` of `fit_deepmapping`.
+        is_ordered: True if the scans are in time order.
+        engine_of: called with the order (rows of the scans); returns the `engine` of `fit_deepmapping`.
 
     Returns:
         The fit, its poses in the order of the scans.

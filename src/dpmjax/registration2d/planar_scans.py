@@ -3,10 +3,10 @@
 All lengths in settings are in typical ranges of the scans, so one set of settings serves pixels, rooms and streets. The
 typical range is the range that nine in ten beams on a line stay below (`dpmjax.geometry.sampling.typical_range`).
 
-A line with a normal is fitted at each beam. Two neighbouring beams give the exact normal of a noise-free wall, but a
-random one as soon as the noise is as large as the distance between the beams. So lines are fitted to several windows of
-neighbouring beams. These are centred on the beam or lie on either side of it, because a beam beside a corner lies on
-one of two walls. Among the windows that are straight up to the noise, the one with the least directional error is kept.
+A line with a normal is fitted at each beam. Two neighbouring beams give the exact normal of a noise-free wall. If the
+noise is as large as the distance between the beams, their normal is random. So lines are fitted to several windows of
+neighbouring beams. The windows are centred on the beam or lie on either side of it, because a beam beside a corner lies
+on one of two walls. Of the windows that are straight up to the noise, the one with the least directional error is kept.
 The noise is estimated from the scans.
 """
 
@@ -49,7 +49,7 @@ class Tolerances(NamedTuple):
     """Tolerances for the comparison of hits of two scans, in the unit of the points.
 
     Attributes:
-        match: standard deviation of a hit about the surface that it belongs to.
+        match: standard deviation of a hit about its surface.
         contradict: least distance in front of a surface at which a hit contradicts the surface.
         jump: least difference of the ranges of two neighbouring beams that end on two surfaces.
     """
@@ -92,8 +92,8 @@ class PlanarScans:
         is_on_line: True where the beam lies on a straight piece (valid, not a corner, not alone).
         noise: standard deviation of the range noise of all scans together, in the unit of the points.
         typical_range: range that nine in ten beams on a line stay below, median over the scans: the unit of settings.
-        is_ordered: True where neighbours in the array are neighbours in time.
-        num_bearings: of the views.
+        is_ordered: True if neighbours in the array are neighbours in time.
+        num_bearings: number of bearings of the views.
     """
 
     points: Float[np.ndarray, "n b 2"]
@@ -145,8 +145,8 @@ def planar_scans(points: AnyArray | ScanSet, mask: AnyArray | None = None, *, is
     """Prepares planar scans for registration: fits lines, measures noise and typical range.
 
     Args:
-        points: (n, b, 2) beam end points in the frame of their sensor, any unit; or a ScanSet. Beams that are not in
-            the order of their angles are sorted, each scan with its invalid beams last.
+        points: (n, b, 2) beam end points in the frame of their sensor, any unit; or a ScanSet. Beams are sorted by
+            angle if they are not in this order; then the invalid beams of a scan come last.
         mask: (n, b) True for valid beams; None: all are valid, or the mask of the ScanSet.
         is_ordered: True where neighbours in the array are neighbours in time.
 

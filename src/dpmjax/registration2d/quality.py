@@ -1,4 +1,4 @@
-"""Quality of a registration without ground truth: scores of trajectories, the choice among them, and trust in the best.
+"""Quality of a registration without ground truth: scores of trajectories, choice of the best, and trust in it.
 
 A map is good if few nats encode all its beams (`map_code_length`) and if near scans agree (`view_misfit`). A trajectory
 is good if its steps are those of the odometry, within its noise.
@@ -102,7 +102,7 @@ def choose_trajectory(
     Args:
         scans: n scans.
         candidates: (n, 3) poses by name.
-        prior: of their steps; None: none.
+        prior: prior of their steps; None without a prior.
 
     Returns:
         The name of the best, and the scores of all.
@@ -230,7 +230,7 @@ class Assessment(NamedTuple):
             are not mirrored, and the range noise is below its limit.
         uncertain_scans: rows of the scans that fit no other scan, or whose position along a corridor or heading between
             round walls is unconstrained.
-        fault: sentence on axes or units that contradict the odometry; None: none found.
+        fault: sentence on axes or units that contradict the odometry; None without a fault.
     """
 
     weakest_connection: float
@@ -246,15 +246,15 @@ def assess_trajectory(
     """Assesses the registration of scans by the scans alone.
 
     The best pairs of scans make a tree that holds the map together. It must have no weak connection between two parts.
-    Pairs outside the tree must contradict hardly more than the pairs in it. Few scans that fit no other scan are left
-    out, up to two in sequence. The position of each other scan relative to the map must be constrained, and without a
-    prior its heading, which round walls leave open.
+    Pairs outside the tree must contradict hardly more than the pairs in it. A few scans that fit no other scan are left
+    out, up to two in sequence. The position of each remaining scan relative to the map must be constrained. Without a
+    prior, its heading must be constrained, too, because round walls leave it open.
 
     Args:
         scans: n scans, two at least.
         poses: (n, 3) x, y, heading.
         prior: of the steps of ordered scans; None: the scans alone.
-        fault: of the odometry or the scans against it; no map is trusted with one.
+        fault: fault of the odometry, or of the scans against it. A map with a fault is not trusted.
 
     Returns:
         Assessment.

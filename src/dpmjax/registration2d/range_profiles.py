@@ -1,7 +1,8 @@
-"""Comparison of pairs of scans at relative poses: the hits that match or contradict the other scan.
+"""Comparison of pairs of scans at relative poses: hits of one scan match or contradict the view of its partner.
 
-A hit of another scan lies on the surface that a scan has seen (a match), in its free space (a contradiction), or in an
-unobserved region. The score of two scans is the agreement of their visible beams.
+A hit of one scan is a match if it lies on the surface that its partner has seen. It is a contradiction in the free
+space of the partner, and does not count in an unobserved region. The score of two scans is the agreement of their
+visible beams.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def compare_pairs(
 
 
 def contradicted_share(scans: PlanarScans, source: Indices, target: Indices, poses: Floats) -> Floats:
-    """Computes the share (p,) of the visible beams of two scans that contradict each other, of at least 20 beams."""
+    """Computes the contradicting share (p,) of the visible beams of two scans; the divisor is at least 20 beams."""
     views = compare_pairs(scans, source, target, poses)
     return np.asarray(views.contradicted / np.maximum(views.visible, 20.0))
 
@@ -135,8 +136,8 @@ def find_evidence(scans: PlanarScans, source: Indices, target: Indices, poses: F
         poses: T_target_source.
 
     Returns:
-        Agreement, which is matched less weighted contradicting beams, and beams that end in the visible region of their
-        partner scan; shares of all beams of both scans.
+        The agreement (matched less weighted contradicting beams), and the beams that end in the visible region of their
+        partner scan. Both are shares of all beams of both scans.
     """
     views = compare_pairs(scans, source, target, poses, stride=4)
     contradicted = np.maximum(views.contradicted - _NOISY_SHARE * views.visible, 0.0)

@@ -1,8 +1,8 @@
 """Recordings: choice of the scans that are registered, and poses of all scans.
 
-A robot's log has thousands of scans, most of them some centimetres from the one before. Only scans that lie some
-distance or turn apart are registered. Each remaining scan follows the odometry between the registered scans before and
-after it, and is then aligned with the nearer of the two.
+A robot's log has thousands of scans, most of them a few centimetres from the previous one. Only scans that differ by a
+least distance or turn are registered. Each remaining scan follows the odometry between the registered scans before and
+after it. It is then aligned with the nearer of these two.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Recording(NamedTuple):
     Attributes:
         scans: all n scans.
         chosen: rows of the k registered scans, in order.
-        motion: (n, 3) poses whose steps are the motion between registered scans; None where all scans except repeated
-            ones are registered.
-        originals: (n,) row of the scan that each scan repeats beam by beam; the row of the scan itself for others. A
-            scan without an echo counts as a repetition, and is put between its neighbours.
+        motion: (n, 3) poses whose steps are the motion between registered scans. None if all scans except repeated ones
+            are registered.
+        originals: (n,) row of the scan that each scan repeats beam by beam, or its own row. A scan without an echo
+            counts as a repetition, and gets a pose between its neighbours.
     """
 
     scans: ScanSet
@@ -101,13 +101,13 @@ def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
 
 
 def find_originals(scans: ScanSet) -> Indices:
-    """Finds scans that repeat the scan before beam by beam, and scans without any echo.
+    """Finds scans that repeat the previous scan beam by beam, and scans without any echo.
 
     Args:
         scans: n scans in the order of time.
 
     Returns:
-        (n,) row of the first scan of each such run; of a scan without an echo, a row that is never its own.
+        (n,) row of the first scan of each run of repetitions. A scan without an echo never has its own row.
     """
     points, mask = np.asarray(scans.points), np.asarray(scans.mask)
     repeats = np.append(False, (points[1:] == points[:-1]).all((1, 2)) & (mask[1:] == mask[:-1]).all(1))
@@ -128,7 +128,7 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
         min_turn: as `choose_by_motion`.
 
     Returns:
-        Recording; a scan that repeats the scan before is not registered, and has the pose of that scan.
+        Recording. A scan that repeats the previous scan is not registered, and gets the pose of that scan.
 
     Raises:
         ValueError: all scans are equal.
@@ -147,12 +147,12 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
 
 
 def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, min_turn: float) -> Indices:
-    """Chooses scans that lie apart; a robot that stands still adds none.
+    """Chooses scans that lie apart; a standing robot adds none.
 
     Args:
         odometry: poses x, y, heading of all scans, in the order of time.
-        min_distance: a scan at this distance or more from the last chosen one is chosen.
-        min_turn: a scan turned by this or more against the last chosen one is chosen, too; radians.
+        min_distance: a scan is chosen at this distance or more from the last chosen one.
+        min_turn: a scan is also chosen at this turn or more against the last chosen one; radians.
 
     Returns:
         Rows of the chosen scans in order; the first and the last scan are among them.
@@ -175,7 +175,7 @@ def choose_by_motion(odometry: Float[np.ndarray, "n 3"], min_distance: float, mi
 
 
 def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Float[np.ndarray, "n 3"]) -> Floats:
-    """Computes poses of all scans from those of the chosen scans, and from corrected odometry between these.
+    """Computes poses of all scans from the poses of the chosen scans and the corrected odometry between them.
 
     The error of odometry at the next chosen scan is distributed over the scans before it, in proportion to distance and
     turns.
@@ -183,7 +183,7 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
     Args:
         chosen: rows of k scans in order, the first and the last scan among them.
         poses: T_world_scan of the chosen scans, x, y, heading.
-        odometry: of all n scans.
+        odometry: odometry of all n scans.
 
     Returns:
         (n, 3) T_world_scan; those at `chosen` are `poses`.
@@ -208,7 +208,7 @@ def fill_between(chosen: Indices, poses: Float[np.ndarray, "k 3"], odometry: Flo
 
 
 def interpolate(num_scans: int, rows: Indices, poses: Floats) -> Floats:
-    """Interpolates poses of all scans from those (k, 3) of `rows` (k,); both ends of the sequence are constant."""
+    """Interpolates poses of all scans from the poses (k, 3) of `rows` (k,); both ends of the sequence are constant."""
     at_start, at_end = rows[:1] * 0, rows[-1:] * 0 + num_scans - 1
     chosen, first = np.unique(np.concatenate([rows, at_start, at_end]), return_index=True)
     known = np.concatenate([poses, poses[:1], poses[-1:]])[first]
@@ -273,7 +273,7 @@ def _share_of_way(odometry: Floats, start: Indices, end: Indices) -> Floats:
 
 
 def distinct_rows(scans: PlanarScans) -> Indices:
-    """Returns rows of the scans that differ from the scan before; all rows for scans without noise."""
+    """Returns rows of the scans that differ from the previous scan; all rows for scans without noise."""
     is_new = (np.diff(scans.points, axis=0) != 0).any(axis=(1, 2))
     is_new = is_new | (scans.noise < _LEAST_NOISE * scans.typical_range)
     return np.flatnonzero(np.append(True, is_new))

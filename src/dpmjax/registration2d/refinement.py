@@ -1,6 +1,6 @@
-"""Refinement of a trajectory: loop closure where its steps fit badly, then the joint alignment of all scans.
+"""Refinement of a trajectory: loop closure at steps that fit badly, then the joint alignment of all scans.
 
-With range noise the scans are then adjusted to common lines (line_adjustment.py).
+If there is range noise, the scans are then adjusted to common lines (`line_adjustment.py`).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class RefinementConfig:
     """Settings of the refinement.
 
     Attributes:
-        radius: largest distance of neighbours in space, which are aligned, typical ranges.
+        radius: largest distance of neighbours in space that are aligned, typical ranges.
         loops: settings of the loop search of ordered scans; None: no search.
     """
 
@@ -81,9 +81,9 @@ def refine(
 ) -> Refined:
     """Refines a trajectory by loop closure, joint alignment of all scans, and adjustment to common lines.
 
-    Loops are searched only where steps of the initial poses fit badly, in a chain of re-aligned steps. The initial
-    poses are also aligned without loops, and the better map is kept. For scans without an order, only neighbours in
-    space are aligned, and no loops are searched. The adjustment to lines needs range noise.
+    Loops are searched only if steps of the initial poses fit badly. The search starts from a chain of re-aligned steps.
+    The initial poses are also aligned without loops, and the better map is kept. For scans without an order, only
+    neighbours in space are aligned, and no loops are searched. The adjustment to lines needs range noise.
 
     Args:
         scans: (n, b, 2) beam end points in the sensor frames, any unit, in the order of time; all-zero or non-finite
@@ -91,8 +91,8 @@ def refine(
             `planar_scans(scans, is_ordered=False)`.
         poses: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
         config: settings.
-        prior: of the steps of ordered scans; None: the steps of the initial poses, with the usual deviations.
-        on_progress: called with the share of the refinement that is done.
+        prior: prior of the steps of ordered scans; None: the steps of the initial poses, with the usual deviations.
+        on_progress: called with the finished share of the refinement.
 
     Returns:
         Refined; the first pose is the initial one, unless loops are kept.
@@ -161,7 +161,7 @@ def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: Refineme
 
 
 def put_back_slid(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Floats | None:
-    """Puts steps back that have slid along passages, for scans without odometry.
+    """Moves steps back that have slid along passages, for scans without odometry.
 
     Args:
         scans: n scans in time order.
@@ -169,7 +169,7 @@ def put_back_slid(scans: PlanarScans, poses: Floats, config: RefinementConfig | 
         config: settings.
 
     Returns:
-        (n, 3) poses; None where no step has slid, or where the map does not become clearly better.
+        (n, 3) poses; None if no step has slid, or if the map does not become clearly better.
     """
     slides = slid_steps(scans, poses)
     if not slides.is_torn.any():

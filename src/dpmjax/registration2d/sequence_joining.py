@@ -1,9 +1,9 @@
 """Correction of the weak steps between the parts of a sequence, by submaps and by loops that agree.
 
-A step is weak where the scans on both sides share few beams, and all later scans may be metres off. So the two submaps
-on either side are searched against each other. Then submaps of different parts are searched against each other. A
-single such pair may be wrong, but wrong pairs propose different poses and correct pairs the same one (consensus, as in
-pairwise consistent sets of loops). Each pair is a vote.
+A step is weak if the scans on both sides share few beams. All later scans may then be metres off. So the two submaps on
+either side are searched against each other, and then submaps of different parts. A single pair may be wrong. But wrong
+pairs propose different poses, and correct pairs propose the same pose (consensus, as in pairwise consistent sets of
+loops). Each pair is a vote.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def join_parts(
         config: settings of the search of pairs of submaps.
 
     Returns:
-        (n, 3) poses; unchanged where no step is weak.
+        (n, 3) poses; unchanged if no step is weak.
     """
     sequence = _Sequence(scans, poses.copy(), rows, prior)
     steps = np.flatnonzero(weak_steps(scans, poses, rows))

@@ -1,10 +1,10 @@
-"""Poses of a sequence of scans by beam search: each scan against the last placed scans, with several hypotheses.
+"""Poses of a sequence of scans by beam search, with several hypotheses for each scan.
 
-A step between two scans that share few beams has several poses that fit. An exhaustive search of the pair finds these
-hypotheses (`pair_search.py`). It prefers poses with much overlap, so further hypotheses are alignments from arcs of the
-usual motion. Their score is matched less contradicting beams against all of the last placed scans; the fitness of an
-ICP ignores contradicting beams. The best sequences of poses are kept from scan to scan. A scan that fits
-none of the last placed scans (a swapped line of the log, a covered lens) stays unregistered, and the sequence continues
+If two scans share few beams, several poses of their step fit. An exhaustive search of the pair finds these hypotheses
+(`pair_search.py`). It prefers poses with much overlap. So alignments from arcs of the usual motion are further
+hypotheses. The score of a hypothesis is matched less contradicting beams against all of the last placed scans. (The
+fitness of an ICP ignores contradicting beams.) The best sequences of poses are kept from scan to scan. A scan that fits
+none of the last placed scans (a swapped line of the log, a covered lens) is not registered, and the sequence continues
 with the next scan.
 """
 
@@ -68,7 +68,7 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
         steps: the n - 1 steps T_scan_next that an ICP has found.
 
     Returns:
-        (n, 3) T_world_scan, the first one zero; an interpolation for scans that fit none of the scans around them.
+        (n, 3) T_world_scan, the first one zero; interpolated for scans that fit none of the scans around them.
     """
     rows = distinct_rows(scans)
     some = scans.take(rows)
@@ -218,7 +218,7 @@ class _Beam:
         return _Sequences(longer.poses[chosen], longer.is_placed[chosen], scores - scores[0])
 
     def extend(self, now: _Sequences, scan: int) -> _Sequences:
-        """Returns all continuations by a scan: its hypotheses, and the scan left out."""
+        """Returns all continuations by a scan: one for each hypothesis, and one without the scan."""
         own = slice(self.starts[scan], self.starts[scan + 1])
         target = self.hypotheses.target[own]
         parent, which = np.nonzero(now.is_placed[:, target])
@@ -259,7 +259,7 @@ class _Beam:
         return np.asarray(agreement - _PRIOR_WEIGHT * self.prior.surprise(step, gap), np.float64)
 
     def are_same(self, sequences: _Sequences, row: int) -> Booleans:
-        """Returns True for sequences that agree with one of them in their last scans."""
+        """Returns True for each sequence whose last scans agree with those of the sequence in `row`."""
         placed = sequences.is_placed[:, -_NUM_SAME:]
         poses = sequences.poses[:, -_NUM_SAME:][:, placed[row]]
         inside = np.asarray(se2.relative(poses[:, -1:], poses))

@@ -2,11 +2,12 @@
 
 Priors come from odometry, given poses or the usual motion.
 
-The weak direction is the direction of the least translation information of the walls. Two scans of a corridor fit at
-every shift along it, and a local alignment stops at the first of these. So the scores of a relative pose, called step,
-are computed at shifts far to either side. Scores and prior together give the posterior of the shift. The mode of this
-posterior is the most probable relative pose, and the spread is the uncertainty along the weak direction. The edges of a
-pose graph have the relative pose of the scans where these constrain it, and the posterior along the weak direction.
+The weak direction is the direction in which the walls give the least information about the translation. Two scans of a
+corridor fit at every shift along it, and a local alignment stops at the first of these shifts. So the scores of a step
+(a relative pose) are computed at shifts far to either side. Scores and prior together give the posterior of the shift.
+The mode of this posterior is the most probable relative pose, and its spread is the uncertainty along the weak
+direction. An edge of the pose graph has the posterior along the weak direction, and the alignment in all other
+directions.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ BEAM_DEVIATION, _STEP_DEVIATION = 0.03, (0.045, 0.15)
 _FREEDOM = 3.0
 # Shifts to either side, and their spacing, typical ranges.
 _REACH, _SPACING = 0.36, 0.012
-# Every `_STRIDE`-th shift is scored first; the others are scored too, unless all are worse by this number of nats.
+# Every `_STRIDE`-th shift is scored first. If the middle one leads by this number of nats, the scores between are
+# interpolated.
 _STRIDE, _CLEAR_GAIN = 3, 8.0
 # Number of interpolated scores for each shift, because a prior may be sharper than the spacing.
 _FINER = 8
@@ -88,7 +90,7 @@ class StepPrior(NamedTuple):
         return self._replace(deviations=np.maximum(self.deviations, usual))
 
     def as_pair_prior(self, residual: float | Floats) -> PairPrior:
-        """Returns the prior of alignments whose beams have this standard deviation `residual`, unit of the points."""
+        """Returns the prior of alignments; `residual` is the standard deviation of a beam, in the unit of points."""
         return PairPrior(self.steps, (residual / self.deviations) ** 2)
 
     def through(self, rows: Indices) -> StepPrior:
@@ -103,11 +105,11 @@ class StepPrior(NamedTuple):
 def usual_motion(matches: PairMatches, typical_range: float) -> StepPrior:
     """Predicts each step by the median translation of clear steps with a similar turn.
 
-    In a corridor two scans fit at every shift along it. The prediction assumes that the robot moves there as elsewhere.
+    In a corridor two scans fit at every shift along it. The prediction assumes the same motion there as outside of it.
 
     Args:
-        matches: of the steps; those with information and fitness of at least the median are clear.
-        typical_range: of the scans.
+        matches: matches of the steps. Steps with information and fitness of at least the median are clear.
+        typical_range: typical range of the scans.
 
     Returns:
         StepPrior of the translations; without five clear steps all deviations are infinite.
@@ -147,16 +149,16 @@ def prior_steps(prior: StepPrior) -> Edges:
 class Slides(NamedTuple):
     """Posterior of the shifts of k steps along their weak directions.
 
-    A step is open where the scores do not constrain the shift, and torn where it has moved away from the mode.
+    A step is open if the scores do not constrain its shift. It is torn if it has moved away from the mode.
 
     Attributes:
         directions: (k, 2) unit vectors in the frame of the target.
         shifts: (k,) shift in the unit of the points: posterior mean of an open step, mode of a torn step, else 0.
         deviations: (k,) standard deviation about the posterior mode, in the unit of the points.
-        is_torn: (k,) True where the mode lies far from the given step and is clearly more probable.
-        is_open: (k,) True where the scores alone do not constrain the shift.
+        is_torn: (k,) True if the mode lies far from the given step and is clearly more probable.
+        is_open: (k,) True if the scores alone do not constrain the shift.
         scores: (k,) score after the shift.
-        typical_range: of the scans.
+        typical_range: typical range of the scans.
     """
 
     directions: Floats
@@ -209,8 +211,8 @@ def slide_steps(
         scans: n scans.
         steps: (k, 3) T_target_source.
         prior: of these steps; None: the scores alone.
-        pairs: (k,) rows of the sources, which are shifted, and of the targets, which they are compared with. None: the
-            steps are the n - 1 steps T_scan_next between neighbours in time.
+        pairs: (k,) rows of the sources, which are shifted, and (k,) rows of the targets. None: the steps are the n - 1
+            steps T_scan_next between neighbours in time.
 
     Returns:
         Slides.
@@ -289,7 +291,7 @@ def _spread(nats: Floats, shifts: Floats) -> tuple[Floats, Floats]:
 def slid_steps(scans: PlanarScans, poses: Floats) -> Slides:
     """Computes the shifts of steps against the usual motion at these poses, for scans without odometry.
 
-    A refinement may let the steps in a corridor collapse: the scans fit at every shift, and the robot would have stood.
+    A refinement may shrink the steps in a corridor to zero, because the scans fit at every shift.
 
     Args:
         scans: n scans in time order.
@@ -312,8 +314,8 @@ def matched_steps(matches: PairMatches, slides: Slides) -> Edges:
         slides: of the same steps.
 
     Returns:
-        Edges. Along an unconstrained direction the variance is that of the shift. Elsewhere the information is at
-        least that of `pose_steps`.
+        Edges. Along an unconstrained direction the variance is that of the shift. In all other directions the
+        information is at least that of `pose_steps`.
     """
     loose = pose_steps(se2.chain(matches.poses), slides.typical_range)
     fixed = matches.information / (BEAM_DEVIATION * slides.typical_range) ** 2
@@ -330,7 +332,7 @@ def held_steps(slides: Slides, poses: Floats) -> Edges:
         poses: (n, 3) T_world_scan.
 
     Returns:
-        Edges; a step that is open and not torn has information along its weak direction alone.
+        Edges. An open step that is not torn has information along its weak direction alone.
     """
     steps = pose_steps(poses, slides.typical_range)
     firm = np.array([slides.typical_range, slides.typical_range, 1.0]) * _LEAST_DEVIATION
@@ -343,7 +345,7 @@ def held_steps(slides: Slides, poses: Floats) -> Edges:
 
 
 def settle_steps(scans: PlanarScans, matches: PairMatches, prior: StepPrior) -> tuple[PairMatches, Slides]:
-    """Shifts ambiguous relative poses along their weak direction to the posterior mode, and re-aligns these scans.
+    """Shifts ambiguous steps along their weak direction to the posterior mode, and re-aligns their scans.
 
     Args:
         scans: n scans in time order.

@@ -1,4 +1,4 @@
-"""Views of planar scans: the range by the bearing, which shows what a scan has seen and looked through.
+"""Views of planar scans: the range by the bearing, with the surfaces and the free space that a scan has seen.
 
 A view has, for each bearing, the range and the slant of the surface, and the free space in front of it.
 """

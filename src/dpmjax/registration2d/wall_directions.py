@@ -65,7 +65,7 @@ class WallDirections:
         return best
 
     def most_similar(self, rows: Indices, others: Indices, count: int) -> Indices:
-        """Finds the most similar scans of each scan, by blocks: memory grows with the rows, not with all pairs.
+        """Finds the most similar scans of each scan. Blocks let memory grow with the rows, not with all pairs.
 
         Args:
             rows: (r,) rows.
@@ -73,7 +73,7 @@ class WallDirections:
             count: largest number of partners.
 
         Returns:
-            (r, k) rows of `others`, the most similar first; k is `count`, or the number of other scans if it is less.
+            (r, k) rows of `others`, the most similar first; k is the lesser of `count` and the number of other scans.
         """
         num_kept = min(count, len(others) - int(np.isin(rows, others).any()))
         chosen, height = np.empty((len(rows), num_kept), np.int64), max(1, _BLOCK // max(len(others), 1))
@@ -93,7 +93,7 @@ class WallDirections:
             num_peaks: number of peaks of the similarity, around which headings are chosen.
 
         Returns:
-            (p, num_turns); all of them where a scan has no walls.
+            (p, num_turns) True for chosen headings; all of them if a scan has no walls.
         """
         curve, row = self.similarity(source, target), np.arange(len(source))[:, None]
         turns = np.broadcast_to(np.ptp(curve, axis=1)[:, None] < 1e-6, (len(source), num_turns)).copy()

@@ -119,7 +119,7 @@ class PairSystems(NamedTuple):
 
     @property
     def visible(self) -> Floats:
-        """Share (p,) of the points that the other image sees."""
+        """Share (p,) of the points that the target image sees."""
         return np.asarray(self.comparable / self.match.shape[1] - UNSEEN_SHARE)
 
 

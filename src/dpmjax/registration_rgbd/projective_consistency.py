@@ -55,7 +55,7 @@ def image_agreement(
 ) -> Agreement:
     """Computes matches less contradictions of points with the depth image of another camera.
 
-    A point on the surface of the image matches. A point in front of that surface contradicts it, because the other
+    A point on the surface of the image matches. A point in front of that surface contradicts it, because the second
     camera looked through it. This is the self-contradictory occupancy of DeepMapping figure 3, tested on the image
     instead of the map. A point behind the surface is occluded and counts 0.
 

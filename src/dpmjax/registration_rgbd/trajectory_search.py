@@ -266,7 +266,7 @@ def _tracked(beam: _Beam, view: DepthView) -> _Tracked | None:
 
 
 def _finished(beam: _Beam, views: list[DepthView]) -> PlacedImages:
-    """Adjusts all keyframes at falling tolerances, then the other images, and selects the best trajectory."""
+    """Adjusts all keyframes at falling tolerances, then the images between, and selects the best trajectory."""
     camera, config = beam.camera, SEARCH[beam.camera.motion]
     images, T = DepthImages(beam.views, camera, _NUM_LAST_SAMPLES), beam.T[:_NUM_LAST].copy()
     shares, explained = [], []
@@ -352,7 +352,7 @@ def explained_shares(
     Args:
         images: n + 1 views and their camera.
         T_world_camera: (n, 4, 4) poses of all images but the last one.
-        T_world_last: (k, 4, 4) poses of the last image, of which each makes a trajectory.
+        T_world_last: (k, 4, 4) poses of the last image; each gives one trajectory.
         tolerance: share of the depth by which matching points may differ.
 
     Returns:

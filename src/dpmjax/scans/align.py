@@ -84,8 +84,8 @@ class Prior(NamedTuple):
 
     Attributes:
         T_target_source: (d+1, d+1).
-        information: (k, k) inverse covariance of the shift, then of the turn about the centre of the pairs, in the
-            frame of the target and in units of the weight of one pair per squared unit of length.
+        information: (k, k) inverse covariance of the shift, then of the turn about the centre of the pairs. It is in
+            the frame of the target; its unit is the weight of one pair per squared unit of length.
     """
 
     T_target_source: Any

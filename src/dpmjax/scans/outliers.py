@@ -1,7 +1,7 @@
 """Statistical outliers of a thinned scan on the host: points whose neighbours are far, compared with those of others.
 
-The limit rests on all points, but the neighbours of lonely points alone are searched, and those of some others: a fifth
-of the time, with the same result up to a percent of the limit.
+The limit rests on all points, but neighbours are searched only for lonely points and for a sample. This takes a fifth
+of the time; the result is the same up to a percent of the limit.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ class PairEvidence(NamedTuple):
     Attributes:
         score: agreement of the visible parts of both scans, 1 at most.
         lead: difference of the score to that of the best motion to another place.
-        visible: share of both scans that the other sees.
+        visible: share of the points of both scans in view of their partner.
         sigma: standard deviation along the weak direction, in typical ranges.
     """
 

@@ -16,8 +16,8 @@ KERNELS_M = (0.5, 0.5, 0.4, 0.3, 0.3, 0.2, 0.2, 0.1, 0.1, 0.1)
 NUM_ELEMENTS = 2000
 
 
-# A size counts if it differs from 1 by more, and if as many more elements meet planes: those of 8 real pairs are within
-# 0.002 and gain up to 0.005, copies enlarged by 2 % gain 0.17.
+# A size counts if it differs from 1 by more than MIN_DIFFERENCE, and if the elements that meet planes increase by more
+# than MIN_GAIN. The sizes of 8 real pairs are within 0.002 of 1 and gain up to 0.005; copies enlarged by 2 % gain 0.17.
 MIN_DIFFERENCE, MIN_GAIN = 0.01, 0.05
 
 

@@ -49,9 +49,9 @@ FIRM_FLATNESS = 0.3
 # A smaller share of the first elements may face an axis by chance.
 NUM_FACED, MIN_FACING_SHARE = 1000, 0.01
 
-# Normals of both scans face the axis of a corridor alike if the sum of the products of their components along it is
-# so many times its standard deviation by chance (bare walls up to 5, a relief of 3 cm above 10), and if their mean is
-# larger (bare walls up to 0.0002, a relief of 3 cm 0.0015).
+# The components along the axis of a corridor are multiplied for paired normals of both scans. Normals face the axis
+# alike if the sum of the products exceeds 6 standard deviations by chance, and if their mean exceeds 0.0005. Bare walls
+# have sums up to 5 and means up to 0.0002; a relief of 3 cm has sums above 10 and a mean of 0.0015.
 MIN_SIGNIFICANCE, MIN_ALIKE = 6.0, 0.0005
 
 BIN_M, NUM_BINS, MAX_COUNT = 0.2, 301, 20.0
@@ -193,9 +193,9 @@ def _with_kept(pairs: Pairs, direction: Float[np.ndarray, "3"], kept: Float[np.n
 def without_noise_along(pairs: Pairs, source: Surface, T_target_source: Pose, axis: Float[np.ndarray, "3"]) -> Pairs:
     """Removes from normals the component along an axis that is noise.
 
-    Elements that face the axis count, if they are enough. If not, the components count as far as the normals of both
-    scans have them: their noise is independent, so that the products of both are zero in the mean, but a relief of
-    centimetres is the same in both.
+    Elements that face the axis count, if they are enough. If not, only the components that the normals of both scans
+    share count. The noise of the two scans is independent, so the products have the mean zero. A relief of centimetres
+    is the same in both scans.
 
     Args:
         pairs: a pair for each of the first samples of the source.

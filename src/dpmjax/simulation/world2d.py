@@ -1,10 +1,10 @@
 """Binary worlds of 1024 x 1024 pixels in the manner of DeepMapping Figure 4, and exact beams of a planar lidar in them.
 
-A world is made by its seed. The index selects one of three kinds in turn. 0 is an office (rooms by repeated division).
-1 is a yard (free-standing blocks, open to the border of the image). 2 is a clinic (a corridor between two rows of
-rooms). All have round, square and triangular obstacles, so that no two places look alike. Two more kinds have names
-only. A grove has trees, bushes and rocks within the edge of a forest, no straight wall. A crowd is an office with
-walking people.
+A world is made by its seed. The index selects one of three kinds in turn. Index 0 is an office (rooms by repeated
+division). Index 1 is a yard (free-standing blocks, open to the border of the image). Index 2 is a clinic (a corridor
+between two rows of rooms). All have round, square and triangular obstacles, so that no two places look alike. Two more
+kinds have names only. A grove has trees, bushes and rocks within the edge of a forest, but no straight wall. A crowd is
+an office with walking people.
 
 Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1). The x axis points right along the
 columns, y points up along the rows (row 0 is the lowest). So the world is right-handed, and a plot with the origin

@@ -1,7 +1,8 @@
 """Several agents: each maps alone, keyframes are exchanged, maps that meet are joined (DeepPointMap section 4).
 
-The relative pose of two maps is unknown. Candidates are similar keyframes of different maps. Like all
-loops, each is registered and verified, and accepted only together with others that the odometry of both maps confirms.
+The relative pose of two maps is unknown. Candidates of loops are similar keyframes of different maps. Each candidate is
+registered and verified. It is accepted only together with further loops that agree with it by the odometry of both
+maps.
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ def _ignore(_: int, __: int) -> None:
 
 @with_short_repr
 class JoinedMaps(NamedTuple):
-    """Several maps in one record; those that meet have one frame.
+    """Several maps in one record; maps that meet have one frame.
 
     Attributes:
         slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
         map_of_keyframe: (k,) number of the map that each keyframe comes from.
         component_of_map: number of the component of each map, from 0; joined maps share one. Each component has its own
-            frame, so poses of different components cannot be compared; nor can those of different `measured_parts`.
+            frame. Poses of different components or of different `measured_parts` cannot be compared.
         loops: candidates between maps and their outcome; rows are those of `slam_map`.
     """
 
@@ -88,7 +89,7 @@ class AgentsResult(NamedTuple):
     Attributes:
         T_world_scan: (n, 4, 4) float64 poses of each agent. The world of a component is the frame of the first scan of
             its first agent.
-        component: number of the component of each agent; agents of one component have met, and only their poses can be
+        component: number of the component of each agent. Agents of one component have met. Only their poses can be
             compared, within `measured_parts`.
         joined: all keyframes in one record, and the loops between agents.
         agents: result of each agent alone.
@@ -126,7 +127,7 @@ class MergedMaps(NamedTuple):
 
     @property
     def is_joined(self) -> bool:
-        """True where all maps have become one, in which measured motions join all keyframes."""
+        """True if all maps have become one, and measured motions join all its keyframes."""
         return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
@@ -137,7 +138,7 @@ def run_agents(
     """Maps with several agents: each runs alone, and loops between their maps join them.
 
     These loops are found by retrieval over the keyframes of all other agents, without any position. The order of the
-    agents does not change who meets whom.
+    agents does not change the joined maps.
 
     Args:
         model: a trained model; or methods of your own.
@@ -159,7 +160,7 @@ def run_agents(
 def join_agents(
     methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe = _ignore
 ) -> AgentsResult:
-    """Joins the maps that agents have made alone, the second half of `run_agents`.
+    """Joins the maps of agents; this is the second half of `run_agents`.
 
     Args:
         methods: methods of all agents.
@@ -183,15 +184,15 @@ def join_agents(
 def merge_maps(
     model: Model | SlamMethods, *maps: KeyframeMap | str | Path, on_keyframe: OnKeyframe = _ignore
 ) -> MergedMaps:
-    """Joins maps of different days or of different robots where they show the same places.
+    """Joins maps of different days or of different robots at the places that they share.
 
     Args:
-        model: the model that made the maps, which takes the settings of the first one; or methods of your own.
+        model: the model that made the maps, or methods of your own. A model takes the settings of the first map.
         *maps: two or more, or their files. The frame of the first map of each component is kept.
         on_keyframe: called while keyframes are compared, for progress.
 
     Returns:
-        One map, or several where no loop joins them, and the maps that have met.
+        One map, or several if no loop joins them, and the maps that have met.
 
     Raises:
         ValueError: if there are fewer than two maps, if one is no map, or if one was made with other weights.
@@ -211,7 +212,7 @@ def merge_maps(
 
 
 def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = _ignore) -> JoinedMaps:
-    """Finds loops between maps and optimises those that meet as one graph.
+    """Finds loops between maps, and optimises each group of joined maps as one graph.
 
     The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
 
@@ -280,7 +281,7 @@ def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
 def _in_own_frames(
     joined: KeyframeMap, map_of_row: np.ndarray, components: Sequence[int], maps: Sequence[KeyframeMap]
 ) -> Poses:
-    """Moves each component, so that the first keyframe of its first map stays where it was."""
+    """Moves each component so that the first keyframe of its first map keeps its pose."""
     T_old = joined.T_world_keyframe
     _, first_rows, component = np.unique(np.array(components)[map_of_row], return_index=True, return_inverse=True)
     T_new_old = [maps[map_of_row[row]].T_world_keyframe[0] @ rigid.inverse(T_old[row]) for row in first_rows]

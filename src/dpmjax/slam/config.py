@@ -20,8 +20,8 @@ class OdometryConfig:
     """Registration of a scan against the local map, point to plane.
 
     Attributes:
-        proposer: source of the first guess. With "prediction" it is the last motion; if that fails, further motions and
-            those of the decoder are tried. With "network" the decoder registers each scan to the nearest keyframe
+        proposer: source of the first guess. "prediction" takes the last motion. If it fails, further motions and those
+            of the decoder are tried. With "network" the decoder registers each scan to the nearest keyframe
             (DeepPointMap section 4).
         num_keyframes: number of the nearest keyframes in the local map.
     """
@@ -41,7 +41,7 @@ class FrontEndConfig:
     Attributes:
         min_probability: smallest P(correct) of a decoder's motion that confirms a pose of too low a score.
         num_submap: largest number of keyframes that are merged for a registration.
-        num_lost: number of scans without an accepted pose after which a new segment begins, which loops may join.
+        num_lost: after this number of scans without an accepted pose, a new segment begins. Loops may join it later.
         keyframe_share: distance of keyframes, as a share of the extent.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of the distance of keyframes.
@@ -66,11 +66,11 @@ class LoopClosureConfig:
     """Candidates of loops, and acceptance of their registrations.
 
     Attributes:
-        is_on: False leaves the map as odometry makes it.
+        is_on: False searches no loops: the map is that of odometry.
         num_similar: largest number of candidates by retrieval.
         min_overlap: smallest overlap probability of a candidate that is registered.
         min_probability: smallest P(correct) of an accepted registration.
-        min_support: smallest number of consistent registrations, its own included, with which a loop becomes an edge.
+        min_support: a loop becomes an edge with this number of consistent registrations, its own included.
     """
 
     is_on: bool = True
@@ -90,11 +90,11 @@ class DescriptorConfig:
     """SLAM by descriptors alone (DeepPointMap section 4; defaults: published configuration).
 
     Attributes:
-        keyframe_m: distance of keyframes at the start of a drive; small errors of registrations enlarge it, large ones
-            reduce it (published: 10 for KITTI, 7 for KITTI-360, 3 for MulRan).
+        keyframe_m: distance of keyframes at the start of a drive (published: 10 for KITTI, 7 for KITTI-360, 3 for
+            MulRan). Small errors of registrations enlarge the distance, and large errors reduce it.
         min_confidence: smallest mean score of the best pairs of an accepted registration.
-        max_rmse_m: largest root mean square error of the pairs of an accepted registration, also the unit of errors
-            in the rule of keyframes. A decoder whose offsets are not exact needs more: 2.5 for `dpm_small`.
+        max_rmse_m: largest root mean square error of the pairs of an accepted registration. It is also the unit of
+            errors in the rule of keyframes. A decoder with inexact offsets needs more: 2.5 for `dpm_small`.
         min_overlap: overlap probability above which the best candidate of a loop is registered.
     """
 
@@ -113,8 +113,8 @@ class SlamConfig:
     """Settings of `run_slam`.
 
     Attributes:
-        method: "surfaces" aligns surface elements; the decoder proposes motions. With "descriptors" the decoder alone
-            registers scans and maps (DeepPointMap section 4).
+        method: "surfaces" aligns surface elements, and the decoder proposes motions. With "descriptors" the decoder
+            alone registers scans and maps (DeepPointMap section 4).
         odometry: registration against the local map, for "surfaces".
         front_end: acceptance of poses, and keyframes, for "surfaces".
         loops: loop closure and optimisation, for "surfaces"; `is_on` counts for both.
@@ -132,7 +132,7 @@ class SlamConfig:
 
     @property
     def encodes_each_scan(self) -> bool:
-        """True where each scan is encoded, not keyframes alone."""
+        """True if every scan is encoded, instead of keyframes alone."""
         return self.method == "descriptors" or self.odometry.proposer == "network"
 
 
@@ -143,8 +143,9 @@ def slam_preset(name: SlamPreset) -> SlamConfig:
     """Returns named settings of SLAM.
 
     Args:
-        name: "default", or "paper" for section 4 of DeepPointMap by its own method, with the published thresholds: the
-            decoder's motion is the pose, and no surfaces are aligned. Our weights need a larger `max_rmse_m`.
+        name: "default", or "paper" for section 4 of DeepPointMap by its own method, with the published thresholds. With
+            "paper" the decoder's motion is the pose, and no surfaces are aligned. Our weights need a larger
+            `max_rmse_m`.
 
     Returns:
         The settings.

@@ -46,7 +46,7 @@ NUM_TRANSLATION_STEPS, NUM_ROTATION_STEPS = 100, 5000
 def close_loops_by_descriptors(
     methods: SlamMethods, slam_map: KeyframeMap, state: LoopState
 ) -> tuple[KeyframeMap, LoopState]:
-    """Looks for a loop of the newest keyframe, and optimises where one was found.
+    """Looks for a loop of the newest keyframe, and optimises the map if there is one.
 
     Args:
         methods: matcher and settings.
@@ -54,7 +54,7 @@ def close_loops_by_descriptors(
         state: loops so far.
 
     Returns:
-        The map and the loops after; of all candidates only the one of the highest overlap is noted.
+        The map and the loops after. Only the candidate of the highest overlap is noted.
     """
     if not methods.config.loops.is_on:
         return slam_map, state
@@ -66,7 +66,7 @@ def close_loops_by_descriptors(
 def join_keyframe_by_descriptors(
     methods: SlamMethods, slam_map: KeyframeMap, loops: tuple[Loop, ...], row: int, is_allowed: Bool[np.ndarray, " k"]
 ) -> tuple[KeyframeMap, tuple[Loop, ...]]:
-    """Looks for a loop from a keyframe to allowed ones, and optimises the map where one is accepted.
+    """Looks for a loop from a keyframe to allowed ones, and optimises the map if a loop is accepted.
 
     Args:
         methods: matcher and settings.
@@ -114,7 +114,7 @@ def find_loop_targets(
         is_allowed: False for keyframes that are no candidates.
 
     Returns:
-        Rows of keyframes within 100 m, and of all keyframes that no edges join to `row`: their distance is unknown.
+        Rows of keyframes within 100 m, and of all keyframes that no edges join to `row`, whose distance is unknown.
     """
     T_world, part = slam_map.T_world_keyframe, measured_parts(slam_map)
     T_row_other = rigid.inverse(T_world[row]) @ T_world
@@ -128,14 +128,14 @@ def find_loop_targets(
 
 
 def _is_rested(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
-    """Returns True where the last accepted loop of the same drive is far enough back along the path."""
+    """Returns True if the last accepted loop of the same drive is far enough back along the path."""
     last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
     keyframe = slam_map.keyframes[row]
     return last is None or last.segment != keyframe.segment or keyframe.path_m - last.path_m >= NEAR_M
 
 
 def disjoint_neighbours(slam_map: KeyframeMap, row: int, target: int) -> tuple[list[int], list[int]]:
-    """Finds the keyframes around both ends of a loop; one that is around both belongs to the nearer end.
+    """Finds the keyframes around both ends of a loop. A keyframe that is around both belongs to the nearer end.
 
     Args:
         slam_map: the map.
@@ -143,7 +143,7 @@ def disjoint_neighbours(slam_map: KeyframeMap, row: int, target: int) -> tuple[l
         target: row of the second end.
 
     Returns:
-        The rows around each end, which is the first of them.
+        The rows around each end; the end itself is the first row.
     """
     ends = row, target
     near = [neighbours_of(slam_map, end, SUBMAP_RADIUS_M).tolist() for end in ends]
@@ -177,9 +177,9 @@ def verify_match(methods: SlamMethods, slam_map: KeyframeMap, loop: Loop, match:
 
 
 def optimize_with_loop(slam_map: KeyframeMap, loop: Loop) -> KeyframeMap:
-    """Adds the edge of a loop, and finds the poses that agree best with all edges; all of them are certain.
+    """Adds the edge of a loop, and finds the poses that agree best with all edges. No edge is rejected.
 
-    Parts that the loop joins for the first time are first moved to the pose that it gives.
+    If the loop joins two parts for the first time, one part first moves to the pose that the loop gives.
 
     Args:
         slam_map: the map.

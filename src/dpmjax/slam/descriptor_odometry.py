@@ -1,7 +1,7 @@
 """Odometry by descriptors alone: the decoder's motion is the pose of a scan (DeepPointMap section 4).
 
-Each scan is registered with the nearest keyframe. A scan that becomes a keyframe is registered again, with the merged
-descriptors of the keyframes around that one. No surface is aligned.
+Each scan is registered with the nearest keyframe. A scan that becomes a keyframe is registered again, now with the
+merged descriptors of the keyframes around the nearest one. No surface is aligned.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ Placed = tuple[FrontEndState, KeyframeMap, ScanReport]
 def place_by_descriptors(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: PreparedInput
 ) -> Placed:
-    """Registers a scan with the nearest keyframe, and makes it a keyframe where it is far from all others.
+    """Registers a scan with the nearest keyframe, and makes it a keyframe if it is far from all keyframes.
 
-    A registration beyond the limits is dropped, and the scan gets the pose of the last motion. Of five scans in a row
-    without an accepted registration, that of the smallest error is accepted.
+    A registration beyond the limits is dropped, and the scan gets the pose of the last motion. After five scans in
+    a row without an accepted registration, the registration of the smallest error is accepted.
 
     Args:
         methods: matcher and settings.
@@ -81,7 +81,7 @@ def is_accepted(match: Match, config: DescriptorConfig) -> bool:
 
 
 def keyframe_spacing_m(ratio: float, config: DescriptorConfig) -> float:
-    """Returns the distance to all keyframes from which on a scan becomes one."""
+    """Returns the least distance to all keyframes at which a scan becomes a keyframe."""
     return max(config.keyframe_m * ratio, MIN_KEYFRAME_M)
 
 
@@ -91,17 +91,17 @@ def next_ratio(ratio: float, rmse: float, max_rmse_m: float) -> float:
     Args:
         ratio: the factor before.
         rmse: error of an accepted registration, metres.
-        max_rmse_m: error from which on the factor falls to 0.
+        max_rmse_m: at this error or a larger one, the factor falls to 0.
 
     Returns:
-        The factor after, in [0, 2]: it grows where errors are small.
+        The factor after, in [0, 2]. Small errors let it grow.
     """
     quality = (1 - min(rmse / max_rmse_m, 1.0)) ** 2
     return float(np.clip(RATIO_MEMORY * ratio + (1 - RATIO_MEMORY) * MAX_RATIO * quality, 0.0, MAX_RATIO))
 
 
 def best_of(dropped: tuple[RegisteredScan | None, ...]) -> RegisteredScan | None:
-    """Returns the scan of the smallest error among the last five; None where none has a motion."""
+    """Returns the scan of the smallest error among the last five; None if no scan has a motion."""
     found = [one for one in dropped[-NUM_DROPPED:] if one is not None and np.isfinite(one.match.rmse)]
     return min(found, key=lambda one: one.match.rmse, default=None)
 
@@ -130,7 +130,7 @@ def nearest_keyframe(slam_map: KeyframeMap, state: FrontEndState) -> int:
 
 
 def information_of(match: Match) -> Information:
-    """Returns the information of a registration, and the usual one of descriptors where it has none."""
+    """Returns the information of a registration, or the usual one of descriptors if it has none."""
     return DESCRIPTOR_INFORMATION if match.information is None else match.information
 
 
@@ -155,7 +155,7 @@ def _begin_part(
 def _accept(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, found: RegisteredScan, report: ScanReport
 ) -> Placed:
-    """Takes over the registration of a scan, which becomes a keyframe where it is far from all."""
+    """Accepts the registration of a scan, and makes it a keyframe if it is far from all keyframes."""
     config, ratio, match = methods.config.descriptors, state.keyframe_ratio or 0.0, found.match
     T_world_scan = slam_map.T_world_keyframe[found.target] @ match.T_target_source
     apart_m = slam_map.distances_to(T_world_scan[:3, 3])[neighbours_of(slam_map, len(slam_map) - 1)]

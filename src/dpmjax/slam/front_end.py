@@ -1,7 +1,7 @@
 """The front end: each scan in turn gets a pose, and some become keyframes (DeepPointMap section 4).
 
-The last motion or the decoder gives a first guess. The alignment with the local map makes it exact, and the share of
-elements that meet planes decides whether the pose is accepted.
+The last motion or the decoder gives a first guess. The alignment with the local map makes it exact. The pose is
+accepted if a large share of the elements meet planes.
 """
 
 from __future__ import annotations
@@ -81,10 +81,10 @@ class ScanReport(NamedTuple):
         status: how the pose was found.
         reason: the numbers that decided.
         keyframe: row of the keyframe that the pose is relative to; its own row if it is one.
-        T_keyframe_scan: relative pose; loops move the keyframe only.
+        T_keyframe_scan: relative pose. Loops do not change it, because they move keyframes only.
         is_keyframe: True if it became a keyframe.
-        score: agreement of the scan with the local map; where the method is "descriptors", confidence of the decoder.
-        probability: P(correct) of the network; None where it did not run.
+        score: agreement of the scan with the local map; with the method "descriptors", confidence of the decoder.
+        probability: P(correct) of the network; None if it did not run.
         num_accepted: number of loops that were accepted at this scan.
         num_points: number of points of the scan.
         T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
@@ -128,16 +128,17 @@ class FrontEndState(NamedTuple):
 
     Attributes:
         num_scans: number of scans so far, those of a loaded map among them.
-        recent: the last scans that were accepted some distance apart, oldest first; none before the first keyframe.
-        local_map: nearest keyframes and recent scans; None where it has to be made from the map.
+        recent: the last accepted scans that lie apart, oldest first; none before the first keyframe.
+        local_map: nearest keyframes and recent scans; None if it must be built from the map.
         T_keyframe_last: pose of the last scan.
         T_before_last: motion of the last scan since the scan before.
-        scores: of recent scans that were accepted.
-        lost: the scans since one was accepted, at their predicted poses.
-        dropped: the same where the method is "descriptors", with their registrations; None for an empty scan.
-        keyframe_ratio: factor of the distance of keyframes where the method is "descriptors"; None before the first.
-        num_coasting: number of scans since the way along a corridor was known.
-        num_agreed: number of scans in a row, among the first, whose pose the last motion and the decoder lead to.
+        scores: scores of recent accepted scans.
+        lost: scans since the last accepted one, at their predicted poses.
+        dropped: the same for the method "descriptors", with their registrations; None for an empty scan.
+        keyframe_ratio: factor of the distance of keyframes for the method "descriptors"; None before the first.
+        num_coasting: number of scans since the position along a corridor was last measured.
+        num_agreed: at the beginning, number of scans in a row at which the last motion and the decoder lead to one
+            pose.
     """
 
     num_scans: int = 0
@@ -154,7 +155,7 @@ class FrontEndState(NamedTuple):
 
     @property
     def is_settled(self) -> bool:
-        """True once the usual score rests on right poses."""
+        """True after enough right poses for the usual score."""
         return len(self.scores) >= NUM_USUAL or self.num_agreed >= NUM_AGREED
 
     @property
@@ -171,7 +172,7 @@ class FrontEndState(NamedTuple):
 def place_scan(
     methods: SlamMethods, state: FrontEndState, slam_map: KeyframeMap, scan: PreparedInput
 ) -> tuple[FrontEndState, KeyframeMap, ScanReport]:
-    """Estimates the pose of a scan, and makes it a keyframe where it is far enough from the last one.
+    """Estimates the pose of a scan, and makes it a keyframe if it is far enough from the last one.
 
     Args:
         methods: matcher, geometry, settings.
@@ -331,14 +332,14 @@ class _Search(NamedTuple):
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
-    """Returns the pose moved along an axis of the scan to where the guess is."""
+    """Returns the pose, moved along an axis of the scan to the position of the guess."""
     held, along = T_map_scan.copy(), T_map_scan[:3, :3] @ axis
     held[:3, 3] += along @ (guess - T_map_scan)[:3, 3] * along
     return held
 
 
 def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
-    """Returns `other` where its score is higher than that of `tracked`, at another place higher by the lead."""
+    """Returns `other` if its score beats that of `tracked`; at another place it must beat it by the lead."""
     is_same = are_near(tracked.T_map_scan, other.T_map_scan, PLACE_M, PLACE_RAD)
     return other if other.score > tracked.score + (0.0 if is_same else lead) else tracked
 
@@ -386,7 +387,7 @@ def with_keyframe(methods: SlamMethods, slam_map: KeyframeMap, keyframe: Keyfram
     Args:
         methods: matcher and settings.
         slam_map: the map before.
-        keyframe: the keyframe as the first of a map; with an edge, its pose, path and segment follow from the edge.
+        keyframe: the new keyframe. If there is an edge, its pose, path and segment are replaced by those of the edge.
         edge: edge from the keyframe to an earlier one; a "guess" begins a segment. None for the first of a map.
 
     Returns:

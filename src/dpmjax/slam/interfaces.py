@@ -1,7 +1,7 @@
 """The parts of SLAM that are arguments: a matcher, the geometry of odometry, and settings.
 
-`model_methods` makes those of a trained model: `SurfaceGeometry` aligns scans with the local map, `NetworkMatcher`
-recognises places.
+The module `model_methods` makes these parts of a trained model. `SurfaceGeometry` aligns scans with the local map, and
+`NetworkMatcher` recognises places.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Geometry(Protocol):
         """
 
     def other_motions(self, T_last_scan: Pose, extent_m: float) -> Poses:
-        """Returns motions that a vehicle may make instead of the predicted one.
+        """Returns possible motions of a vehicle besides the predicted one.
 
         Args:
             T_last_scan: the predicted motion.
@@ -97,7 +97,7 @@ class Match(NamedTuple):
         rmse: root mean square error of the inlier pairs, metres.
         verification: agreement of the scans under the motion; None where the matcher has no scans.
         information: (6, 6) inverse covariance by the planes of the scans, in the tangent of the source, translation
-            first; None where it is unknown. `Matcher.match` gives one by the pairs of points.
+            first; None if it is unknown. `Matcher.match` computes it from the pairs of points.
     """
 
     T_target_source: Pose
@@ -112,7 +112,7 @@ class Proposal(NamedTuple):
 
     Attributes:
         T_target_source: (h, 4, 4) float64, the most likely first.
-        probability: P(correct) of the first motion; of a model without calibration a score.
+        probability: P(correct) of the first motion, or a score for a model without calibration.
         is_calibrated: True for a probability.
     """
 
@@ -135,7 +135,7 @@ class Matcher(Protocol):
     def encode(self, scan: Scan) -> CompactScan:
         """Prepares a scan for any number of registrations.
 
-        Where each scan is encoded it runs one scan ahead, in the thread of `Geometry.thin`.
+        If every scan is encoded, this runs one scan ahead, in the thread of `Geometry.thin`.
 
         Args:
             scan: the scan.
@@ -243,7 +243,7 @@ class PreparedInput(NamedTuple):
         num_points: number of points of the raw scan.
         thinned: the thinned scan; None if it is empty.
         T_turn: predicted motion that a scan with times was deskewed by; None for a scan without times.
-        compact: the encoded scan; None where it was not encoded.
+        compact: the encoded scan; None if it was not encoded.
     """
 
     num_points: int

@@ -1,7 +1,7 @@
 """Joint refinement of the poses of many scans by their surfaces (Borrmann et al. 2008: globally consistent scans).
 
-Near scans are aligned pair by pair from their present poses, and all these motions make a pose graph. A scan that many
-others see is then held by all of them, where a chain of alignments holds it by one.
+Near scans are aligned pair by pair from their present poses, and all these motions make a pose graph. So all scans with
+a common surface constrain a pose. In a chain of alignments, a single scan would constrain it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def refine_jointly(surfaces: Sequence[Surface], T_world_scan: Poses, pairs: Int[
         pairs: rows of scans that overlap; each pair once.
 
     Returns:
-        The poses; the first scan stays where it is. Scans that no pair joins to others stay, too.
+        The poses. The first scan keeps its pose, and so do scans without a pair.
     """
     T_world = np.array(T_world_scan, np.float64)
     for _ in range(NUM_ROUNDS):
@@ -93,7 +93,7 @@ def align_pair(
         pair: rows of the source and the target.
 
     Returns:
-        T_target_source and its information; None where the alignment left the present poses.
+        T_target_source and its information; None if the result is far from the present poses.
     """
     source, target = (surfaces[row] for row in pair)
     T_start = rigid.inverse(T_world_scan[pair[1]]) @ T_world_scan[pair[0]]

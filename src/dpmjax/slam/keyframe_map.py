@@ -1,6 +1,6 @@
-"""The map: keyframes, their poses, the relative poses measured between them. Nothing is changed in place.
+"""The map: keyframes, their poses, and measured relative poses between them. Functions change no map in place.
 
-A map for localisation may be thinned: keyframes that another one covers are left out, and the graph is contracted.
+A map for localisation may be thinned. Redundant keyframes are left out, and the graph is contracted.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Keyframe(NamedTuple):
     Attributes:
         scan: number of the scan.
         T_odometry_keyframe: pose by the chain of odometry alone, which no loop corrects.
-        path_m: length of the path until here, by odometry.
-        segment: number of the unbroken chain of odometry that it belongs to.
+        path_m: length of the path to this keyframe, by odometry.
+        segment: number of its unbroken chain of odometry.
         extent_m: median range of its points.
         compact: descriptors, surface elements and free space.
     """
@@ -54,7 +54,7 @@ class MapEdge(NamedTuple):
         target: row of the second keyframe.
         T_target_source: float64.
         information: (6, 6) inverse covariance in the tangent of the source, translation first.
-        kind: source of the relative pose; a "guess" is a motion that was only predicted.
+        kind: source of the relative pose; a "guess" was predicted and not measured.
     """
 
     source: int
@@ -155,7 +155,7 @@ def add_keyframe(
 
 
 def joined_maps(slam_map: KeyframeMap, other: KeyframeMap) -> KeyframeMap:
-    """Appends the keyframes and the edges of another map; rows in its edges must already count those of the first map.
+    """Appends the keyframes and the edges of another map. Rows in its edges must count from the start of the first map.
 
     Args:
         slam_map: the map before.
@@ -233,11 +233,11 @@ def submap_around(slam_map: KeyframeMap, row: int, num_keyframes: int, *, radius
     Args:
         slam_map: the map.
         row: row of the central keyframe.
-        num_keyframes: largest number of keyframes, the central one among them, and of edges between them and it.
+        num_keyframes: largest number of keyframes, the central one included, and of edges from it to each of them.
         radius_m: keyframes farther away are left out.
 
     Returns:
-        The submap, in the frame of the central keyframe; the others follow it, nearest first.
+        The submap, in the frame of the central keyframe. Its neighbours follow it, nearest first.
     """
     steps = steps_from(slam_map, row, num_keyframes)
     apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
@@ -255,7 +255,7 @@ def steps_from(slam_map: KeyframeMap, row: int, most: float = np.inf) -> Float[n
         most: largest number of edges that is counted.
 
     Returns:
-        The least number of edges; infinite beyond `most` and where no edges join the two.
+        The least number of edges; infinite beyond `most`, and for keyframes that no edges join to `row`.
     """
     source, target = _ends(slam_map.edges_of("odometry", "loop"))
     joined = sp.coo_array((np.ones(len(source)), (source, target)), (len(slam_map), len(slam_map))).tocsr()
@@ -307,7 +307,7 @@ def measured_parts(slam_map: KeyframeMap) -> Int[np.ndarray, " k"]:
 def as_pose_graph(slam_map: KeyframeMap) -> PoseGraph:
     """Makes the pose graph of a map; the ids of its nodes are numbers of scans.
 
-    A guess stands in it only where no measured edges join its ends.
+    The graph has a guess only if no measured edges join its ends.
 
     Args:
         slam_map: map with at least one keyframe.
@@ -334,8 +334,8 @@ def _ends(edges: Iterable[Sequence[Any]]) -> Int[np.ndarray, "2 e"]:
 def thin_map(slam_map: KeyframeMap, *, spacing_share: float = 0.8) -> KeyframeMap:
     """Leaves out keyframes near others, also of other laps, so that repeated drives of a place do not enlarge the map.
 
-    Poses do not change. An edge between keyframes that were left out joins those that cover them; its
-    information is divided by the number of steps that it replaces.
+    Poses do not change. Each keyframe that is left out has a nearby kept one. Edges join the kept keyframes instead.
+    The information of such an edge is divided by the number of steps that it replaces.
 
     Args:
         slam_map: map of a run.

@@ -1,6 +1,7 @@
 """The local map: surface elements of the nearest keyframes and of the last scans.
 
-A keyframe stores few elements. The last scans keep all, because dense surfaces around the lidar make odometry exact.
+A keyframe stores few elements. The last scans keep all elements, because dense surfaces around the lidar make odometry
+exact.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class LocalMap(NamedTuple):
 
 
 def local_map_of(slam_map: KeyframeMap, recent: Sequence[PlacedElements], config: OdometryConfig) -> LocalMap:
-    """Builds the local map: recent scans, and the nearest keyframes that the graph joins to the last one.
+    """Builds the local map of recent scans and of the nearest keyframes that the graph joins to the last one.
 
     Args:
         slam_map: map with at least one keyframe.
@@ -104,7 +105,7 @@ def _placed(T_map_scan: Pose, *arrays: AnyArray) -> PlacedElements:
 def with_scan(
     recent: tuple[PlacedElements, ...], placed: PlacedElements, extent_m: float
 ) -> tuple[PlacedElements, ...]:
-    """Adds a scan that is far enough from the last one, and drops the oldest of more than `NUM_RECENT` scans.
+    """Adds a scan if it is far enough from the last one. Of more than `NUM_RECENT` scans, the oldest is dropped.
 
     Args:
         recent: the last scans, oldest first.
@@ -112,7 +113,7 @@ def with_scan(
         extent_m: extent of the scan; 0 adds it at any distance.
 
     Returns:
-        The new last scans; the same tuple where the scan is not added.
+        The new last scans; the same tuple if the scan is not added.
     """
     if recent:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan

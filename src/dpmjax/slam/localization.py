@@ -1,7 +1,7 @@
-"""Re-localisation: single scans are found in a map without a first guess, or reported as not in it.
+"""Re-localisation: finds single scans in a map without a first guess, or reports that they are not in it.
 
-The keyframes that look most alike are registered one by one. Registrations that put the scan at the same place support
-each other: two wrong ones rarely agree. Then the neighbours of that place are registered too.
+The scan is registered with the most similar keyframes one by one. Registrations that put the scan at the same place
+support each other, because two wrong ones rarely agree. Then the keyframes near that place are registered, too.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ class LocalizationConfig:
     Attributes:
         num_similar: number of keyframes by retrieval whose overlap is estimated.
         num_registered: largest number of these keyframes that are registered, in order of their overlap.
-        min_support: number of registrations that must end at the same place; the scans of at least one must agree. One
-            registration suffices where no other keyframe is near.
-        min_best: smallest P(correct) of the best registration of a place. It is the best of the places that look most
-            alike, and several registrations may agree on a wrong one: streets look alike.
+        min_support: number of registrations that must end at the same place. The scans of at least one registration
+            must agree. One registration suffices if no other keyframe is near.
+        min_best: smallest P(correct) of the best registration of a place. Streets look alike, so several registrations
+            may agree on a wrong place. A high limit rejects such places.
     """
 
     num_similar: int = 16
@@ -98,13 +98,13 @@ class Localization(NamedTuple):
 
     Attributes:
         status: "found", "not in this map", or "empty": the scan has too few points.
-        T_world_scan: pose in the frame of the map, see `part`; None where it was not found.
-        probability: P(correct) of the place; 0 where it was not found.
-        keyframe: row of the keyframe of the most probable registration; None where it was not found.
+        T_world_scan: pose in the frame of the map, see `part`; None if the scan was not found.
+        probability: P(correct) of the place; 0 if the scan was not found.
+        keyframe: row of the keyframe of the most probable registration; None if the scan was not found.
         reason: the numbers that decided.
         evidence: all registrations.
         part: number of the part of the map that holds the pose (`measured_parts`). Only part 0 has the frame of the
-            map: the relative pose of a part that no loop joins is a guess.
+            map. The relative pose of a part that no loop joins to it is a guess.
     """
 
     status: LocalizationStatus
@@ -186,7 +186,7 @@ class _Search(NamedTuple):
     parts: Int[np.ndarray, " k"]
 
     def localized(self, scan: Float[AnyArray, "_n 3"] | str | Path) -> Localization:
-        """Registers the scan with keyframes until the place is clear, or none is left."""
+        """Registers the scan with keyframes until the place is clear, or no keyframe remains."""
         thinned = self.methods.geometry.thin(corrected_points(scan, None))
         if thinned is None:
             return Localization("empty", None, 0.0, None, "too few points")

@@ -1,7 +1,7 @@
 """Loop closure: detection, registration map to map, and verification (DeepPointMap section 4).
 
-Candidates are older keyframes near the new one by the estimated poses, or similar to it by retrieval. Loops that agree
-with others become edges, and the map is optimised.
+Candidates are older keyframes that are near the new one by the estimated poses, or similar to it by retrieval. Loops
+that agree with others become edges, and the map is optimised.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ MAX_AGAIN = 4
 
 
 def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
-    """Looks for loops of the newest keyframe, and optimises where consistent ones were found.
+    """Looks for loops of the newest keyframe, and optimises the map if there are consistent ones.
 
     Args:
         methods: matcher and settings.
@@ -89,7 +89,7 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
 def join_keyframe(
     methods: SlamMethods, slam_map: KeyframeMap, loops: tuple[Loop, ...], row: int, is_allowed: Bool[np.ndarray, " k"]
 ) -> tuple[KeyframeMap, tuple[Loop, ...]]:
-    """Looks for loops from a keyframe to those of other maps, by retrieval.
+    """Looks for loops from a keyframe to keyframes of other maps, by retrieval.
 
     Args:
         methods: matcher and settings.
@@ -108,7 +108,7 @@ def join_keyframe(
 
 
 def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -> LoopState:
-    """Registers keyframes with earlier ones that the optimisation has brought near.
+    """Registers keyframes with earlier ones that are near after the optimisation.
 
     Args:
         methods: matcher and settings.
@@ -143,7 +143,7 @@ def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
         row: row of a keyframe.
 
     Returns:
-        True where the last accepted loop is near along the path.
+        True if the last accepted loop is near along the path.
     """
     last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
     if last is None:
@@ -207,8 +207,9 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
 def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[Loop]:
     """Finds older keyframes that may show the place of a keyframe.
 
-    By distance: within a radius that grows with the length of the path between, because odometry drifts. By retrieval:
-    over the whole map, even after drift or a lost track. Of several neighbours only the best is a candidate.
+    Candidates by distance lie within a radius. It grows with the length of the path between the two, because odometry
+    drifts. Candidates by retrieval come from the whole map, even after drift or a lost track. Of several neighbours
+    only the best is a candidate.
 
     Args:
         slam_map: the map.
@@ -216,7 +217,7 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
         config: largest number of candidates by retrieval.
 
     Returns:
-        Candidates by distance, nearest first, and those by retrieval, most similar first, in turn; each row once.
+        Candidates by distance (nearest first) and by retrieval (most similar first), in turn; each row once.
     """
     extent_m, since_m = slam_map.keyframes[row].extent_m, _path_since_m(*_paths(slam_map), row)
     is_old = _is_old(since_m, row, extent_m)
@@ -231,13 +232,14 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
 
 
 def nearest_pairs(slam_map: KeyframeMap) -> list[tuple[float, int, int]]:
-    """Finds, for each keyframe, the nearest older one that a loop may join to it, by the estimated poses alone.
+    """Finds the nearest older keyframe for a loop of each keyframe, by the estimated poses alone.
 
     Args:
         slam_map: the map.
 
     Returns:
-        Distance in metres and both rows, newer first, where it is within the extent of the newer scan; nearest first.
+        Distance in metres and both rows, the newer one first, nearest pairs first. Pairs farther apart than the extent
+        of the newer scan are left out.
     """
     pairs, paths = [], _paths(slam_map)
     for row, keyframe in enumerate(slam_map.keyframes):
@@ -310,7 +312,7 @@ def _paths(slam_map: KeyframeMap) -> tuple[Float[np.ndarray, " k"], Int[np.ndarr
 
 
 def _path_since_m(path_m: Float[np.ndarray, " k"], segments: Int[np.ndarray, " k"], row: int) -> np.ndarray:
-    """Returns the path length from each keyframe to that of `row`; infinite where the track was lost between them."""
+    """Returns the path length from each keyframe to that of `row`; infinite if the track was lost between them."""
     return np.where(segments == segments[row], path_m[row] - path_m, np.inf)
 
 

@@ -1,7 +1,7 @@
-"""Loops: candidates as records, and their acceptance by their own numbers, by odometry, and by one another.
+"""Loops: candidates as records, and their acceptance by probability, by odometry, and by pairwise consistency.
 
-A single registration may be wrong in a place that looks like another. It becomes an edge only together with
-registrations of other keyframes that the odometry between them confirms (pairwise consistency, Mangelson et al. 2018).
+A single registration may be wrong at a place that looks like another place. It becomes an edge only together with
+consistent registrations of other keyframes: odometry between them must close the cycle (Mangelson et al. 2018).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Loop(NamedTuple):
         target: row of an older one.
         found_by: search that found it; "map" is a loop of the map that was extended.
         status: outcome.
-        overlap: probability of overlap; 1 for a loop of the map that was extended, None where another candidate surely
+        overlap: probability of overlap; 1 for a loop of the map that was extended. None if another candidate surely
             overlaps.
         probability: P(correct) of the registration; None without one.
         rmse: root mean square error of the registration, metres; None without one.
@@ -135,14 +135,14 @@ def num_accepted(loops: Iterable[Loop]) -> int:
 
 
 def has_new_loops(slam_map: KeyframeMap, loops: Iterable[Loop]) -> bool:
-    """Returns True if loops were accepted since the last optimisation, which makes edges of them.
+    """Returns True if loops were accepted since the last optimisation, so that they are not edges yet.
 
     Args:
         slam_map: the map.
         loops: all candidates.
 
     Returns:
-        False where the edges hold all accepted loops.
+        False if the edges hold all accepted loops.
     """
     return num_accepted(loops) > len(slam_map.edges_of("loop"))
 
@@ -185,12 +185,12 @@ def _status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosure
 def accept_consistent(
     slam_map: KeyframeMap, loops: tuple[Loop, ...], number: int, config: LoopClosureConfig
 ) -> tuple[Loop, ...]:
-    """Accepts a loop, and those that waited for it, if enough of them agree pairwise (greedy by probability).
+    """Accepts a loop and waiting loops if enough of them agree pairwise (greedy by probability).
 
     Args:
         slam_map: the map.
         loops: all candidates, in the order of their sources.
-        number: index of the loop; nothing is changed unless it waits for support.
+        number: index of the loop. Only a loop that waits for support changes.
         config: the required number of registrations.
 
     Returns:
@@ -224,7 +224,7 @@ def are_consistent(slam_map: KeyframeMap, loop: Loop, other: Loop) -> bool:
         other: another one.
 
     Returns:
-        False also where the loops are too far apart for a test.
+        False also if the loops are too far apart for a test.
     """
     if loop.source == other.source or loop.T_target_source is None or other.T_target_source is None:
         return False

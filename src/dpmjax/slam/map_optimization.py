@@ -1,4 +1,4 @@
-"""Poses of a whole map: those that agree best with odometry and loops."""
+"""Poses of a whole map that agree best with odometry and loops."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ CERTAIN = 1e9
 def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, LoopState]:
     """Optimises all poses, and removes loops that contradict the remaining edges.
 
-    Parts that loops join for the first time are first moved to the pose that a loop gives. A predicted motion is
-    dropped where measured edges join its ends.
+    If a loop joins two parts for the first time, one part first moves to the pose that the loop gives. A predicted
+    motion is dropped if measured edges join its ends.
 
     Args:
         slam_map: the map.
@@ -55,12 +55,12 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
 
 
 def move_parts(T_world_keyframe: Poses, parts: Int[np.ndarray, " k"], edges: Sequence[MapEdge]) -> Poses:
-    """Moves whole parts, so that one edge between two parts holds exactly: a start near the solution.
+    """Moves whole parts so that one edge between two parts holds exactly, as a start near the solution.
 
     Args:
         T_world_keyframe: poses of the keyframes.
         parts: number of the part of each keyframe.
-        edges: edges of which some join parts.
+        edges: edges within parts and between parts.
 
     Returns:
         The poses after.

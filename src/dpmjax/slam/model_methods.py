@@ -50,11 +50,11 @@ UNKNOWN = diagonal_information(1000.0, np.pi)
 
 
 class NetworkMatcher:
-    """The matcher of a trained model; a `ValueError` refuses one that cannot predict overlap.
+    """The matcher of a trained model. A model that cannot predict overlap raises a `ValueError`.
 
     Args:
         model: encoder, decoder and, at best, a calibration of its confidence.
-        by_head: True predicts overlap by the decoder's head where it is trained, as published; else a regression does.
+        by_head: True predicts overlap by the decoder's head if it is trained, as published; else a regression does.
     """
 
     def __init__(self, model: Model, *, by_head: bool = False) -> None:
@@ -167,13 +167,13 @@ class NetworkMatcher:
 
 
 def without_regression(model: Model) -> Model:
-    """Returns the model without its regression of overlap where its overlap head is trained, so that the head predicts.
+    """Removes the regression of overlap from a model with a trained overlap head, so that the head predicts.
 
     Args:
         model: encoder and decoder.
 
     Returns:
-        The model; unchanged, with a warning, where the head is untrained.
+        The model. If the head is untrained, it is unchanged, with a warning.
     """
     if "overlap" in model.config.trained:
         return replace(model, config=replace(model.config, overlap=None))
@@ -189,7 +189,7 @@ def _merged(submap: Submap) -> Scan:
 
 
 def union_of(submap: Submap) -> DescriptorCloud:
-    """Merges descriptors; the number of scans is filled up to a power of two, so that few programs are compiled.
+    """Merges descriptors. Padding makes the number of scans a power of two, so that few programs are compiled.
 
     Args:
         submap: keyframes and poses.
@@ -210,7 +210,8 @@ def point_information(
 ) -> Information:
     """Estimates the information of a motion by the target's points that meet points of the source.
 
-    Each point that moves counts one (square metre)^-1: the sum of G^T G with G = [I, -[q]x] (published configuration).
+    It is the sum of G^T G over the points q, with G = [I, -[q]x]. So each point counts one (square metre)^-1 (published
+    configuration).
 
     Args:
         source: points in the frame of the source, metres.

@@ -1,4 +1,4 @@
-"""Odometry of wheels or of an IMU as first guess of each motion, and what the drive says about it afterwards."""
+"""Odometry of wheels or of an IMU as first guess of each motion, and its errors compared with the finished map."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class OdometryErrors(NamedTuple):
     """Comparison of odometry with the trajectory of SLAM.
 
     Attributes:
-        step_m: median error of its motion between two scans.
-        delay_scans: number of scans by which its stamps are late; negative where they are early.
+        step_m: median error of a motion of odometry between two scans.
+        delay_scans: number of scans by which the stamps of odometry are late; negative if they are early.
         undelayed_step_m: the median error without this delay.
     """
 
@@ -30,7 +30,7 @@ class OdometryErrors(NamedTuple):
 
 
 def with_guess(state: FrontEndState, odometry: Poses | None, index: int) -> FrontEndState:
-    """Replaces the predicted motion to a scan by that of odometry, where there is one.
+    """Replaces the predicted motion to a scan by the motion of odometry, if there is one.
 
     Args:
         state: state of the front end before the scan.

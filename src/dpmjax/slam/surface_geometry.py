@@ -110,7 +110,7 @@ class SurfaceGeometry:
             T_map_scan: first guesses.
 
         Returns:
-            The pose under which most elements meet planes and fewest lie in free space.
+            The pose of the highest score: most elements meet planes, and fewest lie in free space.
         """
         coarse = align_on_host(scan.surface, local_map.surface, T_map_scan, WIDE).T_target_source
         matched = _matched_shares(scan.surface, _planes(local_map, scan, coarse, NUM_SAMPLES // 3))

@@ -1,6 +1,6 @@
 """The whole system: scan by scan, front end, loop closure and optimisation make one map.
 
-The work on a scan that needs no map is done in a thread, one scan ahead.
+A thread thins and encodes scans one scan ahead, because this needs no map.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class SlamState(NamedTuple):
         front_end: state of odometry, with the local map.
         slam_map: keyframes and edges.
         loops: candidates of loops.
-        begun: the first scan, where it has times, and the state before it, until the second scan gives its motion.
+        begun: the first scan and the state before it. It waits here if it has times, until the second scan gives its
+            motion. None otherwise.
     """
 
     front_end: FrontEndState
@@ -61,14 +62,14 @@ class SlamResult(NamedTuple):
     """Result of `run_slam`.
 
     Attributes:
-        T_world_scan: (n, 4, 4) float64, of every scan; the world is the frame of the first one, or of the map that was
-            extended.
+        T_world_scan: (n, 4, 4) float64 poses of all scans. The world is the frame of the first scan, or of the map
+            that was extended.
         keyframes: (k,) numbers of the scans that are keyframes.
         loops: every candidate and its outcome; rows are those of `keyframes`.
-        graph: poses of the keyframes and the edges that were kept, with ids of scans; None without any keyframe.
+        graph: poses of the keyframes and the kept edges, with numbers of scans as ids; None without any keyframe.
         reports: report of each scan.
         state: state after the last scan, from which `step_slam` continues.
-        T_odometry_scan: (n, 4, 4) every scan by odometry alone, without any loop.
+        T_odometry_scan: (n, 4, 4) poses of all scans by odometry alone, without any loop.
     """
 
     T_world_scan: Poses
@@ -123,7 +124,7 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedIn
         methods: methods from `make_methods`.
         state: state after the scan before.
         scan: (n, 3) points in metres, in the frame of the lidar, or a `TimedScan`, which is deskewed by the predicted
-            motion; points that are not finite are dropped. Or the same from `prepare_ahead`.
+            motion. Points that are not finite are dropped. Or the output of `prepare_ahead` for them.
 
     Returns:
         The state after the scan, and its report.
@@ -189,7 +190,7 @@ def place_scans(T_world_keyframe: Poses, reports: Sequence[ScanReport]) -> Poses
     """Computes the world pose of each scan from the pose of its keyframe.
 
     Args:
-        T_world_keyframe: poses of the keyframes; none where all scans were empty.
+        T_world_keyframe: poses of the keyframes; none if all scans were empty.
         reports: reports of all scans.
 
     Returns:
@@ -222,8 +223,8 @@ def run_slam(
             files, or the folder or bag of a drive (`io.open_lidar_sequence`). `TimedScan`s are deskewed.
         config: settings; None takes the defaults. Methods of your own carry theirs.
         slam_map: map from `load_map`, or its file, to be extended; None begins an empty one.
-        odometry: (n, 4, 4) poses of the lidar at each scan by wheels or an IMU, in any world, NaN where there is none:
-            the first guess of each motion, in place of the motion before.
+        odometry: (n, 4, 4) poses of the lidar at each scan by wheels or an IMU, in any world; NaN for missing poses.
+            They give the first guess of each motion, in place of the previous motion.
         progress: False shows no bar.
 
     Returns:
@@ -247,7 +248,7 @@ def run_slam(
 
 
 def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> PreparedInput:
-    """Does the work on a scan that needs no map: thins it, and encodes it where each scan is encoded.
+    """Prepares a scan without the map: thins it, and encodes it if every scan is encoded.
 
     Args:
         methods: matcher, geometry, settings.
@@ -268,7 +269,7 @@ def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = Non
 
 
 def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n 3"]:
-    """Returns the finite points of a scan, and undoes the motion of the lidar where the scan has times.
+    """Returns the finite points of a scan; the motion of the lidar is undone if the scan has times.
 
     Args:
         scan: points in metres, in the frame of the lidar, perhaps with times.
@@ -290,14 +291,14 @@ def corrected_points(scan: AnyScan, T_turn: Pose | None) -> Float[np.ndarray, "n
 
 
 def prepare_ahead(methods: SlamMethods, scan: AnyScan) -> PreparedInput | TimedScan:
-    """Prepares a scan before those in front of it have poses, for instance in another thread.
+    """Prepares a scan before the earlier scans have poses, for instance in another thread.
 
     Args:
         methods: methods from `make_methods`.
         scan: see `step_slam`.
 
     Returns:
-        The input of `step_slam`; a scan with times is unchanged, because the motion before it is not known yet.
+        The input of `step_slam`. A scan with times is unchanged, because the previous motion is not known yet.
 
     Raises:
         ValueError: if the shape is not (n, 3).
@@ -306,11 +307,11 @@ def prepare_ahead(methods: SlamMethods, scan: AnyScan) -> PreparedInput | TimedS
 
 
 def in_advance(work: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Result, None, None]:
-    """Works on each item in a thread, the next one while the caller uses this one.
+    """Works on items in a thread, one item ahead of the caller.
 
     Args:
-        work: called with one item after another.
-        items: the items, taken one ahead by the thread of the caller.
+        work: called with each item in order.
+        items: the items. The thread of the caller takes them one ahead.
 
     Yields:
         The results, in order; an error of the work is raised in place of its result.

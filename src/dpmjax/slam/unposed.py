@@ -1,7 +1,8 @@
 """Registration of a set of 3-D scans without any poses or order.
 
-Pairs that may overlap are registered. Motions join the scans to parts, the surest ones first; less sure ones join two
-parts where several agree. Each part is refined jointly. Parts that no motion joins have frames of their own.
+Pairs that may overlap are registered. Motions join the scans to parts, the most probable motions first. Less probable
+motions join two parts if several of them agree. Each part is refined jointly. Parts that no motion joins have frames of
+their own.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class PairMotion(NamedTuple):
         target: row of the second scan.
         T_target_source: its motion.
         confidence: probability that the motion is right.
-        is_used: True where the poses agree with it.
+        is_used: True if the poses agree with it.
     """
 
     source: int
@@ -81,7 +82,7 @@ class RegisteredClouds(NamedTuple):
 
     @property
     def is_joined(self) -> bool:
-        """True where all scans have one frame."""
+        """True if all scans have one frame."""
         return not self.part.any()
 
 
@@ -94,7 +95,7 @@ def register_unposed(model: Model, scans: Sequence[RawScan] | Path, *, progress:
         progress: False shows no bars.
 
     Returns:
-        The poses, and the parts that they are comparable in.
+        The poses and their parts. Poses of one part can be compared.
 
     Raises:
         ValueError: there are fewer than two scans, or the points of one are no real numbers (n, 3).
@@ -153,7 +154,7 @@ def join_scans(motions: Sequence[PairMotion], count: int) -> tuple[Poses, Int[np
         count: number of scans.
 
     Returns:
-        Poses of the scans in the frames of their parts, and the number of the part of each.
+        Poses of the scans in the frames of their parts, and the part number of each scan.
     """
     T_world, part = np.tile(np.eye(4), (count, 1, 1)), np.arange(count)
     while (best := _best_supported(motions, T_world, part)) is not None:
@@ -166,7 +167,7 @@ def join_scans(motions: Sequence[PairMotion], count: int) -> tuple[Poses, Int[np
 
 
 def _best_supported(motions: Sequence[PairMotion], T_world: Poses, part: np.ndarray) -> PairMotion | None:
-    """Returns the motion between two parts that has most support; None where none has enough."""
+    """Returns the motion with most support between two parts; None if no motion has enough."""
     between: dict[tuple[int, ...], list[_Joint]] = {}
     for motion in motions:
         ends = part[motion.source], part[motion.target]
@@ -194,7 +195,7 @@ class _Joint(NamedTuple):
     T_first_scan: Pose
 
     def agrees(self, other: _Joint) -> bool:
-        """Returns True where both put the scan of this motion to the same place."""
+        """Returns True if both motions put the scan of this one at the same place."""
         T_first_scan = self.T_first_scan
         return are_near(self.T_second_first @ T_first_scan, other.T_second_first @ T_first_scan, AGREE_M, AGREE_RAD)
 

@@ -103,7 +103,7 @@ class Panel(NamedTuple):
 
     Attributes:
         title: title; long lines are wrapped.
-        layers: what is drawn, in this order.
+        layers: points, lines and texts of the panel, drawn in this order.
         reference: (n, d) true positions; rows of NaN interrupt the path. None where there are none.
         limits: shown part of the plane; None shows all layers.
     """
@@ -139,7 +139,8 @@ def figure(
         title: title of the picture.
         unit: unit of the positions, for the scale bars.
         num_columns: most panels of a row.
-        is_shared: the panels of a row have the limits of the last one, and half as much beyond for the others.
+        is_shared: True gives all panels of a row the same limits: those of the last one, extended by at most half its
+            size to show the panels before it.
         bar: bar of colours at the right.
 
     Returns:

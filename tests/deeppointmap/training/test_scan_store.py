@@ -1,4 +1,4 @@
-"""Prepared drives: what is kept, what is read again, and what a bad scan does."""
+"""Prepared drives: kept scans, scans that are read again, and bad scans."""
 
 from __future__ import annotations
 

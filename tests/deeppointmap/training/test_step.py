@@ -1,4 +1,4 @@
-"""The step of training: what it changes, what it does not, how often it compiles, on how many devices."""
+"""The step of training: its changes, its invariants, the number of its compilations, and several devices."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_step_compiles_once_for_each_capacity(maker, start, assert_compiles_no
 def test_places_without_a_group_change_nothing(maker, start) -> None:
     batch = maker(0)
     pairs = batch.groups
-    # That what is masked reaches no gradient either is a law of each term (test_objective).
+    # Masked entries reach no gradient either: this is a law of each term (test_objective).
     loss = jax.jit(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0])
     masked = replace(batch, groups=replace(pairs, mask=np.array([[True, False, True]])))
     kept = jax.tree.map(lambda leaf: leaf[:, [0, 2]], pairs)
@@ -131,7 +131,7 @@ def test_places_without_a_group_change_nothing(maker, start) -> None:
 
 @pytest.mark.slow
 def test_a_map_without_the_rows_that_thinning_removes_has_the_same_loss(maker, start, monkeypatch) -> None:
-    """Down to as many rows as there are descriptors."""
+    """The compact map has one row for each descriptor."""
     batch = maker(next(number for number in range(3, 20) if capacity_of(number, 0).num_target > 1))
     masks = [side.mask for side in (batch.groups.source, batch.groups.target)]
     most = max(int(mask.sum(axis=(-1, -2)).max()) for mask in masks)

@@ -133,8 +133,8 @@ class TrainingConfig:
         curriculum: stages, in their order.
         sampling: choice of the scans of a sample.
         augment: augmentation of each scan. Each step draws a new motion for each scan.
-        num_variants: number of times that a scan is thinned, occluded and jittered; steps choose among these variants.
-            0 prepares the scan anew at each use, which needs no disk and more processors.
+        num_variants: number of times that a scan is thinned, occluded and jittered. Steps choose among these variants.
+            0 prepares the scan anew at each use. This needs no disk and more processors.
         thins_as_in_use: True: the points of a scan are thinned as for `encode`, in their order, and outliers are
             removed. False: they are shuffled before the voxel filter, and outliers stay.
         thins_maps: True: maps are thinned as in SLAM, to at most 1,024 descriptors. False: they keep all descriptors.

@@ -110,8 +110,8 @@ class TrainingHooks:
         evaluate_every: number of steps from one evaluation to the next.
         on_report: gets the record and the progress after each step.
         stop: called before each step; any number but 0 ends training.
-        steps_left: called before each step with the number of steps done; any number but 0 sets the end that many
-            steps ahead, at most at that of the curriculum, as `training.finish` does.
+        steps_left: called before each step with the number of steps done. It returns the number of steps to the new
+            end, as for `training.finish`; 0 keeps the end. Training never goes beyond the end of the curriculum.
     """
 
     evaluate: Callable[[Model], float] | None = None
@@ -218,8 +218,8 @@ def train(
 
     Raises:
         ValueError: if there is no drive, or `start` is a model of another network. Also if a drive has no poses, no
-            readable scan, or no two scans at a distance of `config.sampling`, if all scans overlap or none do, and if
-            `cache` is given with prepared scans.
+            readable scan, or no two scans at a distance of `config.sampling`. Also if all scans overlap or none do,
+            and if `cache` is given with prepared scans.
         TrainingLostError: if the loss is not finite.
     """
     if cache is not None and isinstance(drives, ScanStore):

@@ -208,7 +208,7 @@ def draw_overlap_pairs(
     """Draws pairs of scans with and without overlap; the anchors are drawn from all scans.
 
     Half of the pairs are less than 20 m apart, a quarter 20 to 40 m, and a quarter farther, or of different drives.
-    Where some kind is missing, pairs of the other kind replace it.
+    If there are no pairs at one of the larger distances, other pairs more than 20 m apart replace them.
 
     Args:
         table: poses of the scans, of which `why_no_overlap` is None.

@@ -144,7 +144,7 @@ def find_prepared(path: Path, T_world_lidar: Poses) -> PreparedDrive | None:
 def prepare_variants(
     drive: LidarSequence, numbers: Iterable[int], config: TrainingConfig, seed: int
 ) -> Iterator[PreparedScan]:
-    """Prepares some scans of a drive, one after the other.
+    """Prepares the numbered scans of a drive, one by one.
 
     Args:
         drive: the drive.

@@ -40,7 +40,7 @@ from dpmjax.geometry.pyramid_storage import moved_pyramid
 from dpmjax.nets.neighbourhood import WINNERS
 from dpmjax.types import AnyArray, DescriptorCloud
 
-# Groups of about this many scans are decoded at the same time, or of as many scans as are encoded at the same time.
+# Groups with about this number of scans are decoded at the same time, or with `scans_at_once` scans if that is larger.
 GROUP_SCANS_AT_ONCE = 16
 
 # Largest number of descriptors of a thinned map (ours). Thinning leaves a fifth of a map of 16 scans, and attention
@@ -113,7 +113,7 @@ def init_training(key: PRNGKeyArray, config: TrainingConfig) -> TrainingState:
 
 
 def finish(state: TrainingState, num_steps: int) -> TrainingState:
-    """Sets the number of steps that are left; in them the learning rate falls by the rest of its cosine.
+    """Sets the number of remaining steps, in which the learning rate falls to the end of its cosine.
 
     Args:
         state: state before any step.
