@@ -50,10 +50,9 @@ SURE_PROBABILITY = 0.9
 # decoder it is this share of the usual score.
 MIN_LEAD, UNSURE_LEAD_SHARE = 0.1, 0.5
 
-# Number of scans whose median is the usual score. The decoder proposes each of the first poses, because one wrong pose
-# there would make low scores usual: NUM_USUAL of them, or until it has led to the pose of the last motion NUM_AGREED
-# times in a row.
-USUAL_WINDOW, NUM_USUAL, NUM_AGREED = 20, 10, 4
+# Number of scans whose median is the usual score, and of the first scans whose poses the decoder proposes: a wrong pose
+# among them makes low scores usual. Fewer, until the decoder has agreed four times, made two short drives 12 % worse.
+USUAL_WINDOW, NUM_USUAL = 20, 10
 
 # Standard deviation of a predicted translation.
 GUESS_M = 1.0
@@ -137,8 +136,6 @@ class FrontEndState(NamedTuple):
         dropped: the same for the method "descriptors", with their registrations; None for an empty scan.
         keyframe_ratio: factor of the distance of keyframes for the method "descriptors"; None before the first.
         num_coasting: number of scans since the position along a corridor was last measured.
-        num_agreed: at the beginning, number of scans in a row at which the last motion and the decoder lead to one
-            pose.
     """
 
     num_scans: int = 0
@@ -151,12 +148,6 @@ class FrontEndState(NamedTuple):
     dropped: tuple[RegisteredScan | None, ...] = ()
     keyframe_ratio: float | None = None
     num_coasting: int = 0
-    num_agreed: int = 0
-
-    @property
-    def is_settled(self) -> bool:
-        """True after enough right poses for the usual score."""
-        return len(self.scores) >= NUM_USUAL or self.num_agreed >= NUM_AGREED
 
     @property
     def predicted(self) -> Pose:
@@ -197,8 +188,6 @@ def place_scan(
     state = state._replace(local_map=local_map)
     located = _Search(methods, state, local_map, thinned, scan.compact).located(report)
     report = located.report
-    if not state.is_settled:
-        state = state._replace(num_agreed=state.num_agreed + 1 if located.is_agreed else 0)
     if report.status == "restarted" or _is_keyframe(methods, report, thinned):
         return _make_keyframe(methods, state, slam_map, thinned, located)
     after = _advanced(state, report)
@@ -228,22 +217,18 @@ def empty_reason(scan: PreparedInput) -> str:
 
 
 class _Located(NamedTuple):
-    # The pose and why it was accepted; its information in the tangent of the scan; the scan, if it was encoded; True
-    # where the last motion and the decoder lead to one pose.
+    # The pose and why it was accepted; its information in the tangent of the scan; the scan, if it was encoded.
     report: ScanReport
     information: Information
     compact: CompactScan | None = None
-    is_agreed: bool = False
 
 
 class _Attempt(NamedTuple):
-    # The best pose; that from the prediction and other motions; the poses that the decoder proposes; the encoded scan;
-    # True where prediction and decoder lead to one pose.
+    # The best pose; that from the prediction and other motions; the poses that the decoder proposes; the encoded scan.
     best: Alignment
     tracked: Alignment | None
     proposal: Proposal | None = None
     compact: CompactScan | None = None
-    is_agreed: bool = False
 
 
 class _Search(NamedTuple):
@@ -285,7 +270,7 @@ class _Search(NamedTuple):
         # The next prediction uses this pose three times, so a rounding error would triple from scan to scan.
         report = report._replace(status=status, reason=reason, T_keyframe_scan=orthonormal(T))
         report = report._replace(score=best.score, probability=probability)
-        return _Located(report, information, tried.compact, tried.is_agreed)
+        return _Located(report, information, tried.compact)
 
     def _guess(self, tried: _Attempt) -> Pose:
         """Returns the guessed pose of a rejected scan, aligned with the lost scans, too: behind a door the map ends."""
@@ -302,11 +287,11 @@ class _Search(NamedTuple):
         (matcher, geometry, config, _), state, local_map, scan, compact = self
         predicted, is_predicted = state.predicted, config.odometry.proposer == "prediction"
         good_score = max(MIN_SCORE, GOOD_SHARE * state.usual_score)
-        tracked, is_agreed, min_probability = None, False, config.front_end.min_probability
+        tracked, min_probability = None, config.front_end.min_probability
         # The second scan of a drive has no last motion.
         if is_predicted and state.scores:
             tracked = geometry.align(local_map, scan, predicted)
-            if tracked.score >= good_score and state.is_settled:
+            if tracked.score >= good_score and len(state.scores) >= NUM_USUAL:
                 return _Attempt(tracked, tracked)
         compact = matcher.encode(scan) if compact is None else compact
         row = local_map.nearest(predicted[:3, 3])
@@ -328,7 +313,7 @@ class _Search(NamedTuple):
             is_sure = is_near or proposal.probability >= min_probability
             lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
             best = _better_of(tracked, matched, lead if state.scores else 0.0)
-        return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact, is_agreed)
+        return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact)
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
@@ -416,7 +401,7 @@ def _advanced(state: FrontEndState, report: ScanReport) -> FrontEndState:
         return after
     after = after._replace(lost=(), num_coasting=num_coasting + 1 if report.status == "coasting" else 0)
     if report.status in ("first", "restarted"):
-        return after._replace(scores=(), num_agreed=0)
+        return after._replace(scores=())
     T_before_last = rigid.inverse(state.T_keyframe_last) @ T
     # The error along a corridor is that of all scans since it was known, and not of the last step.
     before_m = state.T_before_last[:3, 3]
