@@ -23,6 +23,8 @@ import pytest
         ("slam --columns 4", "--columns"),
         ("slam a b", "--cluster: give it with two or more DATA"),
         ("slam a --cluster local", "--cluster: give it with two or more DATA"),
+        ("slam a b --cluster local --map m.npz", "--cluster: leave --map"),
+        ("slam a b --cluster local --odometry odometry.txt", "--cluster: leave --map"),
         ("slam /no/a /no/b --cluster local", "no such file or folder"),
         ("slam --base-from-lidar 0 0 0 0 0 0", "--base-from-lidar"),
         ("slam --base-from-lidar 0 0 1 0 0 1 1", "--base-from-lidar"),

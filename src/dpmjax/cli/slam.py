@@ -73,6 +73,9 @@ class SlamOptions(cli.DriveOptions):
         self.check_data(self.data, self.sequence)
         if (len(self.data) > 1) != (self.cluster is not None):
             raise ValueError(f"--cluster: give it with two or more DATA, got {len(self.data)}")
+        of_one = self.map, self.sequence, self.base_from_lidar, self.visualize, self.odometry not in (None, *PROPOSERS)
+        if self.cluster is not None and any(of_one):
+            raise ValueError("--cluster: leave --map, --sequence, --base-from-lidar, -v and --odometry FILE out")
         if self.preset == "paper" and self.odometry in PROPOSERS:
             raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
         if self.base_from_lidar and (
