@@ -391,6 +391,26 @@ def test_a_scan_that_is_tracked_moves_to_another_place_by_a_lead_in_score(
     assert (off > 1.5) == is_moved
 
 
+class ReliefGeometry(TruthGeometry):
+    """A corridor that looks alike 1.2 m ahead, with a score that is higher by chance."""
+
+    def thin(self, points: np.ndarray) -> Scan | None:
+        scan = super().thin(points)
+        return scan and scan._replace(weak_axis=np.array([1.0, 0.0, 0.0]))
+
+    def search(self, local_map, scan, T_map_scan):
+        found = super().search(local_map, scan, T_map_scan)
+        is_other = np.linalg.norm((found.T_map_scan - T_map_scan[0])[:3, 3]) > 0.6
+        return found._replace(T_map_scan=T_map_scan[0], score=0.61) if is_other else found._replace(score=0.6)
+
+
+def test_the_network_moves_no_scan_along_a_corridor_where_both_places_fit() -> None:
+    truth = np.array([pose(0.5 * number, 0.0, 0.0) for number in range(8)])
+    matcher = LookAlikeMatcher(truth, T_true_found=pose(1.2, 0.0, 0.0), probability=0.9)
+    result = run(truth, matcher=matcher, geometry=ReliefGeometry(truth), config=without_loops())
+    np.testing.assert_allclose(result.T_world_scan, truth, atol=0.2)
+
+
 class StuckGeometry(LookAlikeGeometry):
     """From one scan on, the alignment from the prediction ends at a low score, and a search finds the truth."""
 

@@ -307,13 +307,20 @@ class _Search(NamedTuple):
             # At a low score, too, no further starts are needed where a sure decoder leads to the same pose.
             if not is_agreed and (matched.score < good_score or not is_near):
                 others = state.T_keyframe_last @ geometry.other_motions(state.T_before_last, scan.extent_m)
-                tracked = _better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
+                tracked = self._better_of(tracked, geometry.search(local_map, scan, orthonormal(others)), MIN_LEAD)
             # Symmetric places fit at other poses, too. Before any motion is known, nothing supports the prediction.
             is_near = are_near(tracked.T_map_scan, matched.T_map_scan, PLACE_M, np.inf)
             is_sure = is_near or proposal.probability >= min_probability
             lead = MIN_LEAD if is_sure else max(MIN_LEAD, UNSURE_LEAD_SHARE * state.usual_score)
-            best = _better_of(tracked, matched, lead if state.scores else 0.0)
+            best = self._better_of(tracked, matched, lead if state.scores else 0.0)
         return _Attempt(best, tracked, proposal._replace(T_target_source=starts), compact)
+
+    def _better_of(self, tracked: Alignment, other: Alignment, lead: float) -> Alignment:
+        """Returns `other` if its score beats that of `tracked`; at another place it must beat it by the lead."""
+        # A scan of a corridor fits almost as well after any shift along it.
+        place_m = PLACE_M if self.scan.weak_axis is None else SAME_M
+        is_same = are_near(tracked.T_map_scan, other.T_map_scan, place_m, PLACE_RAD)
+        return other if other.score > tracked.score + (0.0 if is_same else lead) else tracked
 
 
 def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"]) -> Pose:
@@ -321,12 +328,6 @@ def _with_guess_along(T_map_scan: Pose, guess: Pose, axis: Float[np.ndarray, "3"
     held, along = T_map_scan.copy(), T_map_scan[:3, :3] @ axis
     held[:3, 3] += along @ (guess - T_map_scan)[:3, 3] * along
     return held
-
-
-def _better_of(tracked: Alignment, other: Alignment, lead: float) -> Alignment:
-    """Returns `other` if its score beats that of `tracked`; at another place it must beat it by the lead."""
-    is_same = are_near(tracked.T_map_scan, other.T_map_scan, PLACE_M, PLACE_RAD)
-    return other if other.score > tracked.score + (0.0 if is_same else lead) else tracked
 
 
 def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
