@@ -12,7 +12,7 @@ from tests.scans.surface_scenes import motion, seen_from, street
 T_TRUE = motion(8, (1.5, -0.4, 0.1))
 
 
-@pytest.mark.parametrize("size", [0.93, 0.97, 1.02, 1.06])
+@pytest.mark.parametrize("size", [0.9, 0.93, 0.97, 1.02, 1.06, 1.1])
 def test_an_enlarged_scan_is_as_much_larger(size: float) -> None:
     source = measure_scan(size * seen_from(street(0), T_TRUE)).surface
     target = measure_scan(street(1)).surface
