@@ -15,6 +15,7 @@ from dpmjax.registration2d.recordings import (
     choose_by_motion,
     choose_scans,
     fill_between,
+    find_silent_steps,
     in_runs,
 )
 from dpmjax.simulation import simulate_sequence
@@ -150,3 +151,30 @@ def test_scans_that_follow_a_silent_odometry_are_named() -> None:
     assert set(np.flatnonzero(off > 20)) <= set(lost)
     honest = recording._replace(motion=true)
     assert not len(honest.aligned(true[rows])[1])
+
+
+def test_odometry_is_silent_where_the_robot_moves_and_not_where_it_stands() -> None:
+    walk = simulate_sequence(0, 14, num_beams=128, range_noise_px=1.0, seed=5)
+    rows = np.r_[0:4, 4:12, np.full(6, 11), 12:14]
+    noise = np.random.default_rng(0).normal(0, 1e-3, (len(rows), 128, 1))
+    scans = ScanSet((walk.points[rows] * (1 + noise)).astype(np.float32), walk.mask[rows])
+    odometry = np.asarray(walk.odometry_poses if walk.odometry_poses is not None else walk.reference_poses)[rows]
+    assert not find_silent_steps(scans, odometry).any()
+    # Encoders that fail from scan 4 to 11 repeat their pose, as in the six scans of the standing robot after it.
+    odometry[4:12] = odometry[4]
+    odometry[12:] = odometry[18]
+    odometry[12:18] = odometry[12]
+    is_silent = find_silent_steps(scans, odometry)
+    assert is_silent[4:11].all()
+    assert not is_silent[:4].any()
+    chosen = choose_scans(scans, odometry, 1.0, 0.5, is_silent).chosen
+    assert np.isin(np.arange(4, 12), chosen).all()
+
+
+def test_a_robot_that_stands_among_people_is_not_silent() -> None:
+    walk = simulate_sequence(0, 2, num_beams=128, seed=5)
+    points = np.repeat(walk.points[:1], 6, axis=0)
+    for row in range(6):
+        points[row, 10 + 5 * row : 16 + 5 * row] *= 0.5
+    scans = ScanSet(points, np.repeat(walk.mask[:1], 6, axis=0))
+    assert not find_silent_steps(scans, np.zeros((6, 3))).any()

@@ -15,7 +15,7 @@ import numpy as np
 from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import match_near
 from dpmjax.registration2d.pair_alignment import COARSE, FINE, match_pairs
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
 from dpmjax.registration2d.steps import StepPrior, slide_steps
 
 # Score above which a step is clear.
@@ -90,12 +90,13 @@ class Odometry(NamedTuple):
         return self.fault == MIRRORED
 
 
-def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
+def calibrate_odometry(scans: PlanarScans, poses: Floats, *, is_silent: Booleans | None = None) -> Odometry:
     """Estimates scale, noise and faults of odometry from the steps that the scans alone constrain.
 
     Args:
         scans: n scans in time order, two at least.
         poses: (n, 3) raw x, y, heading.
+        is_silent: (n - 1,) steps that the odometry does not measure; the usual motion is expected there.
 
     Returns:
         Odometry; with the usual deviations if few steps are clear.
@@ -104,7 +105,11 @@ def calibrate_odometry(scans: PlanarScans, poses: Floats) -> Odometry:
     fault = _find_fault(clear, poses, unit)
     corrected = poses if fault is None else _FAULTS[fault](poses)
     usual = StepPrior.of_poses(corrected, unit)
-    return Odometry(corrected, usual if len(clear.rows) < _LEAST_STEPS else _calibrate(clear, usual.steps, unit), fault)
+    prior = usual if len(clear.rows) < _LEAST_STEPS else _calibrate(clear, usual.steps, unit)
+    if is_silent is None or not is_silent.any():
+        return Odometry(corrected, prior, fault)
+    prior = prior.without(is_silent, unit)
+    return Odometry(se2.chain(prior.steps), prior, fault)
 
 
 def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:

@@ -24,9 +24,9 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.global_registration import nearest_tour, register_globally
 from dpmjax.registration2d.incremental import incremental_icp, scan_odometry
 from dpmjax.registration2d.odometry import Odometry, calibrate_odometry
-from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import Assessment, Score, assess_trajectory, choose_trajectory
-from dpmjax.registration2d.recordings import Recording, choose_scans, interpolate, take_scans
+from dpmjax.registration2d.recordings import Recording, choose_scans, find_silent_steps, interpolate, take_scans
 from dpmjax.registration2d.refinement import put_back_slid, refine
 from dpmjax.registration2d.steps import StepPrior
 from dpmjax.types import ScanSet, with_short_repr
@@ -206,13 +206,16 @@ def register_scans(
     count = len(all_scans.points)
     odometry_poses = None if odometry is None else se2.as_poses("odometry", odometry, count)
     kind, given = _checked_start(start, odometry_poses, count, config)
-    recording = _choose_scans(all_scans, odometry_poses, kind, config, hooks)
+    is_silent = None if odometry_poses is None else find_silent_steps(all_scans, odometry_poses)
+    recording = _choose_scans(all_scans, odometry_poses, is_silent, kind, config, hooks)
     lines = planar_scans(take_scans(all_scans, recording.chosen), is_ordered=config.is_ordered)
     evidence = None
     # Initial poses from the scans alone, or zero, are no evidence.
     if given is not None and len(lines) > 1 and config.is_ordered:
         hooks.report(_CALIBRATION, "calibration of the odometry")
-        evidence = calibrate_odometry(lines, (given if odometry_poses is None else odometry_poses)[recording.chosen])
+        measured = given if odometry_poses is None else odometry_poses
+        is_unknown = None if is_silent is None else np.logical_or.reduceat(is_silent, recording.chosen[:-1])
+        evidence = calibrate_odometry(lines, measured[recording.chosen], is_silent=is_unknown)
     run = _Run(lines, recording, evidence, config, hooks)
     start_name, poses = _start_poses(run, kind, given)
     fitted = _fit(run, None if start_name == START_NAMES["zero"] else poses, key=key)
@@ -307,7 +310,12 @@ def _checked_start(
 
 
 def _choose_scans(
-    scans: ScanSet, odometry: Floats | None, start: str, config: RegistrationConfig, hooks: RegistrationHooks
+    scans: ScanSet,
+    odometry: Floats | None,
+    is_silent: Booleans | None,
+    start: str,
+    config: RegistrationConfig,
+    hooks: RegistrationHooks,
 ) -> Recording:
     """Chooses the registered scans by the odometry, or by scan odometry for initial poses from the scans alone."""
     motion = None if start in STARTS_FROM_SCANS else odometry
@@ -319,7 +327,7 @@ def _choose_scans(
         hooks.report(_MOTION, "odometry from the scans")
         seen = np.flatnonzero(np.asarray(scans.mask).any(axis=1))
         motion = interpolate(len(scans.points), seen, scan_odometry(planar_scans(take_scans(scans, seen))))
-    return choose_scans(scans, motion, config.min_distance, config.min_turn)
+    return choose_scans(scans, motion, config.min_distance, config.min_turn, is_silent)
 
 
 def _start_poses(run: _Run, start: str, given: Floats | None) -> tuple[str, Floats]:

@@ -16,8 +16,17 @@ from jaxtyping import Float
 from dpmjax.checks import require_positive
 from dpmjax.geometry import se2
 from dpmjax.registration2d.pair_alignment import FINE, PairPrior, match_pairs
-from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, Pairs, PlanarScans, planar_scans
+from dpmjax.registration2d.planar_scans import (
+    Booleans,
+    Floats,
+    Indices,
+    Pairs,
+    PlanarScans,
+    planar_scans,
+    spread_evenly,
+)
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, contradicted_share, pair_scores
+from dpmjax.registration2d.steps import slide_steps
 from dpmjax.types import ScanSet
 
 # Standard deviation of odometry from one chosen scan to the next: translation in typical ranges, radians.
@@ -31,6 +40,12 @@ _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 _STANDING = 0.02
 # So many successive scans that fit no neighbour are lost; fewer are covered, or passed by people.
 _LEAST_LOST = 3
+# Odometry that repeats its pose for this many steps may have failed; low rates repeat it for fewer. Number of scans of
+# such a run that are compared with its first one.
+_LEAST_SILENT, _MAX_COMPARED = 3, 8
+# A beam has changed by more than these standard deviations of the noise, and this share of the typical range; the
+# robot has stood where a smaller share of the beams has changed.
+_NOISE, _LEAST_CHANGE, _CHANGED_SHARE = 6.0, 0.01, 0.01
 # Scans that are aligned at a time.
 _BLOCK = 1024
 # Range noise, in typical ranges, above which no two scans are equal.
@@ -87,11 +102,52 @@ class Recording(NamedTuple):
 
 def in_runs(is_member: Booleans, length: int) -> Booleans:
     """Returns True for members of a run of at least this many members."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], is_member, [False]])))
     is_long = np.zeros(len(is_member), bool)
-    for first, last in ends.reshape(-1, 2):
-        is_long[first:last] = last - first >= length
+    for first, last in find_runs(is_member, length):
+        is_long[first:last] = True
     return is_long
+
+
+def find_runs(is_member: Booleans, length: int) -> Indices:
+    """Finds the runs of at least this many members: rows (k, 2) of the first member and of the one after the last."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], is_member, [False]]))).reshape(-1, 2)
+    return ends[ends[:, 1] - ends[:, 0] >= length]
+
+
+def find_silent_steps(scans: ScanSet, odometry: Floats) -> Booleans:
+    """Finds steps without any odometry, although the scans do not show that the robot stood.
+
+    Encoders that fail repeat their last pose, as those of a standing robot do. A robot has stood where its scans are
+    equal within their noise, or fit without a motion and at no other place, as in a room that people walk through.
+
+    Args:
+        scans: n scans in the order of time.
+        odometry: (n, 3) raw poses.
+
+    Returns:
+        (n - 1,) True for the steps of a run in which the robot may have moved.
+    """
+    is_seen = np.asarray(scans.mask).any(axis=1)
+    stands = np.isclose(np.diff(odometry, axis=0), 0.0, atol=1e-9).all(axis=1)
+    is_silent = np.zeros(len(stands), bool)
+    for first, last in find_runs(stands, _LEAST_SILENT):
+        rows = first + np.flatnonzero(is_seen[first : last + 1])
+        if len(rows) > 1:
+            rows = rows[spread_evenly(len(rows), _MAX_COMPARED)]
+            is_silent[first:last] = not _has_stood(planar_scans(take_scans(scans, rows)))
+    return is_silent
+
+
+def _has_stood(scans: PlanarScans) -> bool:
+    """Returns True if the scans fit the first one without a motion, and do not fit as well at another place."""
+    ranges = np.linalg.norm(scans.points, axis=-1)
+    off = np.abs(ranges[1:] - ranges[0]) > max(_NOISE * scans.noise, _LEAST_CHANGE * scans.typical_range)
+    both = scans.mask[1:] & scans.mask[0]
+    if np.median((off & both).sum(axis=1) / np.maximum(both.sum(axis=1), 1)) < _CHANGED_SHARE:
+        return True
+    others = np.arange(1, len(scans))
+    slides = slide_steps(scans, np.zeros((len(others), 3)), pairs=(others, np.zeros_like(others)))
+    return bool(np.median((slides.scores > WEAK_SCORE) & ~slides.is_torn & ~slides.is_open) == 1)
 
 
 def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:
@@ -116,7 +172,9 @@ def find_originals(scans: ScanSet) -> Indices:
     return np.maximum(np.maximum.accumulate(np.where(repeats | ~is_seen, 0, np.arange(len(points)))), first)
 
 
-def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float) -> Recording:
+def choose_scans(
+    scans: ScanSet, motion: Floats | None, min_distance: float, min_turn: float, is_silent: Booleans | None = None
+) -> Recording:
     """Selects the scans to register by distance and turn.
 
     If that keeps at least half of the distinct scans, all scans of the moving robot are selected.
@@ -126,6 +184,7 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
         motion: (n, 3) odometry of any kind; None: all scans are registered.
         min_distance: as `choose_by_motion`.
         min_turn: as `choose_by_motion`.
+        is_silent: (n - 1,) steps that `motion` does not measure; their scans are registered.
 
     Returns:
         Recording. A scan that repeats the previous scan is not registered, and gets the pose of that scan.
@@ -143,6 +202,9 @@ def choose_scans(scans: ScanSet, motion: Floats | None, min_distance: float, min
     if 2 * len(chosen) >= len(rows):
         # A robot that stands still measures noise alone.
         chosen = choose_by_motion(motion[rows], _STANDING * min_distance, _STANDING * min_turn)
+    if is_silent is not None:
+        ends = np.append(is_silent, False) | np.append(False, is_silent)
+        chosen = np.union1d(chosen, np.flatnonzero(ends[rows]))
     return Recording(scans, rows[chosen], None if len(chosen) == len(rows) else motion, originals)
 
 

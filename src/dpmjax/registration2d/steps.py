@@ -29,6 +29,8 @@ _USUAL_DEVIATION = (0.0225, 0.15)
 # Clear steps predict the translation of another step if the turns differ by less than this, in radians. Least number of
 # such steps; with fewer, all clear steps predict. Least deviation of such a prediction, typical ranges.
 _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_SPREAD = 0.15, 5, 0.015
+# Shorter steps are not counted in the usual motion of a robot that moves, typical ranges.
+_LEAST_MOVE = 0.02
 # Score above which a step is clear at final poses.
 _CLEAR_SCORE = 0.45
 # Accuracy of a fitted beam, typical ranges; and of a step without other information: typical ranges, radians.
@@ -88,6 +90,18 @@ class StepPrior(NamedTuple):
         """
         usual = StepPrior.of_poses(se2.chain(self.steps), typical_range).deviations
         return self._replace(deviations=np.maximum(self.deviations, usual))
+
+    def without(self, is_unknown: Booleans, typical_range: float) -> StepPrior:
+        """Returns the prior with the usual motion of the other steps, and its spread, at the unknown ones."""
+        is_known = ~is_unknown & (np.hypot(self.steps[:, 0], self.steps[:, 1]) > _LEAST_MOVE * typical_range)
+        straight = np.where(is_unknown[:, None], 0.0, self.steps)
+        usual = _usual_steps(straight, is_known, typical_range)
+        deviations = np.where(np.isfinite(usual.deviations), usual.deviations, [typical_range, typical_range, np.pi])
+        deviations[:, 2] = _USUAL_DEVIATION[1]
+        return StepPrior(
+            np.where(is_unknown[:, None], usual.steps, self.steps),
+            np.where(is_unknown[:, None], np.maximum(deviations, self.deviations), self.deviations),
+        )
 
     def as_pair_prior(self, residual: float | Floats) -> PairPrior:
         """Returns the prior of alignments; `residual` is the standard deviation of a beam, in the unit of points."""
