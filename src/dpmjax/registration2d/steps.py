@@ -29,8 +29,9 @@ _USUAL_DEVIATION = (0.0225, 0.15)
 # Clear steps predict the translation of another step if the turns differ by less than this, in radians. Least number of
 # such steps; with fewer, all clear steps predict. Least deviation of such a prediction, typical ranges.
 _SIMILAR_TURN, _LEAST_CLEAR, _LEAST_SPREAD = 0.15, 5, 0.015
-# Shorter steps are not counted in the usual motion of a robot that moves, typical ranges.
-_LEAST_MOVE = 0.02
+# Shorter steps are not counted in the usual motion of a robot that moves, typical ranges. Least deviation of an unknown
+# step as a share of the usual length, because the robot may stop or hurry there.
+_LEAST_MOVE, _UNKNOWN_SHARE = 0.02, 0.5
 # Score above which a step is clear at final poses.
 _CLEAR_SCORE = 0.45
 # Accuracy of a fitted beam, typical ranges; and of a step without other information: typical ranges, radians.
@@ -97,6 +98,8 @@ class StepPrior(NamedTuple):
         straight = np.where(is_unknown[:, None], 0.0, self.steps)
         usual = _usual_steps(straight, is_known, typical_range)
         deviations = np.where(np.isfinite(usual.deviations), usual.deviations, [typical_range, typical_range, np.pi])
+        length = np.median(np.hypot(*self.steps[is_known, :2].T)) if is_known.any() else 0.0
+        deviations[:, :2] = np.maximum(deviations[:, :2], _UNKNOWN_SHARE * length)
         deviations[:, 2] = _USUAL_DEVIATION[1]
         return StepPrior(
             np.where(is_unknown[:, None], usual.steps, self.steps),
