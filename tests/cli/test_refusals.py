@@ -45,8 +45,6 @@ import pytest
         ("train --epochs 0", "--epochs"),
         ("train --epochs 3 --steps 100", "--epochs: expected without --steps"),
         ("train --variants -1", "--variants"),
-        ("train --town-length-m 5", "--town-length-m"),
-        ("train --weights dpm_small --frame local", "--frame"),
         ("train --stages overlap", "--stages overlap trains the head of a model"),
         ("train --stages", "--stages: expected registration, overlap, or both"),
         ("train --data nowhere", "nowhere"),

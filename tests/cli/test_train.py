@@ -15,7 +15,7 @@ import pytest
 
 from dpmjax.cli import train_preparation, train_run
 from dpmjax.cli.run import CHECKPOINTS, HISTORY
-from dpmjax.cli.train import TrainOptions, for_devices, training_settings
+from dpmjax.cli.train import TrainOptions, training_settings
 from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
@@ -200,7 +200,7 @@ def test_the_paper_trains_for_epochs_and_options_have_its_values_as_defaults() -
     assert training_settings(TrainOptions(preset="paper", steps=500)).num_epochs is None
     changed = training_settings(TrainOptions(preset="paper", epochs=3, variants=2, refine_labels=True))
     assert (changed.num_epochs, changed.num_variants, changed.refines_labels) == (3, 2, True)
-    assert for_devices(changed, 1000).num_steps == 3000 // jax.device_count()
+    assert changed.for_scans(1000).num_steps == 3000
 
 
 def test_a_gpu_computes_all_scans_of_a_step_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -304,15 +304,6 @@ def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
         train_preparation.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
 
 
-@pytest.mark.slow
-def test_a_stop_ends_the_preparation_of_the_evaluation() -> None:
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_run.draw_selection(TRAINING, 2, [toy.drive], "a toy", on_wait=stop)
-
-
 def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=100_000))
     with pytest.raises(ValueError, match=r"^--cache .*: 24 scans of .* need .* --variants 1 needs") as refused:
@@ -341,11 +332,11 @@ def test_a_long_drive_is_prepared_in_parts_as_in_one(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_drives", [1, 2])
-def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, num_drives: int) -> None:
-    def stop() -> None:
+def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, monkeypatch) -> None:
+    def stop(_handler: object, number: int) -> None:
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(train_preparation.tqdm, "update", stop)
     with pytest.raises(KeyboardInterrupt):
-        train_preparation.prepare_sources([toy.drive] * num_drives, TRAINING, tmp_path, seed=0, on_wait=stop)
+        train_preparation.prepare_sources([toy.drive], TRAINING, tmp_path, seed=0)
     assert not list(tmp_path.iterdir())

@@ -94,9 +94,7 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
 
     state, step = init_training(jax.random.key(0), TRAINING), make_step(TRAINING)
     maker = SampleMaker(toy.store(), TRAINING, seed=0, numbers=(0, 1), num_in_step=2)
-    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(
-        replace(begin_training(TRAINING), best_params={}), fallback=None
-    )
+    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(begin_training(TRAINING), fallback=None)
     for number in range(2):
         state, _ = step(state, maker(number))
     assert progress.state.step == progress.best_step == 2

@@ -10,13 +10,12 @@ from .evaluate import FIRST_TOWN as FIRST_TOWN
 from .evaluate import STAGES as STAGES
 from .evaluate import EvaluateOptions as EvaluateOptions
 from .evaluate import Matcher as Matcher
-from .evaluate import PairReader as PairReader
 from .evaluate import draw_evaluation as draw_evaluation
 from .evaluate import evaluation_towns as evaluation_towns
 from .evaluate import fill_overlap as fill_overlap
-from .evaluate import fill_pairs as fill_pairs
 from .evaluate import open_evaluation_drives as open_evaluation_drives
 from .evaluate import rate_confidence as rate_confidence
+from .evaluate import register_pairs as register_pairs
 from .evaluate import summarize_pairs as summarize_pairs
 from .info import environment as environment
 from .info import peak_rss_gb as peak_rss_gb
@@ -44,7 +43,6 @@ from .run import Numbers as Numbers
 from .run import Run as Run
 from .run import run_command as run_command
 from .run import run_experiment as run_experiment
-from .run_folder import counting_bar as counting_bar
 from .run_folder import find_run as find_run
 from .run_folder import load_json as load_json
 from .run_folder import load_options as load_options
@@ -52,7 +50,6 @@ from .run_folder import write_json as write_json
 from .run_folder import write_poses as write_poses
 from .slam_results import accepted_ends as accepted_ends
 from .slam_results import gather_map as gather_map
-from .slam_results import localization_errors as localization_errors
 from .slam_results import open_map as open_map
 from .slam_results import require_same_weights as require_same_weights
 from .slam_results import write_loops as write_loops

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, io, metrics, registration_rgbd, simulation, viz
@@ -55,7 +56,11 @@ def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
     recorder = cli.FitRecorder(run, "m")
     settings = deepmapping.preset(options.preset, "depth", motion="planar" if sequence.is_planar else "full")
     key = jax.random.key(options.seed)
-    with cli.counting_bar("poses from image to image", " images") as on_image:
+    with tqdm(total=len(sequence), desc="poses from image to image", unit=" images", dynamic_ncols=True) as bar:
+
+        def on_image(num_placed: int, _: int) -> None:
+            bar.update(num_placed - bar.n)
+
         start = registration_rgbd.initialize_depth(images, settings.motion, key=key, on_image=on_image)
     found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
     numbers = {**depth_numbers(sequence, found), **recorder.numbers}

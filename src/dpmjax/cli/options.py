@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import re
@@ -122,9 +121,8 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
     finally:
         os.environ.pop("COLUMNS", None) if width is None else os.environ.update(COLUMNS=width)
     # tyro draws a box: a line with the title, the message, a line across, and help.
-    rows = (row[2:].strip("│ ") for row in re.sub("\x1b[^m]*m", "", box.getvalue()).splitlines()[1:])
-    is_text = lambda row: bool(row.strip(" ─-"))  # noqa: E731
-    message = " ".join(itertools.takewhile(is_text, itertools.dropwhile(lambda row: not is_text(row), rows)))
+    rows = re.sub("\x1b[^m]*m|│", "", box.getvalue()).partition("\n")[2]
+    message = " ".join(re.split(r"\n[ ─-]*\n", rows.strip())[0].split())
     own = f"Error parsing {options_type.__name__}: "
     if message.startswith(own):  # a check of the options themselves
         raise ValueError(message.removeprefix(own))

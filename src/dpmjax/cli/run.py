@@ -36,12 +36,10 @@ from dpmjax.cli.report import write_report
 from dpmjax.cli.run_folder import (
     CONFIG,
     RESULTS,
-    cannot_write,
     check_replaceable,
     check_same_options,
     find_run,
     load_options,
-    lock_folder,
     make_latest,
     write_json,
     write_table,
@@ -51,7 +49,6 @@ from dpmjax.sequences import InputError, Note
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
 METRICS, HISTORY, LOG, CHECKPOINTS = "metrics.json", "metrics.csv", "log.txt", "checkpoints"
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
 LOGGER = logging.getLogger("dpmjax")
 
@@ -87,7 +84,6 @@ class Run:
         """
         self._options, self._started = options, time.perf_counter()
         self._handler: logging.Handler | None = None
-        self._lock: int | None = None
         self._stops: list[BaseException] = []
         self._notes: list[str] = []
         self.is_resumed = getattr(options, "resume", False)
@@ -128,22 +124,20 @@ class Run:
             notes: doubts and decisions on the input.
 
         Raises:
-            ValueError: the folder cannot be written, or another process is writing in it.
+            ValueError: the folder cannot be written.
         """
-        output = self._options.output
+        options = self._options
         try:
-            if output is None and not self.is_resumed:
+            if options.output is None and not self.is_resumed:
                 self.path = make_latest(self.path)
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = lock_folder(self.path)
-            if output is not None and not self.is_resumed:
-                check_replaceable(self.path, self._options)  # another run may have ended here meanwhile
-                for entry in self.path.iterdir():
-                    shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-            write_json(self / CONFIG, self._options)
+            for entry in self.path.iterdir() if options.force else ():
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            write_json(self / CONFIG, options)
             self._handler = logging.FileHandler(self / LOG, encoding="utf-8")
         except OSError as error:
-            raise ValueError(cannot_write(self.path, error.strerror or str(error))) from error
+            reason = error.strerror or str(error)
+            raise ValueError(f"cannot write to {self.path}: {reason}; name another folder with -o") from error
         self._handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         LOGGER.addHandler(self._handler)
         LOGGER.setLevel(logging.INFO)
@@ -158,21 +152,11 @@ class Run:
                 print(note.text, flush=True)
 
     def close(self) -> None:
-        """Ends the log, and lets other processes into the folder."""
+        """Ends the log."""
         if self._handler is not None:
             LOGGER.removeHandler(self._handler)
             self._handler.close()
-        if self._lock is not None:
-            os.close(self._lock)
-        self._handler = self._lock = None
-
-    def part(self, *names: str) -> Run:
-        """Makes or continues a folder inside, such as one for a drive; a signal stops both runs."""
-        part = object.__new__(Run)
-        part.__dict__ |= self.__dict__
-        part.path, part.is_resumed = self.path.joinpath(*names), True
-        part.path.mkdir(parents=True, exist_ok=True)
-        return part
+            self._handler = None
 
     def say(self, text: str) -> None:
         """Prints a text, and writes it to the log."""
@@ -248,14 +232,14 @@ def run_command(
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     run: Run | None = None
-    previous = {number: signal.signal(number, _end_at_once) for number in SIGNALS}
+    previous = {number: signal.signal(number, _end_at_once) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         enable_compile_cache()
         options = _read_options(main, name, description, list(sys.argv[1:] if args is None else args))
         run = Run(name, options)
         if getattr(options, "coordinator", None) is None:  # several processes find each other first
             select_device(getattr(options, "device", None))
-        for number in SIGNALS:
+        for number in previous:
             signal.signal(number, run.on_signal)
         return _finish(run, main(options, run))
     except SystemExit as done:  # after --help
@@ -293,20 +277,18 @@ def _finish(run: Run, numbers: Numbers) -> int:
 
 def _explain(error: Exception, run: Run | None) -> int:
     """Prints the error in one line, after the traceback if the program is at fault."""
-    text, code = f"{type(error).__name__}: {error}", EXIT_FAILED
-    if run is not None and run.is_open:
+    is_open, text = run is not None and run.is_open, str(error).removesuffix(".")
+    is_usual = isinstance(error, InputError | OSError if is_open else ValueError | PermissionError)
+    if not isinstance(error, InputError) and (is_open or not is_usual):
+        text = f"{type(error).__name__}: {error}"
+    elif isinstance(error, PermissionError):
+        text = f"{error.filename}: {error.strerror}"
+    if run is not None and is_open:
         LOGGER.info("failed", exc_info=error)
-        is_usual = isinstance(error, InputError | OSError)
-        text = str(error).removesuffix(".") if isinstance(error, InputError) else text
         text += f"; what was finished is in {run.path}"
-    elif is_usual := isinstance(error, ValueError | PermissionError):
-        text, code = (
-            str(error) if isinstance(error, ValueError) else f"{error.filename}: {error.strerror}",
-            EXIT_BAD_INPUT,
-        )
     if not is_usual:
         traceback.print_exception(error)
-    return _say(f"error: {text}", code)
+    return _say(f"error: {text}", EXIT_BAD_INPUT if is_usual and not is_open else EXIT_FAILED)
 
 
 def _end_at_once(number: int, _frame: object) -> NoReturn:

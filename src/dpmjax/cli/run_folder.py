@@ -1,4 +1,4 @@
-"""The folder of a run: finds it, refuses it before any work, links `latest` to it, locks it, and writes its files."""
+"""The folder of a run: finds it, refuses it before any work, links `latest` to it, and writes its files."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from dpmjax import io
 
@@ -85,7 +83,8 @@ def check_replaceable(path: Path, options: Any) -> None:
     """Raises a ValueError for a folder that is not writable or not empty, or that --force must not remove."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise ValueError(cannot_write(path, "permission denied" if existing.is_dir() else f"{existing} is a file"))
+        reason = "permission denied" if existing.is_dir() else f"{existing} is a file"
+        raise ValueError(f"cannot write to {path}: {reason}; name another folder with -o")
     if existing != path or not any(path.iterdir()):
         return
     if not (path / CONFIG).is_file() or "output" not in load_json(path / CONFIG):
@@ -100,38 +99,15 @@ def check_replaceable(path: Path, options: Any) -> None:
             raise ValueError(f"--force would remove {value}, an input: name another folder with -o")
 
 
-def cannot_write(path: Path, reason: str) -> str:
-    """Returns the message on a folder that cannot be written."""
-    return f"cannot write to {path}: {reason}; name another folder with -o"
-
-
 def make_latest(path: Path) -> Path:
     """Makes a new folder, and points the link `latest` beside it there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    names = itertools.chain([path.name], (f"{path.name}_{number}" for number in itertools.count(2)))
-    path = next(new for new in map(path.with_name, names) if not new.exists())
-    path.mkdir()
+    while path.exists():  # a second run of the same second
+        path = path.with_name(f"{path.name}_2")
+    path.mkdir(parents=True)
     link = path.parent / f".latest_{path.name}"
     link.symlink_to(path.name, target_is_directory=True)
     link.replace(path.parent / "latest")
     return path
-
-
-def lock_folder(path: Path) -> int | None:
-    """Keeps other processes out of a folder, if the system can lock folders."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise ValueError(f"{path}: another process is writing this run; let it end, or stop it") from error
-    except OSError:
-        pass  # a network file system without locks
-    return handle
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -170,14 +146,10 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, 
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([_cell(row[column]) for column in columns] for row in rows)
+    for row in rows:
+        cells = (row[column] for column in columns)
+        writer.writerow([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in cells])
     io.write_atomically(path, text.getvalue())
-
-
-def _cell(value: Any) -> Any:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return int(value) if isinstance(value, bool) else value
 
 
 def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum: Any) -> None:
@@ -192,23 +164,3 @@ def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum
     io.write_poses_npy(folder / f"{name}.npy", poses)
     io.write_tum(folder / f"{name}_tum.txt", poses, **tum)
     io.write_kitti(folder / f"{name}_kitti.txt", poses)
-
-
-@contextmanager
-def counting_bar(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Shows a bar while the block runs; yields a callback that takes the numbers of finished and of all items.
-
-    Args:
-        description: shown before the bar.
-        unit: unit of the numbers, with a space before it.
-
-    Yields:
-        The callback.
-    """
-    with tqdm(desc=description, unit=unit, dynamic_ncols=True) as bar:
-
-        def on_progress(num_done: int, num_all: int) -> None:
-            bar.total = num_all
-            bar.update(num_done - bar.n)
-
-        yield on_progress

@@ -120,29 +120,38 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     run.say(f"{sequence.name}: {counted(len(sequence), 'scan')}" + (f", {num_done} done before" if num_done else ""))
     viewer = viz.LiveViewer(sequence.name, run / "slam.rrd") if options.visualize else None
     with nullcontext() if viewer is None else closing(viewer):
-        mapped = run_scans(run, reader, methods, beginning, viewer=viewer, odometry=odometry)
+        mapped = run_scans(
+            run.path, reader, methods, beginning, stop=lambda: run.is_stopped, viewer=viewer, odometry=odometry
+        )
+    if mapped.error is not None:
+        run.fail(mapped.error)
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
     placed = sequence.take(slice(0, len(result.reports)))
-    num_new = len(mapped.scan_s)
-    numbers = {
-        "weights": options.weights,
-        **results.run_numbers(result, placed),
-        "scans_per_s": num_new / mapped.run_s if num_new else None,
-        "run_s": mapped.run_s,
-        "compile_s": mapped.compile_s,
-    }
+    scans_per_s = len(mapped.scan_s) / mapped.run_s if mapped.scan_s else None
+    numbers = {"weights": options.weights, **results.run_numbers(result, placed), "scans_per_s": scans_per_s}
+    numbers |= {"run_s": mapped.run_s, "compile_s": mapped.compile_s}
+    if odometry is not None and len(result.reports) > 2:
+        errors = slam.compare_odometry(odometry[: len(result.reports)], result.T_world_scan)
+        numbers |= {"odometry_step_m": errors.step_m, "odometry_delay_scans": errors.delay_scans}
+        run.say(odometry_text(errors, placed))
     if result.reports:
         if options.T_base_lidar is not None:
             poses = options.T_base_lidar @ result.T_world_scan @ geometry.rigid.inverse(options.T_base_lidar)
             cli.write_poses(run.path, poses, "trajectory_base", times=placed.times, frame="T_world_base")
         numbers |= write_map_results(run, placed, start, result, numbers)
-    if errors := results.error_text(numbers):
-        run.say(errors)
-    if odometry is not None and len(result.reports) > 2:
-        numbers |= results.odometry_numbers(odometry[: len(result.reports)], placed, result, run)
-    if num_new:
-        run.say(f"{numbers['scans_per_s']:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
+    if scans_per_s is not None:
+        run.say(f"{scans_per_s:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
     return numbers
+
+
+def odometry_text(found: slam.OdometryErrors, sequence: LidarSequence) -> str:
+    """Returns the error of the given odometry against the trajectory, and the delay of its stamps."""
+    text = f"odometry: {found.step_m:.2g} m off a step in the median"
+    if found.delay_scans:
+        step, unit = (1.0, "scans") if sequence.times is None else (float(np.median(np.diff(sequence.times))), "s")
+        late = f"{abs(found.delay_scans) * step:.2g} {unit} {'late' if found.delay_scans > 0 else 'early'}"
+        text += f"; its stamps are {late} ({found.undelayed_step_m:.2g} m off)"
+    return text
 
 
 def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
@@ -150,21 +159,21 @@ def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     cli.require_importable("distributed", "--cluster")
     from distributed import Client, LocalCluster
 
-    from dpmjax.cli.fleet import DrivePlan, map_drives
+    from dpmjax.cli.fleet import map_drives
 
     for data in options.data:  # bad input is refused here, before any work
         cli.open_drive(data, options)
-    plan = DrivePlan(options, slam_methods(options).config, options.deskew)
+    settings = slam_methods(options).config
     run.open()
     if options.cluster != "local":
         with Client(options.cluster) as client:
-            return map_drives(client, options.data, plan, run)
+            return map_drives(client, options, settings, run)
     num_workers = min(len(options.data), cli.environment()["num_cores"])
     with (
         LocalCluster(n_workers=num_workers, threads_per_worker=1, memory_limit=None, dashboard_address=None) as cluster,
         Client(cluster) as client,
     ):
-        return map_drives(client, options.data, plan, run)
+        return map_drives(client, options, settings, run)
 
 
 def slam_methods(options: SlamOptions) -> slam.SlamMethods:
@@ -203,7 +212,7 @@ def write_map_results(
         cli.write_poses(run.path, poses, name, times=sequence.times, frame="T_world_lidar")
     results.write_graph(run.path, result)
     results.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
-    results.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
+    results.write_scans(run / "scans.csv", result, sequence.sources)
     sizes: cli.Numbers = {}
     if len(slam_map):
         whole = saved_maps.save_map(run / "map.npz", slam_map)

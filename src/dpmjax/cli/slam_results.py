@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dpmjax import geometry, io, metrics, saved_maps, slam, viz
-from dpmjax.cli.run import Numbers, Run
+from dpmjax.cli.run import Numbers
 from dpmjax.cli.run_folder import write_table
 from dpmjax.sequences import LidarSequence, counted
 
@@ -61,21 +60,6 @@ def write_graph(folder: Path, result: slam.SlamResult) -> None:
     io.write_tum(folder / "keyframes.txt", poses, times=result.keyframes, frame=frame)
 
 
-def odometry_numbers(odometry: np.ndarray, sequence: LidarSequence, result: slam.SlamResult, run: Run) -> Numbers:
-    """Returns and prints the errors of the given odometry against the result, and the delay of its stamps."""
-    found = slam.compare_odometry(odometry, result.T_world_scan)
-    text = f"odometry: {found.step_m:.2g} m off a step in the median"
-    if found.delay_scans:
-        step_s = 1.0 if sequence.times is None else float(np.median(np.diff(sequence.times)))
-        unit = "scans" if sequence.times is None else "s"
-        late = "late" if found.delay_scans > 0 else "early"
-        text += (
-            f"; its stamps are {abs(found.delay_scans) * step_s:.2g} {unit} {late} ({found.undelayed_step_m:.2g} m off)"
-        )
-    run.say(text)
-    return {"odometry_step_m": found.step_m, "odometry_delay_scans": found.delay_scans}
-
-
 def write_loops(path: Path, loops: Sequence[slam.Loop], ends: Sequence[Mapping[str, int]]) -> None:
     """Writes every candidate of a loop: its two keyframes, its source, its outcome, and the numbers behind it.
 
@@ -90,14 +74,13 @@ def write_loops(path: Path, loops: Sequence[slam.Loop], ends: Sequence[Mapping[s
     write_table(path, [*names, *LOOP_COLUMNS], rows)
 
 
-def write_scans(
-    path: Path, reports: Sequence[slam.ScanReport], keyframes: Sequence[int] | np.ndarray, sources: Sequence[str]
-) -> None:
+def write_scans(path: Path, result: slam.SlamResult, sources: Sequence[str]) -> None:
     """Writes the reports on the placed scans."""
-    rows = [
-        report._asdict() | {"keyframe_scan": keyframes[report.keyframe] if len(keyframes) else "", "source": source}
-        for report, source in zip(reports, sources, strict=False)
-    ]
+    rows = []
+    for report, source in zip(result.reports, sources, strict=False):
+        keyframe = result.keyframes[report.keyframe] if len(result.keyframes) else ""
+        named = {"is_keyframe": int(report.is_keyframe), "keyframe_scan": keyframe, "source": source}
+        rows.append(report._asdict() | named)
     write_table(path, SCAN_COLUMNS, rows)
 
 
@@ -119,26 +102,20 @@ def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray])
     """
     from dpmjax.scans.preprocess import first_of_each_voxel
 
-    voxel_m, parts, num_thinned = MAP_VOXEL_M, [np.zeros((0, 4), np.float32)], 0
-
-    def thinned() -> np.ndarray:
-        whole = np.concatenate(parts)
-        return whole[first_of_each_voxel(whole[:, :3], voxel_m)]
-
+    voxel_m, whole, fresh = MAP_VOXEL_M, np.zeros((0, 4), np.float32), list[np.ndarray]()
     for row, T in enumerate(tqdm(T_world_scan, desc="map", unit=" keyframes", dynamic_ncols=True)):
         points = read_scan(row).astype(np.float64)
         ranges = np.linalg.norm(points, axis=1)
         points = points[(ranges > MAP_RANGES_M[0]) & (ranges < MAP_RANGES_M[1])]
         turned = points[first_of_each_voxel(points, voxel_m)] @ T[:3, :3].T
-        parts.append(np.column_stack([turned + T[:3, 3], turned[:, 2]]).astype(np.float32))
+        fresh.append(np.column_stack([turned + T[:3, 3], turned[:, 2]]).astype(np.float32))
         # Larger maps are thinned less often, so that the work is linear in the size of the map.
-        if sum(map(len, parts)) > 2 * num_thinned + 200_000:
-            parts = [thinned()]
-            while len(parts[0]) > MAX_MAP_POINTS:
+        if row == len(T_world_scan) - 1 or sum(map(len, fresh)) > len(whole) + 200_000:
+            whole, fresh = np.concatenate([whole, *fresh]), []
+            whole = whole[first_of_each_voxel(whole[:, :3], voxel_m)]
+            while len(whole) > MAX_MAP_POINTS:
                 voxel_m *= 1.5
-                parts = [thinned()]
-            num_thinned = len(parts[0])
-    whole = thinned()
+                whole = whole[first_of_each_voxel(whole[:, :3], voxel_m)]
     return Cloud(whole[:, :3], whole[:, 3], voxel_m)
 
 
@@ -199,55 +176,6 @@ def require_same_weights(path: Path, slam_map: slam.KeyframeMap, methods: slam.S
         raise ValueError(f"{path}: made with weights {made_by}, these are {given}; {advice}")
 
 
-class LocalizationErrors(NamedTuple):
-    """Errors of n scans against the reference.
-
-    Attributes:
-        is_found: (n,) bool.
-        is_right: (n,) True for scans that were found within 2 m and 5 degrees.
-        translation_m: (n,) NaN for scans that were not found.
-        rotation_deg: (n,) NaN for scans that were not found.
-        keyframe_distance_m: (n,) distance of the true position to the nearest keyframe.
-    """
-
-    is_found: np.ndarray
-    is_right: np.ndarray
-    translation_m: np.ndarray
-    rotation_deg: np.ndarray
-    keyframe_distance_m: np.ndarray
-
-
-def localization_errors(
-    found: Sequence[slam.Localization],
-    slam_map: slam.KeyframeMap,
-    T_reference_keyframe: np.ndarray,
-    T_reference_scan: np.ndarray,
-) -> LocalizationErrors:
-    """Compares the pose of each scan in the frame of its keyframe with the reference.
-
-    Args:
-        found: results of n scans.
-        slam_map: the map.
-        T_reference_keyframe: (k, 4, 4) reference poses of all keyframes.
-        T_reference_scan: (n, 4, 4) reference poses of the scans, in the same world.
-
-    Returns:
-        The errors.
-    """
-    is_found = np.array([one.is_in_map for one in found], bool)
-    is_right, errors = np.zeros(len(found), bool), np.full((2, len(found)), np.nan)
-    keyframes = np.array([one.keyframe for one in found if one.is_in_map], np.int64)
-    T_world_scan = np.reshape([one.T_world_scan for one in found if one.is_in_map], (-1, 4, 4))
-    T = geometry.rigid.inverse(slam_map.T_world_keyframe[keyframes]) @ T_world_scan
-    true = geometry.rigid.inverse(T_reference_keyframe[keyframes]) @ T_reference_scan[is_found]
-    recall = metrics.registration_recall(T, true)
-    is_right[is_found] = recall.is_right
-    errors[:, is_found] = recall.translation_errors_m, recall.rotation_errors_deg
-    apart = np.linalg.norm(T_reference_scan[:, None, :3, 3] - T_reference_keyframe[None, :, :3, 3], axis=2)
-    translation_m, rotation_deg = errors
-    return LocalizationErrors(is_found, is_right, translation_m, rotation_deg, apart.min(axis=1))
-
-
 def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
     """Returns the numbers of a map for `metrics.json`; the sequence has the scans that were placed."""
     T, reference = result.T_world_scan, sequence.T_world_lidar
@@ -270,19 +198,11 @@ def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
 
 
 def why_failed(statuses: Mapping[str, int]) -> str | None:
-    """Returns the reason why a finished run has no result; None if it has one.
-
-    Args:
-        statuses: number of scans by status.
-
-    Returns:
-        One text.
-    """
+    """Returns the reason why a finished run, with these numbers of scans by status, has no result; or None."""
     num_scans, num_empty = sum(statuses.values()), statuses.get("empty", 0)
-    num_aligned = sum(statuses.get(status, 0) for status in ("tracked", "network", "coasting"))
     if num_scans and num_empty == num_scans:
         return f"{num_empty} of {counted(num_scans, 'scan')} without enough points, no map was made"
-    if num_scans > 1 and not num_aligned:
+    if num_scans > 1 and not {"tracked", "network", "coasting"} & statuses.keys():
         return f"none of {counted(num_scans, 'scan')} could be aligned with those before, the trajectory is no result"
     return None
 
@@ -301,11 +221,10 @@ def status_of(numbers: Numbers) -> str:
     statuses = numbers["scan_statuses"]
     if why_failed(statuses) is not None:
         return "failed"
-    if numbers["num_parts"] > 1:
-        return "uncertain"
     num_scans = sum(statuses.values())
     num_guessed = num_scans - sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
-    return "done" if num_guessed <= max(1, MAX_GUESSED_SHARE * num_scans) else "uncertain"
+    is_sure = numbers["num_parts"] < 2 and num_guessed <= max(1, MAX_GUESSED_SHARE * num_scans)
+    return "done" if is_sure else "uncertain"
 
 
 def count_parts(slam_map: slam.KeyframeMap) -> int:
@@ -317,31 +236,19 @@ def verdict_of(numbers: Numbers) -> str:
     """Returns the verdict: the size of the map, and its uncertain or wrong parts."""
     if (reason := why_failed(numbers["scan_statuses"])) is not None:
         return f"{reason}: check that the scans are 3-D, in metres, and follow each other"
-    counts = (("scan", "num_scans"), ("keyframe", "num_new_keyframes"), ("loop closure", "num_loops"))
-    scans, keyframes, loops = (counted(numbers[name], noun) for noun, name in counts)
+    text = f"{counted(numbers['num_scans'], 'scan')}, {numbers['path_m']:.1f} m driven, "
+    text += counted(numbers["num_new_keyframes"], "keyframe")
     if numbers["num_keyframes"] > numbers["num_new_keyframes"]:
-        keyframes += f" ({numbers['num_keyframes']} in the map)"
-    texts = [", ".join([scans, f"{numbers['path_m']:.1f} m driven", keyframes, loops])]
-    texts += [
-        f"{counted(numbers['scan_statuses'][status], 'scan')} {text} (scans.csv has the reasons)"
-        for status, text in UNSURE.items()
-        if status in numbers["scan_statuses"]
-    ]
+        text += f" ({numbers['num_keyframes']} in the map)"
+    text += f", {counted(numbers['num_loops'], 'loop closure')}"
+    for status, reason in UNSURE.items():
+        if status in numbers["scan_statuses"]:
+            text += f"; {counted(numbers['scan_statuses'][status], 'scan')} {reason} (scans.csv has the reasons)"
     if numbers["num_parts"] > 1:
-        texts.append(f"the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess")
+        text += f"; the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess"
     if numbers["reference_doubt"] is not None:
-        texts.append(f"warning: {numbers['reference_doubt']}")
-    return "; ".join(texts)
-
-
-def error_text(numbers: Numbers) -> str:
-    """Returns the errors against the reference poses; empty without a reference."""
-    lines = []
+        text += f"; warning: {numbers['reference_doubt']}"
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM")):
         if f"ate{suffix}_m" in numbers:
-            ate_m, rpe_m = numbers[f"ate{suffix}_m"], numbers[f"rpe{suffix}_m"]
-            line = f"{name:14}  ATE {ate_m:.3f} m, RPE from scan to scan {rpe_m:.3f} m"
-            t_rel, r_rel = numbers.get(f"t_rel{suffix}_percent"), numbers.get(f"r_rel{suffix}_deg_per_100m")
-            is_long = t_rel is not None and math.isfinite(t_rel)
-            lines.append(line + (f", {t_rel:.2f} %, {r_rel:.2f} degrees/100 m" if is_long else ""))
-    return "\n".join(lines)
+            text += f"; ATE of {name} {numbers[f'ate{suffix}_m']:.3f} m"
+    return text

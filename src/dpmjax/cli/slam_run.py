@@ -1,9 +1,9 @@
-"""A SLAM run in its folder: progress, and the state for a resumed run."""
+"""SLAM of a drive in a folder: progress, and the state for a resumed run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -15,29 +15,14 @@ from tqdm import tqdm
 from dpmjax import slam, viz
 from dpmjax.cli import slam_results as results
 from dpmjax.cli.drives import ScanReader
-from dpmjax.cli.run import Run
 from dpmjax.saved_maps import RunState, load_state, save_state
-from dpmjax.sequences import LidarSequence, counted
+from dpmjax.sequences import counted
 
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
 SAVE_EVERY_S = 10.0
 # A scan from its file, and the same scan prepared for SLAM.
 _Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
-
-
-class DriveFolder(NamedTuple):
-    """Folder of a drive without a run of its own; no signal stops its mapping."""
-
-    path: Path
-    is_stopped: bool = False
-
-    def __truediv__(self, name: str) -> Path:
-        return self.path / name
-
-    def fail(self, error: Exception) -> None:
-        """Raises the error, which the worker sends back."""
-        raise error
 
 
 class SlamRun(NamedTuple):
@@ -49,6 +34,7 @@ class SlamRun(NamedTuple):
         compile_s: seconds of compilation.
         run_s: seconds of all scans of this process, without compilation.
         scan_s: seconds of each scan of this process, without compilation and writing.
+        error: the error that stopped the run; None without one.
     """
 
     state: slam.SlamState
@@ -56,6 +42,7 @@ class SlamRun(NamedTuple):
     compile_s: float
     run_s: float
     scan_s: tuple[float, ...]
+    error: Exception | None
 
 
 class _Clock:
@@ -73,64 +60,74 @@ class _Clock:
             self.compile_s += duration_secs
 
 
-def find_beginning(earlier: Path | None, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
-    """Reads the state of an earlier run, if there is one; raises a `ValueError` for a run with other weights."""
-    path = None if earlier is None else earlier / STATE
-    if path is None or not path.is_file():
+def find_beginning(folder: Path | None, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
+    """Reads the state in the folder of an earlier run, if any; raises a `ValueError` for a run with other weights."""
+    if folder is None or not (folder / STATE).is_file():
         return RunState(start, ())
-    found = load_state(path)
-    results.require_same_weights(path, found.state.slam_map, methods, "give those, or start again")
+    found = load_state(folder / STATE)
+    results.require_same_weights(folder / STATE, found.state.slam_map, methods, "give those, or start again")
     return found
 
 
-def map_drive(run: Run, sequence: LidarSequence, methods: slam.SlamMethods) -> tuple[SlamRun, slam.SlamResult]:
+def map_drive(
+    folder: Path, reader: ScanReader, methods: slam.SlamMethods, stop: Callable[[], bool] = lambda: False
+) -> tuple[SlamRun, slam.SlamResult]:
     """Maps a drive from its beginning, or from the state in its folder.
 
     Args:
-        run: folder for the state.
-        sequence: the drive.
+        folder: folder for the state; made here.
+        reader: reads the scans.
         methods: matcher, geometry and settings.
+        stop: called before each scan; True ends the run.
 
     Returns:
         The run with its seconds, and the trajectory and the map.
     """
-    beginning = find_beginning(run.path if run.is_resumed else None, methods, slam.init_slam())
-    mapped = run_scans(run, ScanReader(sequence), methods, beginning)
+    folder.mkdir(parents=True, exist_ok=True)
+    mapped = run_scans(folder, reader, methods, find_beginning(folder, methods, slam.init_slam()), stop=stop)
+    if mapped.error is not None:
+        raise mapped.error
     return mapped, slam.finish_slam(mapped.state, mapped.reports, methods.config)
 
 
 def run_scans(
-    run: Run | DriveFolder,
+    folder: Path,
     reader: ScanReader,
     methods: slam.SlamMethods,
     beginning: RunState,
     *,
+    stop: Callable[[], bool],
     viewer: viz.LiveViewer | None = None,
     odometry: np.ndarray | None = None,
 ) -> SlamRun:
     """Places the remaining scans and saves the state of the last keyframe; an error stops the run.
 
     Args:
-        run: folder for the state.
+        folder: folder for the state.
         reader: reads the scans.
         methods: matcher, geometry and settings.
         beginning: state and reports of the scans that are done.
+        stop: called before each scan; True ends the run.
         viewer: shows the run.
         odometry: (n, 4, 4) poses of the lidar, as first guesses; None without odometry.
 
     Returns:
         The run.
     """
-    clock, sequence = _Clock(), reader.sequence
+    clock, sequence, error = _Clock(), reader.sequence, None
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
-    first, started = len(reports), clock.now_s()
-    saved = time.perf_counter()
+    first, started, saved = len(reports), clock.now_s(), time.perf_counter()
     resumable: RunState | None = None
+
+    def prepare(index: int) -> _Prepared:
+        scan = reader(index)
+        return scan, slam.prepare_ahead(methods, scan)
+
     progress = tqdm(total=len(sequence), initial=first, desc=sequence.name, unit=" scans", dynamic_ncols=True)
-    with progress as bar, closing(_prepared_scans(reader, methods, first)) as scans:
+    with progress as bar, closing(slam.in_advance(prepare, range(first, len(sequence)))) as scans:
         try:
             for row in range(first, len(sequence)):
-                if run.is_stopped:
+                if stop():
                     break
                 before = clock.now_s()
                 scan, prepared = next(scans)
@@ -141,36 +138,20 @@ def run_scans(
                 if report.is_keyframe:
                     resumable = RunState(state, tuple(reports))
                 if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
-                    save_state(run / STATE, *resumable)
+                    save_state(folder / STATE, *resumable)
                     resumable, saved = None, time.perf_counter()
                 if viewer is not None:
                     show_live(viewer, scan, state, report)
-                bar.set_postfix_str(_progress(state, report, clock.compile_s), refresh=False)
+                num_loops = len(results.accepted_ends(state.loops.loops))
+                counts = f"{counted(len(state.slam_map), 'keyframe')}, {counted(num_loops, 'loop')}"
+                bar.set_postfix_str(f"{counts}, {report.status}, score {report.score:.2f}", refresh=False)
                 bar.update(1)
-        except Exception as error:  # what was found is written before it goes on
-            run.fail(error)
+        except Exception as failure:  # what was found is written before it goes on
+            error = failure
         finally:
             if resumable is not None:
-                save_state(run / STATE, *resumable)
-    return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s))
-
-
-def _prepared_scans(reader: ScanReader, methods: slam.SlamMethods, first: int) -> Generator[_Prepared, None, None]:
-    """Reads and prepares each scan while the caller works on the one before."""
-
-    def prepare(index: int) -> _Prepared:
-        scan = reader(index)
-        return scan, slam.prepare_ahead(methods, scan)
-
-    return slam.in_advance(prepare, range(first, len(reader.sequence)))
-
-
-def _progress(state: slam.SlamState, report: slam.ScanReport, compile_s: float) -> str:
-    num_loops = len(results.accepted_ends(state.loops.loops))
-    parts = [counted(len(state.slam_map), "keyframe"), counted(num_loops, "loop"), f"score {report.score:.2f}"]
-    if report.status not in ("first", "tracked"):
-        parts.append(report.status)
-    return ", ".join([*parts, f"compiled {compile_s:.0f} s"])
+                save_state(folder / STATE, *resumable)
+    return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s), error)
 
 
 def show_live(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import jax
 from tqdm import tqdm
@@ -19,9 +19,9 @@ from tqdm import tqdm
 from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.compile_cache import enable_compile_cache
+from dpmjax.sequences import LidarSequence
 from dpmjax.types import Poses
 
-Result = TypeVar("Result")
 # Scans of a drive that a processor prepares at a time; with more the bar stands still, with fewer the drive is opened
 # more often.
 NUM_AT_ONCE = 16
@@ -43,13 +43,14 @@ class PlannedDrive(NamedTuple):
     found: dpm.PreparedDrive | None
 
 
+def part_of_drive(source: cli.Source, part: Literal["training", "held_out"]) -> LidarSequence:
+    """Opens the held-out places of a drive, or the remaining scans without those near them."""
+    drive = source()
+    return drive.take(getattr(dpm.split_places(drive), part))
+
+
 def prepare_sources(
-    sources: Sequence[cli.Source],
-    settings: dpm.TrainingConfig,
-    folder: Path,
-    *,
-    seed: int,
-    on_wait: Callable[[], object] = lambda: None,
+    sources: Sequence[cli.Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
 ) -> list[dpm.PreparedDrive]:
     """Prepares all drives on all processors and keeps them in a folder for later runs.
 
@@ -58,7 +59,6 @@ def prepare_sources(
         settings: settings of training.
         folder: folder of prepared scans.
         seed: seed of the variants.
-        on_wait: called about every second; an error of it ends the preparation.
 
     Returns:
         The drives, in order.
@@ -70,18 +70,19 @@ def prepare_sources(
         print("each scan is prepared anew at each use; nothing is kept on disk")
         return [dpm.prepare_drive(source(), settings) for source in sources]
     with _workers() as pool:
-        begun = deque(pool.submit(_plan, source, settings, folder, seed) for source in sources)
-        opened = _results(begun, on_wait)
+        opened = pool.map(partial(_plan, settings=settings, folder=folder, seed=seed), sources)
         plans = list(tqdm(opened, "open drives", len(sources), unit=" drives", dynamic_ncols=True))
         # The same drive may be given twice.
         missing = {plan.path: plan for plan in plans if plan.found is None}
         num_scans = sum(len(plan.T_world_lidar) for plan in missing.values())
         check_space(num_scans, settings, folder)
-        parts = {path: _submit_parts(pool, plan, settings, seed) for path, plan in missing.items()}
+        work = partial(_prepare, settings=settings, seed=seed)
+        # All parts are begun here; each result is forgotten when it was written.
+        parts = {path: pool.map(work, *_parts(plan)) for path, plan in missing.items()}
         with tqdm(desc="prepare scans", total=num_scans, unit=" scans", dynamic_ncols=True) as bar:
 
             def scans_of(path: Path) -> Iterator[dpm.PreparedScan]:
-                for part in _results(parts[path], on_wait):
+                for part in parts[path]:
                     yield from part
                     bar.update(len(part))
 
@@ -98,17 +99,12 @@ def check_space(num_scans: int, settings: dpm.TrainingConfig, folder: Path) -> N
     needed = num_scans * each
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
+    scans, free_text = f"{num_scans} scans of {each / 1e6:.2f} MB", f"{free / 1e9:.1f} GB are free"
     if needed > free:
-        one = needed / settings.num_variants
-        raise ValueError(
-            f"--cache {folder}: {num_scans} scans of {each / 1e6:.2f} MB need {needed / 1e9:.1f} GB, "
-            f"{free / 1e9:.1f} GB are free; --variants 1 needs {one / 1e9:.1f} GB, --variants 0 nothing"
-        )
+        advice = f"--variants 1 needs {needed / settings.num_variants / 1e9:.1f} GB, --variants 0 nothing"
+        raise ValueError(f"--cache {folder}: {scans} need {needed / 1e9:.1f} GB, {free_text}; {advice}")
     if num_scans > 0:
-        print(
-            f"prepares {num_scans} scans of {each / 1e6:.2f} MB: {needed / 1e9:.1f} GB in {folder}, "
-            f"{free / 1e9:.1f} GB are free"
-        )
+        print(f"prepares {scans}: {needed / 1e9:.1f} GB in {folder}, {free_text}")
 
 
 @contextmanager
@@ -133,15 +129,6 @@ def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _results(begun: deque[Future[Result]], on_wait: Callable[[], object]) -> Iterator[Result]:
-    """Yields results in order, and forgets each: all scans together may not fit into the memory."""
-    while begun:
-        while not wait([begun[0]], timeout=1.0).done:
-            on_wait()
-        on_wait()
-        yield begun.popleft().result()
-
-
 def _plan(source: cli.Source, settings: dpm.TrainingConfig, folder: Path, seed: int) -> PlannedDrive:
     drive = source()
     if drive.T_world_lidar is None:
@@ -150,12 +137,10 @@ def _plan(source: cli.Source, settings: dpm.TrainingConfig, folder: Path, seed: 
     return PlannedDrive(source, drive.T_world_lidar, path, dpm.find_prepared(path, drive.T_world_lidar))
 
 
-def _submit_parts(
-    pool: ProcessPoolExecutor, plan: PlannedDrive, settings: dpm.TrainingConfig, seed: int
-) -> deque[Future[list[dpm.PreparedScan]]]:
+def _parts(plan: PlannedDrive) -> tuple[list[cli.Source], list[range]]:
     num = len(plan.T_world_lidar)
-    parts = (range(first, min(first + NUM_AT_ONCE, num)) for first in range(0, num, NUM_AT_ONCE))
-    return deque(pool.submit(_prepare, plan.source, numbers, settings, seed) for numbers in parts)
+    rows = [range(first, min(first + NUM_AT_ONCE, num)) for first in range(0, num, NUM_AT_ONCE)]
+    return [plan.source] * len(rows), rows
 
 
 def _prepare(source: cli.Source, numbers: range, settings: dpm.TrainingConfig, seed: int) -> list[dpm.PreparedScan]:
