@@ -40,23 +40,31 @@ class FoundLoop(NamedTuple):
     T_older_newer: np.ndarray
 
 
-class KissIcp:
+class _Odometry:
+    """Poses of a program without loops."""
+
+    def __init__(self) -> None:
+        self._poses = list[np.ndarray]()
+
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        return np.array(self._poses), []
+
+
+class KissIcp(_Odometry):
     """KISS-ICP (Vizzo et al. 2023), with a voxel map of the whole way: the program itself drops far points."""
 
     def __init__(self, *, is_indoors: bool) -> None:
+        super().__init__()
         from kiss_icp.config import load_config
         from kiss_icp.kiss_icp import KissICP
 
         self._config = load_config(None)
         _set_range(self._config.data, self._config.mapping, is_indoors)
-        self._odometry, self._poses = KissICP(self._config), list[np.ndarray]()
+        self._odometry = KissICP(self._config)
 
     def step(self, points: np.ndarray) -> None:
         self._odometry.register_frame(points, np.zeros(0))
         self._poses.append(self._odometry.last_pose)
-
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        return np.array(self._poses), []
 
     def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
         from kiss_icp.mapping import VoxelHashMap
@@ -103,15 +111,16 @@ class KissSlam:
         return POINT_BYTES * sum(len(cloud.point.positions) for cloud in clouds)
 
 
-class SmallGicp:
+class SmallGicp(_Odometry):
     """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
 
     def __init__(self, *, is_indoors: bool) -> None:
+        super().__init__()
         import small_gicp
 
         self._library, self._threads = small_gicp, os.cpu_count() or 1
         self._point_m, self._voxel_m = (0.125, 0.5) if is_indoors else (0.25, 1.0)
-        self._map, self._poses = small_gicp.GaussianVoxelMap(self._voxel_m), list[np.ndarray]()
+        self._map = small_gicp.GaussianVoxelMap(self._voxel_m)
 
     def step(self, points: np.ndarray) -> None:
         scan, T = self._thin(points), np.eye(4)
@@ -125,9 +134,6 @@ class SmallGicp:
 
     def _thin(self, points: np.ndarray) -> Any:
         return self._library.preprocess_points(points, self._point_m, num_threads=self._threads)[0]
-
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        return np.array(self._poses), []
 
     def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
         whole = self._library.GaussianVoxelMap(self._voxel_m)

@@ -25,13 +25,12 @@ from dpmjax.registration2d import DEEPMAPPING, START_NAMES
 
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
 RIGHT_M = 0.5
-# Columns of rows.csv that are numbers of the run; those of the table.
+# Numbers of a run in rows.csv and in the table.
 NUMBERS = (
     "num_scans", "num_registered", "ate_initial_m", "ate_m", "worst_scan_m", "relations_initial_m",
     "relations_initial_deg", "relations_m", "relations_deg", "ate_corrected_initial_m", "ate_corrected_m", "kept",
     "wall_s", "peak_rss_gb",
 )  # fmt: skip
-COLUMNS = (*NUMBERS[:11], "deepmapping_ate_m", "right", "trusted", "wall_s", "peak_rss_gb")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +77,10 @@ def main(options: LogOptions, run: cli.Run) -> cli.Row:
     if rows and not done:
         raise ValueError("every run was refused, for the reasons above")
     refused = [f"Refused: {row['log']} from {row['init']}." for row in rows if row["num_scans"] is None]
-    shares = cli.summarize(
-        [row | {"trust": "all"} for row in done], ("trust",), ("right_if_trusted", "trusted_if_right")
-    )
-    return cli.write_summary(run, cli.summarize(done, ("log", "init"), COLUMNS), cli.format_table(shares), *refused)
+    columns = ("trusted", "right", "right_if_trusted", "trusted_if_right")
+    shares = cli.format_table(cli.summarize([row | {"trust": "all"} for row in done], ("trust",), columns))
+    summary = [{name: row[name] for name in ("log", "init", *NUMBERS, *columns[:2])} for row in done]
+    return cli.write_summary(run, summary, shares, *refused)
 
 
 def list_logs(folder: Path) -> list[Path]:

@@ -13,8 +13,7 @@ a scan. The scans themselves are not used again.
 
 The file rows.csv has every pair, overlap.csv the overlap probability of each drive. The file table.md has the shares of
 right registrations (95 % intervals) and the median errors of right ones. The file pooled.md has all recorded drives
-together, and names the methods that differ. The pictures reliability.png and failures.png are those of `dpmjax
-evaluate`.
+together, and names the methods that differ. The picture reliability.png is that of `dpmjax evaluate`.
 """
 
 from __future__ import annotations
@@ -63,18 +62,17 @@ def main(options: PairOptions, run: cli.Run) -> cli.Row:
     matchers |= {} if no_kiss else {"kiss": kiss_matcher}
     matchers |= {f"clouds_{num}": partial(match_clouds, model=model, num_elements=num) for num in options.clouds}
     run.open()
-    rows, read = cli.register_pairs(run, model, drives, options, matchers)
+    rows = cli.register_pairs(run, model, drives, options, matchers)
     summary = cli.summarize_pairs(rows, cli.fill_overlap(run, model, drives, options), tuple(matchers))
     notes = () if no_kiss is None else (f"KISS-Matcher was not run: {no_kiss}.",)
-    numbers = {"weights": options.weights, "kiss_matcher": no_kiss or "run", **cli.rate_confidence(model, rows)}
+    numbers = {"weights": options.weights, "kiss_matcher": no_kiss or "run"}
+    numbers |= cli.rate_confidence(run, model, rows, Path(options.weights).stem)
     numbers |= cli.write_summary(run, summary, *notes)
     recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
     pooled = pool_drives(rows, recorded or [drive.name for drive in drives])
     shares = tuple(f"{name}_right" for name in (*cli.STAGES, *matchers))
     table = cli.summarize(pooled, ("drives", "band"), shares)
-    numbers |= cli.write_summary(run, table, *compare_methods(pooled, shares), name="pooled")
-    cli.draw_evaluation(run, model, rows, read, Path(options.weights).stem)
-    return numbers
+    return numbers | cli.write_summary(run, table, *compare_methods(pooled, shares), name="pooled")
 
 
 def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:

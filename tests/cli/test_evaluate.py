@@ -14,8 +14,7 @@ import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli import drives
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_OK, load_json
 from dpmjax.deeppointmap import SamplingConfig
 from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy

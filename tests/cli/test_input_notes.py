@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli.run import EXIT_FAILED, EXIT_OK
-from dpmjax.cli.run_folder import load_json
-from dpmjax.cli.slam_results import status_of, why_failed
+from dpmjax.cli.run import EXIT_FAILED, EXIT_OK, load_json
+from dpmjax.cli.slam_run import status_of, why_failed
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from tests.cli.test_slam import run

@@ -12,8 +12,7 @@ import pytest
 import dpmjax
 from dpmjax.cli import localize
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_FAILED, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_FAILED, EXIT_OK, load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import open_lidar_sequence, read_poses
 from dpmjax.slam import Match, NetworkMatcher, Submap, make_methods

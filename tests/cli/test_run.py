@@ -14,8 +14,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax.cli import run as run_module
 from dpmjax.cli.options import OutputOptions, RunOptions, parse_options
-from dpmjax.cli.run import Run
-from dpmjax.cli.run_folder import load_options, write_json
+from dpmjax.cli.run import Run, load_options, write_json
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from dpmjax.cli import train_preparation, train_run
+from dpmjax.cli import train_run
 from dpmjax.cli.run import CHECKPOINTS, HISTORY
 from dpmjax.cli.train import TrainOptions, training_settings
 from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
@@ -63,7 +63,7 @@ def train_both(folder: Path, *, stop_after: int = 99):
 
 
 def train(folder: Path, *, stop_after: int = 99, total_s: float = math.inf):
-    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=KINDS)
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=tuple(KINDS))
     records = Records(run_in(folder), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
@@ -123,8 +123,8 @@ def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_pa
     assert nothing == Selection(None, "the last step: no drive has held-out places")
     some = train_run.draw_selection(TRAINING, 4, [toy.drive, lambda: toy.drive(1)], "the drives")
     assert some.chosen_by == "the drives"
-    assert [pairs.kind for pairs in some.of_scans.pairs] == list(KINDS[:2])
-    assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 4
+    assert [pairs.kind for pairs in some.pairs.pairs] == list(KINDS)
+    assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 2
     assert max(pairs.sources.max() for pairs in some.pairs.pairs) >= 24  # of the second drive
 
 
@@ -133,7 +133,7 @@ def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path
     recalls = (registration_recall(np.eye(4)[None], np.eye(4)[None]),)
     found = Evaluation(recalls, (), r2, toy.cloud(np.zeros((1, 3))))
     monkeypatch.setattr(train_run.dpm, "evaluate_registration", lambda model, pairs: found)
-    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL, kinds=KINDS[:1]), np.ones(())
+    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL, kinds=tuple(KINDS)[:1]), np.ones(())
     records = Records(run_in(tmp_path), TRAINING, Selection(nothing, "a toy"), seed=0)
     report = TrainingReport(one, ObjectiveTerms(one, one, one, one, np.ones((), int)), one, one)
     with records:
@@ -217,7 +217,7 @@ def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(t
     assert settings.learning_rate == pytest.approx(0.2 * training_settings(TrainOptions()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
-    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=KINDS)
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=tuple(KINDS))
     sets = Selection(pairs, "a toy")
     with Records(run_in(tmp_path), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)
@@ -301,16 +301,16 @@ def broken_drive() -> None:
 @pytest.mark.slow
 def test_a_broken_drive_ends_the_preparation_of_all(tmp_path) -> None:
     with pytest.raises(ValueError, match="no drive"):
-        train_preparation.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
+        train_run.prepare_sources([broken_drive, toy.drive], TRAINING, tmp_path, seed=0)
 
 
 def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=100_000))
     with pytest.raises(ValueError, match=r"^--cache .*: 24 scans of .* need .* --variants 1 needs") as refused:
-        train_preparation.check_space(24, TRAINING, tmp_path / "new")
+        train_run.check_space(24, TRAINING, tmp_path / "new")
     assert "\n" not in str(refused.value)
     assert not list(tmp_path.iterdir())
-    (drive,) = train_preparation.prepare_sources([toy.drive], replace(TRAINING, num_variants=0), tmp_path, seed=0)
+    (drive,) = train_run.prepare_sources([toy.drive], replace(TRAINING, num_variants=0), tmp_path, seed=0)
     assert len(drive.pyramids) == 24
     assert "nothing is kept on disk" in capsys.readouterr().out
 
@@ -318,10 +318,10 @@ def test_scans_that_do_not_fit_on_the_disk_are_refused_before_any_is_prepared(tm
 @pytest.mark.slow
 def test_a_long_drive_is_prepared_in_parts_as_in_one(tmp_path, monkeypatch, capsys) -> None:
     """Twice the same drive is one file; the bar counts scans, and a second call finds the file."""
-    monkeypatch.setattr(train_preparation, "NUM_AT_ONCE", 7)
+    monkeypatch.setattr(train_run, "NUM_AT_ONCE", 7)
     alone = prepare_drive(toy.drive(), TRAINING)
     for _ in range(2):
-        found = train_preparation.prepare_sources([toy.drive] * 2, TRAINING, tmp_path, seed=0)
+        found = train_run.prepare_sources([toy.drive] * 2, TRAINING, tmp_path, seed=0)
         for drive in found:
             np.testing.assert_array_equal(np.load(drive.pyramids), alone.pyramids)
             assert drive.bad == alone.bad
@@ -336,7 +336,7 @@ def test_a_stop_ends_the_preparation_and_leaves_no_half_file(tmp_path, monkeypat
     def stop(_handler: object, number: int) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train_preparation.tqdm, "update", stop)
+    monkeypatch.setattr(train_run.tqdm, "update", stop)
     with pytest.raises(KeyboardInterrupt):
-        train_preparation.prepare_sources([toy.drive], TRAINING, tmp_path, seed=0)
+        train_run.prepare_sources([toy.drive], TRAINING, tmp_path, seed=0)
     assert not list(tmp_path.iterdir())

@@ -51,7 +51,7 @@ def stop():
     return signal.SIGINT if number == 0 and len(calls) == 3 else 0
 
 assert is_first() == (number == 0)
-sets = Selection(draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL, kinds=KINDS), "a toy")
+sets = Selection(draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL, kinds=tuple(KINDS)), "a toy")
 records = Records(run_in(Path(folder)), TRAINING, sets, seed=0) if is_first() else None
 done = run_training(records, toy.store(), TRAINING, TrainingHooks(evaluate_every=1, stop=stop), seed=0)
 assert done.stopped_by == signal.SIGINT

@@ -31,8 +31,6 @@ from dpmjax.sequences import DepthSequence
 _NUM_SIMULATED = 8
 # Names of the sets of poses, in the order of the picture.
 METHODS = {"start": "tracking and search", "fit": "DeepMapping"}
-# Typical ranges that a radian equals in the alignment of poses, for positions on a line.
-_LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +87,8 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
-    before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     assert found.placed is not None
+    before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     consistency = 1 - (found.misfit if found.kept == "fit" else found.start_misfit)
     is_trusted, uncertain = found.placed.is_trusted, list(found.placed.uncertain_images)
     verdict = f"{'can be trusted' if is_trusted else 'DO NOT TRUST this map'}: the images agree to {consistency:.0%}"
@@ -99,8 +97,7 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     elif not is_trusted:
         verdict += "; other poses explain the images as well"
     if after:
-        verdict += f"; ATE {after['ate_m']:.3f} m, map points {after['point_distance_m']:.3f} m, largest error of a "
-        verdict += f"turn {after['largest_turn_error_deg']:.2f} degrees"
+        verdict += f"; {error_text(after)}, largest error of a turn {after['largest_turn_error_deg']:.2f} degrees"
     return {
         "status": "done" if is_trusted else "uncertain",
         "verdict": verdict,
@@ -116,15 +113,18 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     }
 
 
+def error_text(errors: cli.Numbers) -> str:
+    """Returns the errors of poses as a text."""
+    return f"ATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m"
+
+
 def draw(run: cli.Run, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
-    assert found.start is not None
     panels = []
-    for name, T_world_camera in {"start": found.start, "fit": found.fit}.items():
-        errors = metrics.depth_errors(sequence, T_world_camera)
-        ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
-        panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))
-    if sequence.T_world_camera is not None:
-        panels.append(("reference", sequence.T_world_camera))
+    for name, T in (("start", found.start), ("fit", found.fit), ("reference", sequence.T_world_camera)):
+        if T is not None:
+            errors = metrics.depth_errors(sequence, T) if name in METHODS else None
+            title = METHODS.get(name, name) + " (kept)" * (found.kept == name)
+            panels.append((title + (f"\n{error_text(errors)}" if errors else ""), T))
     viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), run / "map.png", dpi=110)
     cli.draw_loss(run, "m")

@@ -10,9 +10,8 @@ registration within 2 m and 5 degrees is right. Results go to results/evaluate/<
 The file table.md has the shares of right registrations, with 95 % intervals, and the median errors of right ones. It
 has them for the network alone, after the verification by the scans, and after the final alignment. The file rows.csv
 has every pair. The picture reliability.png shows the share of right registrations for each confidence, also for pairs
-more than 60 m apart (far). The picture failures.png shows wrong registrations from above. The AUC of overlap compares
-pairs less than 20 m apart (revisits, if the drive has any) with pairs more than 40 m apart. The file overlap.csv has
-the AUC of the overlap head on the same pairs.
+more than 60 m apart (far). The AUC of overlap compares pairs less than 20 m apart (revisits, if the drive has any) with
+pairs more than 40 m apart. The file overlap.csv has the AUC of the overlap head on the same pairs.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ OVERLAP_FACTOR = 4
 FIRST_TOWN = 5_000_000
 """Seed of the first town; no training, selection or calibration uses these towns."""
 
-NUM_SHOWN, TOWN_LENGTH_M = 4, 400.0
+TOWN_LENGTH_M = 400.0
 BANDS = ("near", "middle", "far")
 STAGES = ("network", "verified", "refined")
 Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -66,12 +65,10 @@ def main(options: EvaluateOptions, run: cli.Run) -> cli.Row:
     kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
     drives = open_evaluation_drives(options.data, evaluation_towns(options.num_towns, kinds))
     run.open()
-    rows, read = register_pairs(run, model, drives, options)
-    numbers = {"weights": options.weights, **rate_confidence(model, rows)}
-    numbers |= cli.write_summary(run, summarize_pairs(rows, fill_overlap(run, model, drives, options)))
-    run.write_numbers(numbers)  # also where a picture fails
-    draw_evaluation(run, model, rows, read, Path(options.weights).stem)
-    return numbers
+    rows = register_pairs(run, model, drives, options)
+    summary = summarize_pairs(rows, fill_overlap(run, model, drives, options))
+    numbers = cli.write_summary(run, summary)
+    return {"weights": options.weights, **numbers, **rate_confidence(run, model, rows, Path(options.weights).stem)}
 
 
 def evaluation_towns(num_towns: int, kinds: Sequence[str | None] = (None,)) -> list[cli.Source]:
@@ -108,7 +105,7 @@ def register_pairs(
     drives: Sequence[LidarSequence],
     options: EvaluateOptions,
     matchers: Mapping[str, Matcher] = MappingProxyType({}),
-) -> tuple[list[cli.Row], Callable[..., deeppointmap.ScanPair]]:
+) -> list[cli.Row]:
     """Fills rows.csv with errors of each pair after each stage, confidence and seconds, also of further methods.
 
     Args:
@@ -119,38 +116,35 @@ def register_pairs(
         matchers: further methods by name, for pairs that overlap: each makes `T_target_source` of source and target.
 
     Returns:
-        The rows, and a function that reads the pair of a row by its first five cells.
+        The rows.
     """
     by_name = {drive.name: drive for drive in drives}
     draw = partial(deeppointmap.draw_scan_pairs, num_pairs=options.pairs, seed=options.seed)
     drawn = {(drive.name, band): draw(drive, band) for drive in drives for band in BANDS}
     cases = [
-        {"drive": drive, "band": band, "pair": number, "source": int(ends[0]), "target": int(ends[1])}
+        {"drive": drive, "band": band, "pair": number}
         for (drive, band), pairs in drawn.items()
-        for number, ends in enumerate(pairs)
+        for number in range(len(pairs))
     ]
 
     @lru_cache(maxsize=1)  # the yaws of the pairs of a band come from one stream
-    def read_band(drive: str, band: str) -> list[deeppointmap.ScanPair]:
+    def read(drive: str, band: str) -> list[deeppointmap.ScanPair]:
         return list(deeppointmap.read_scan_pairs(by_name[drive], drawn[drive, band], seed=options.seed))
 
-    def read(drive: str, band: str, pair: int, **_: object) -> deeppointmap.ScanPair:
-        return read_band(drive, band)[pair]
-
-    def work(**case: object) -> cli.Row:
-        scans = read(**case)  # type: ignore[arg-type]
+    def work(drive: str, band: str, pair: int) -> cli.Row:
+        scans = read(drive, band)[pair]
         found = deeppointmap.register_in_stages(model, scans)
         row: cli.Row = {"confidence": found.confidence}
         for stage, T in zip(STAGES, (found.descriptors, found.verified, found.refined), strict=True):
             row |= motion_errors(stage, T, scans)
         row["pair_s"] = found.seconds
-        for name, matcher in matchers.items() if case["band"] != "far" else ():
+        for name, matcher in matchers.items() if band != "far" else ():
             begun = time.perf_counter()
             T = matcher(scans.source, scans.target)
             row |= {f"{name}_s": time.perf_counter() - begun, **motion_errors(name, T, scans)}
         return row
 
-    return cli.fill_table(run, cases, work), read
+    return cli.fill_table(run, cases, work)
 
 
 def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.ScanPair) -> cli.Row:
@@ -195,41 +189,15 @@ def summarize_pairs(rows: Sequence[cli.Row], overlap: Sequence[cli.Row], matcher
     return [row | {"overlap_auc": auc.get(row["drive"])} for row in summary]
 
 
-def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.Row:
-    """Returns the Brier scores of the confidence for all pairs and for each band, and a verdict."""
+def rate_confidence(run: cli.Run, model: deeppointmap.Model, rows: Sequence[cli.Row], title: str) -> cli.Row:
+    """Returns the Brier score of the confidence and a verdict, and draws reliability.png, for all pairs."""
     if not rows:
         return {"verdict": "no pair is registered"}
     confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))
-    band, is_calibrated = np.array([row["band"] for row in rows]), model.config.calibration is not None
+    is_near, is_calibrated = np.array([row["band"] != "far" for row in rows]), model.config.calibration is not None
     brier = metrics.brier_score(confidence, is_right)
-    bands = {
-        f"brier_{one}": metrics.brier_score(confidence[band == one], is_right[band == one])
-        for one in BANDS
-        if (band == one).any()
-    }
-    verdict = f"{is_right[band != 'far'].sum()} of {(band != 'far').sum()} pairs are registered right; "
+    verdict = f"{is_right[is_near].sum()} of {is_near.sum()} pairs are registered right; "
     verdict += f"Brier score of the confidence {brier:.3f} (0 is best"
     verdict += ")" if is_calibrated else "; these weights are not calibrated)"
-    return {"brier": brier, **bands, "is_calibrated": is_calibrated, "verdict": verdict}
-
-
-def draw_evaluation(
-    run: cli.Run,
-    model: deeppointmap.Model,
-    rows: Sequence[cli.Row],
-    read: Callable[..., deeppointmap.ScanPair],
-    title: str,
-) -> None:
-    """Draws reliability.png and failures.png: wrong registrations of overlapping pairs, with the highest confidence."""
-    confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))
     viz.save_figure(viz.reliability_figure(confidence, is_right, title=f"{title}, all pairs"), run / "reliability.png")
-    wrong = [row for row in rows if row["band"] != "far" and not row["refined_right"]]
-    shown = []
-    for row in sorted(wrong, key=lambda row: -row["confidence"])[:NUM_SHOWN]:
-        pair, names = read(**row), (f"scan {row['source']}", f"scan {row['target']}")
-        title = f"{row['drive']}: {names[0]} onto {names[1]}, confidence {row['confidence']:.2f}"
-        refined = deeppointmap.register_in_stages(model, pair).refined
-        motions = {"estimated motion": refined, "true motion": pair.T_target_source}
-        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions, names))
-    if shown:
-        viz.save_figure(viz.registered_pairs_figure(shown), run / "failures.png")
+    return {"brier": brier, "is_calibrated": is_calibrated, "verdict": verdict}

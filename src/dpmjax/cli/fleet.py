@@ -16,8 +16,7 @@ from tqdm import tqdm
 
 from dpmjax import saved_maps, slam, weights
 from dpmjax.cli.drives import ScanReader, open_drive
-from dpmjax.cli.run import Numbers, Run
-from dpmjax.cli.run_folder import write_poses
+from dpmjax.cli.run import Numbers, Run, write_poses
 from dpmjax.cli.slam_run import map_drive
 from dpmjax.sequences import counted
 

@@ -77,9 +77,8 @@ def select_device(device: Literal["cpu", "gpu"] | None) -> None:
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the second where the plugin of the device is not installed
-        raise ValueError(
-            f"--device {device}: JAX finds no such device here; leave the option out or install its plugin"
-        ) from error
+        reason = "JAX finds no such device here; leave the option out or install its plugin"
+        raise ValueError(f"--device {device}: {reason}") from error
 
 
 def environment() -> dict[str, Any]:
@@ -124,7 +123,7 @@ def peak_rss_gb() -> float:
     """Returns the largest resident memory of this process so far, in units of 10^9 bytes."""
     # On Linux, ru_maxrss starts from the parent's size at the fork; VmHWM belongs to this program alone.
     status = Path("/proc/self/status")
-    if status.exists() and (own := re.search(r"^VmHWM:\s*(\d+)", status.read_text(errors="replace"), re.MULTILINE)):
+    if status.exists() and (own := re.search(r"VmHWM:\s*(\d+)", status.read_text(errors="replace"))):
         return int(own[1]) * 1024 / 1e9
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
 

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
-from dpmjax.cli import slam_results
+from dpmjax.cli import slam_run
 from dpmjax.sequences import counted
 
 # Points below this height above the lidar are the ground.
@@ -88,7 +88,7 @@ def merge_numbers(
     texts = [f"{counted(len(ends), 'loop')} between maps, of {counted(len(merged.loops), 'candidate')}"]
     for part, (file, slam_map) in enumerate(zip(files, merged.maps, strict=True)):
         members = [number for number, component in enumerate(merged.component, start=1) if component == part]
-        num_measured, num_keyframes = slam_results.count_parts(slam_map), len(slam_map)
+        num_measured, num_keyframes = slam_run.count_parts(slam_map), len(slam_map)
         parts.append(
             {"file": file, "maps": members, "num_keyframes": num_keyframes, "num_measured_parts": num_measured}
         )

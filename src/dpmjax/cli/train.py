@@ -12,7 +12,7 @@
                                                                   on two hosts; --process-id 1 on the other
 
 Results go to results/train/<time>/ (latest links to the newest): model.safetensors for dpmjax.load_model,
-last.safetensors, metrics.csv, metrics.json, checkpoints, and pictures: loss.png, matches.png. Recall is the share of
+metrics.csv, metrics.json, checkpoints, and the picture loss.png. Recall is the share of
 pairs of held-out places, turned by any yaw, that are registered within 2 m and 5 degrees. The last tenth of the path of
 each drive is held out, with all scans near it. The model of the step with the best mean recall is kept (metrics.json:
 best_step, chosen_by). With `paper`, the last model is kept, as published. Then the overlap head is trained, and
@@ -39,7 +39,7 @@ from dpmjax.cli.run import HISTORY, METRICS, Numbers, Run
 if TYPE_CHECKING:
     from dpmjax.cli.train_run import Records, Selection
 
-MODEL, LAST, BEST = "model.safetensors", "last.safetensors", "best.safetensors"
+MODEL = "model.safetensors"
 # Share of the learning rate at which trained weights are tuned: at the full rate they forget pairs far apart.
 TUNING_SHARE = 0.2
 TOWN_LENGTH_M, NUM_HELD_OUT_PAIRS = 400.0, 32
@@ -125,8 +125,7 @@ def main(options: TrainOptions, run: Run) -> Numbers:
         cli.select_device(options.device)
     import jax
 
-    from dpmjax.cli.train_preparation import part_of_drive, prepare_sources
-    from dpmjax.cli.train_run import Records, run_training
+    from dpmjax.cli.train_run import Records, part_of_drive, prepare_sources, run_training
 
     first = None if options.weights is None else weights.load_model(options.weights)
     settings = training_settings(options, first)
@@ -159,9 +158,10 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     numbers = training_numbers(trained, records) | {"num_scans": num_scans, "bad_scans": store.bad, "calibration": {}}
     origin = f"{options.preset}, trained on {', '.join(options.data)}"
     # A stopped run has no minutes for the evaluation and the calibration.
-    evaluation, measured = (None, {}) if run.is_stopped else evaluate(trained, records)
-    numbers |= measured
-    write_training(records, trained, evaluation, numbers, origin=origin)
+    numbers |= {} if run.is_stopped else evaluate(trained, records)
+    run.write_numbers(numbers)
+    write_model(run / MODEL, trained.model, numbers, origin=origin)
+    draw_curves(run)
     if options.calibrate and not run.is_stopped:
         # A signal that comes from here on loses the calibration alone.
         run.write_numbers({**numbers, "status": "interrupted"})
@@ -213,8 +213,7 @@ def select_pairs(
     options: TrainOptions, settings: deeppointmap.TrainingConfig, chosen: Sequence[cli.Source], kind: str
 ) -> Selection:
     """Draws the pairs that choose the model, of --validate or else of held-out places of the chosen drives."""
-    from dpmjax.cli.train_preparation import part_of_drive
-    from dpmjax.cli.train_run import Selection, draw_selection
+    from dpmjax.cli.train_run import Selection, draw_selection, part_of_drive
 
     if "registration" not in options.stages:
         return Selection(None, "given weights")
@@ -269,50 +268,30 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers
     }
 
 
-def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, Numbers]:
-    """Returns recall and errors of the trained network, and of the untrained one for pairs of scans alone."""
-    from dpmjax.cli.train_run import KIND_NAMES
+def evaluate(trained: deeppointmap.Trained, records: Records) -> Numbers:
+    """Returns recall and errors of the trained and of the untrained network."""
+    from dpmjax.cli.train_run import KINDS
 
-    pairs, of_scans = records.selection.pairs, records.selection.of_scans
-    if pairs is None or of_scans is None:
-        return None, {}
-    metrics: Numbers = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
+    pairs = records.selection.pairs
+    if pairs is None:
+        return {}
+    numbers: Numbers = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
     print("evaluation ...", flush=True)
-    evaluation = deeppointmap.evaluate_registration(trained.model, pairs)
-    untrained = deeppointmap.evaluate_registration(records.untrained, of_scans)
-    for suffix, found, some in (("", evaluation, pairs), ("_untrained", untrained, of_scans)):
-        of_kinds = zip(some.pairs, found.recalls, strict=True)
-        metrics |= {f"{KIND_NAMES[of_kind.kind]}{suffix}": recall.recall for of_kind, recall in of_kinds}
-        metrics[f"translation_error_median{suffix}_m"] = float(np.median(found.recalls[0].translation_errors_m))
-        metrics[f"rotation_error_median{suffix}_deg"] = float(np.median(found.recalls[0].rotation_errors_deg))
-    return evaluation, metrics
+    for suffix, model in (("", trained.model), ("_untrained", records.untrained)):
+        recalls = deeppointmap.evaluate_registration(model, pairs).recalls
+        named = zip(pairs.pairs, recalls, strict=True)
+        numbers |= {f"{KINDS[some.kind]}{suffix}": recall.recall for some, recall in named}
+        numbers[f"translation_error_median{suffix}_m"] = float(np.median(recalls[0].translation_errors_m))
+        numbers[f"rotation_error_median{suffix}_deg"] = float(np.median(recalls[0].rotation_errors_deg))
+    return numbers
 
 
-def write_training(
-    records: Records,
-    trained: deeppointmap.Trained,
-    evaluation: deeppointmap.Evaluation | None,
-    numbers: Numbers,
-    *,
-    origin: str,
-) -> None:
-    """Writes all files of a run, numbers first, because a picture may fail."""
-    from dpmjax.cli.train_run import with_params
-
-    run = records.run
-    run.write_numbers(numbers)
-    write_model(run / MODEL, trained.model, numbers, origin=origin)
-    if numbers["best_step"] is not None and "registration" in numbers["trained"]:
-        # The last model of the first stage stands beside the best, or the best beside the last.
-        progress = trained.progress
-        name, params = (BEST, progress.best_params) if records.takes_last else (LAST, progress.state.params)
-        write_model(run / name, with_params(trained.model, params), numbers, origin=f"{name} of {origin}")
+def draw_curves(run: Run) -> None:
+    """Draws loss.png: losses and recalls over the steps."""
     if rows := run.read_table(HISTORY):
         curves = {name: np.array([float(row[name] or "nan") for row in rows]) for name in SHOWN_CURVES}
         curves = {name.replace("_", " "): curve for name, curve in curves.items() if np.isfinite(curve).any()}
         viz.save_figure(viz.curves_figure([int(row["step"]) for row in rows], curves), run / "loss.png")
-    if evaluation is not None and records.selection.pairs is not None:
-        draw_matches(run, evaluation, records.selection.pairs)
 
 
 def write_model(path: Path, model: deeppointmap.Model, numbers: Numbers, *, origin: str) -> None:
@@ -331,24 +310,6 @@ def write_model(path: Path, model: deeppointmap.Model, numbers: Numbers, *, orig
     unfinished = path.with_name(f".tmp_{path.name}")
     weights.save_model(model, unfinished, card=card)
     unfinished.replace(path)
-
-
-def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:
-    """Draws matches.png: the held-out pair with the median error."""
-    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
-    number = int(np.argsort(errors)[len(errors) // 2])
-    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
-    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
-    is_inlier = matches.is_inlier[number]
-    p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
-    q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]
-    distances = np.linalg.norm(p @ T_true[:3, :3].T + T_true[:3, 3] - q, axis=1)
-    title = f"Pair of scans left out of the training, the one of the median error ({errors[number]:.2f} m)\n"
-    title += "right matches are less than 3 m apart under the true motion"
-    motions = {"source moved by the estimated motion": np.asarray(matches.T_target_source[number], np.float64)}
-    source, target = (np.asarray(pairs.scans[row].points)[np.asarray(pairs.scans[row].mask)] for row in (a, b))
-    pair = viz.RegisteredPair(title, source, target, motions)
-    viz.save_figure(viz.matches_figure(pair, p, q, distances < 3.0), run / "matches.png")
 
 
 def training_verdict(numbers: Numbers) -> str:

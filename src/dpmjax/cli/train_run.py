@@ -1,13 +1,23 @@
-"""A DeepPointMap training in its folder: evaluations, table, progress bar and checkpoints."""
+"""A DeepPointMap training in its folder: prepared drives, evaluations, table, progress bar and checkpoints.
+
+All processors share the preparation of the scans, even of one long drive.
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from multiprocessing import active_children, get_context
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -17,41 +27,157 @@ from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.run import CHECKPOINTS, HISTORY, Run
+from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import LidarSequence
+from dpmjax.types import Poses
 
+# Scans of a drive that a processor prepares at a time; with more the bar stands still, with fewer the drive is opened
+# more often.
+NUM_AT_ONCE = 16
 # Largest number of scans of an evaluation, all drives together.
 MAX_EVALUATED_SCANS = 96
-KINDS = (dpm.PairKind(2.0, 10.0), dpm.PairKind(10.0, 20.0), dpm.PairKind(2.0, 10.0, 4), dpm.PairKind(10.0, 20.0, 4))
-"""Pairs of scans, near and far, which choose the model; pairs of maps of four scans, which the last model registers."""
+KINDS = {dpm.PairKind(2.0, 10.0): "recall", dpm.PairKind(10.0, 20.0): "recall_far"}
+"""Pairs of scans, near and far, which choose the model, and the names of their recalls."""
 
-KIND_NAMES = dict(zip(KINDS, ("recall", "recall_far", "recall_maps", "recall_maps_far"), strict=True))
 OVERLAP_CHECKPOINTS = "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
 MEASURES = ("loss", "pairing", "offset", "top1_accuracy", "score", "coarse", "gradient_norm", "learning_rate")
-RECALLS = ("recall", "recall_far")
 # Coefficients of determination of predicted offsets, on the pairs that choose the model; empty without an offset head.
 OFFSETS = ("offset_r2_normal", "offset_r2_along", "offset_r2_up")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OFFSETS, "overlap_loss", "overlap_accuracy")
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *KINDS.values(), *OFFSETS, "overlap_loss", "overlap_accuracy")
+
+
+class PlannedDrive(NamedTuple):
+    """A drive before its preparation.
+
+    Attributes:
+        source: opens the drive.
+        T_world_lidar: true poses of its scans, metres.
+        path: file of its prepared scans.
+        found: the prepared drive if the file exists already; None otherwise.
+    """
+
+    source: cli.Source
+    T_world_lidar: Poses
+    path: Path
+    found: dpm.PreparedDrive | None
+
+
+def part_of_drive(source: cli.Source, part: Literal["training", "held_out"]) -> LidarSequence:
+    """Opens the held-out places of a drive, or the remaining scans without those near them."""
+    drive = source()
+    return drive.take(getattr(dpm.split_places(drive), part))
+
+
+def prepare_sources(
+    sources: Sequence[cli.Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
+) -> list[dpm.PreparedDrive]:
+    """Prepares all drives on all processors and keeps them in a folder for later runs.
+
+    Args:
+        sources: the drives.
+        settings: settings of training.
+        folder: folder of prepared scans.
+        seed: seed of the variants.
+
+    Returns:
+        The drives, in order.
+
+    Raises:
+        ValueError: if the prepared scans do not fit on the disk, or if a drive cannot be read.
+    """
+    if settings.num_variants == 0:
+        print("each scan is prepared anew at each use; nothing is kept on disk")
+        return [dpm.prepare_drive(source(), settings) for source in sources]
+    with _workers() as pool:
+        opened = pool.map(partial(_plan, settings=settings, folder=folder, seed=seed), sources)
+        plans = list(tqdm(opened, "open drives", len(sources), unit=" drives", dynamic_ncols=True))
+        # The same drive may be given twice.
+        missing = {plan.path: plan for plan in plans if plan.found is None}
+        num_scans = sum(len(plan.T_world_lidar) for plan in missing.values())
+        check_space(num_scans, settings, folder)
+        work = partial(_prepare, settings=settings, seed=seed)
+        # All parts are begun here; each result is forgotten when it was written.
+        parts = {path: pool.map(work, *_parts(plan)) for path, plan in missing.items()}
+        with tqdm(desc="prepare scans", total=num_scans, unit=" scans", dynamic_ncols=True) as bar:
+
+            def scans_of(path: Path) -> Iterator[dpm.PreparedScan]:
+                for part in parts[path]:
+                    yield from part
+                    bar.update(len(part))
+
+            made = {
+                path: dpm.store_scans(path, plan.T_world_lidar, scans_of(path), settings)
+                for path, plan in missing.items()
+            }
+    return [plan.found or made[plan.path] for plan in plans]
+
+
+def check_space(num_scans: int, settings: dpm.TrainingConfig, folder: Path) -> None:
+    """Prints the size of the prepared scans; raises a ValueError if the disk has less free space."""
+    each = dpm.stored_bytes(settings)
+    needed = num_scans * each
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    scans, free_text = f"{num_scans} scans of {each / 1e6:.2f} MB", f"{free / 1e9:.1f} GB are free"
+    if needed > free:
+        advice = f"--variants 1 needs {needed / settings.num_variants / 1e9:.1f} GB, --variants 0 nothing"
+        raise ValueError(f"--cache {folder}: {scans} need {needed / 1e9:.1f} GB, {free_text}; {advice}")
+    if num_scans > 0:
+        print(f"prepares {scans}: {needed / 1e9:.1f} GB in {folder}, {free_text}")
+
+
+@contextmanager
+def _workers() -> Iterator[ProcessPoolExecutor]:
+    """Yields processes, which are gone after an error."""
+    # A fresh interpreter: a fork of a process that runs JAX may hang.
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn"), initializer=_begin_worker) as pool:
+        try:
+            yield pool
+        except BaseException:
+            processes = active_children()
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.kill()
+            raise
+
+
+def _begin_worker() -> None:
+    # The device belongs to the process that trains, and so does the answer to Ctrl-C.
+    jax.config.update("jax_platforms", "cpu")
+    enable_compile_cache()  # the caster of each lidar compiles for ten seconds
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _plan(source: cli.Source, settings: dpm.TrainingConfig, folder: Path, seed: int) -> PlannedDrive:
+    drive = source()
+    if drive.T_world_lidar is None:
+        raise ValueError(f"{drive.name}: expected a true pose for each scan, got a drive without poses")
+    path = dpm.prepared_path(drive, settings, folder, seed)
+    return PlannedDrive(source, drive.T_world_lidar, path, dpm.find_prepared(path, drive.T_world_lidar))
+
+
+def _parts(plan: PlannedDrive) -> tuple[list[cli.Source], list[range]]:
+    num = len(plan.T_world_lidar)
+    rows = [range(first, min(first + NUM_AT_ONCE, num)) for first in range(0, num, NUM_AT_ONCE)]
+    return [plan.source] * len(rows), rows
+
+
+def _prepare(source: cli.Source, numbers: range, settings: dpm.TrainingConfig, seed: int) -> list[dpm.PreparedScan]:
+    return list(dpm.prepare_variants(source(), numbers, settings, seed))
 
 
 class Selection(NamedTuple):
     """Pairs that choose the model.
 
     Attributes:
-        pairs: pairs of scans and of maps. None if no drive has held-out places; then the last model is kept.
+        pairs: pairs of scans. None if no drive has held-out places; then the last model is kept.
         chosen_by: a name of the pairs, for `metrics.json`.
     """
 
     pairs: dpm.EvaluationPairs | None
     chosen_by: str
-
-    @property
-    def of_scans(self) -> dpm.EvaluationPairs | None:
-        """The pairs of scans alone, which are measured during the training."""
-        if self.pairs is None:
-            return None
-        return self.pairs._replace(pairs=tuple(some for some in self.pairs.pairs if some.kind.num_scans == 1))
 
 
 def draw_selection(
@@ -74,7 +200,7 @@ def draw_selection(
             drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
             yield drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
 
-    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model, kinds=KINDS)
+    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model, kinds=tuple(KINDS))
     if not pairs.pairs:
         return Selection(None, "the last step: no drive has held-out places")
     return Selection(pairs, chosen_by)
@@ -104,13 +230,8 @@ class Records:
         weights: dpm.Model | None = None,
         takes_last: bool = False,
     ) -> None:
-        self.run, self.selection, self.seed, self.takes_last, self._settings = (
-            run,
-            selection,
-            seed,
-            takes_last,
-            settings,
-        )
+        self.run, self.selection, self._settings = run, selection, settings
+        self.seed, self.takes_last = seed, takes_last
         self._checkpoints, self._of_overlap = Checkpoints(run / CHECKPOINTS), Checkpoints(run / OVERLAP_CHECKPOINTS)
         begun, config = dpm.begin_training(settings, seed=seed, start=weights), settings.model
         if weights is not None and "registration" not in settings.stages:
@@ -128,13 +249,11 @@ class Records:
         self._saved_at, self._pace_s, self._recalls = time.perf_counter(), math.nan, dict[str, float]()
 
     def evaluate(self, model: dpm.Model) -> float:
-        """Returns the mean recall of the pairs of scans that choose the model, and measures their offsets."""
-        pairs = self.selection.of_scans
-        if pairs is None:
-            return math.nan
-        found = dpm.evaluate_registration(model, pairs)
-        named = zip(pairs.pairs, found.recalls, strict=True)
-        self._recalls = {KIND_NAMES[some.kind]: recall.recall for some, recall in named}
+        """Returns the mean recall of the pairs that choose the model, and measures their offsets."""
+        assert self.selection.pairs is not None
+        found = dpm.evaluate_registration(model, self.selection.pairs)
+        named = zip(self.selection.pairs.pairs, found.recalls, strict=True)
+        self._recalls = {KINDS[some.kind]: recall.recall for some, recall in named}
         self._recalls |= dict(zip(OFFSETS, found.offset_r2.tolist(), strict=True))
         return float(np.mean([recall.recall for recall in found.recalls]))
 
@@ -144,25 +263,21 @@ class Records:
         values = {name: float(values[name]) for name in MEASURES if name in values} | {"score": record.score}
         if values["offset"] == 0:  # no offset head is trained
             del values["offset"]
-        if math.isfinite(record.score):
-            values |= self._recalls
+        values |= self._recalls if math.isfinite(record.score) else {}
         self.run_s = self._earlier_s + speed.run_s + speed.compile_s
         self._pace_s = speed.run_s / speed.num_steps if speed.num_steps else math.nan
-        stage = f"K={record.stage.max_group}"
-        self._append(record.step, stage, values)
-        shown = {"loss": values["loss"], "top-1": values["top1_accuracy"]}
-        shown |= {"recall": self._recalls["recall"]} if "recall" in self._recalls else {}
-        parts = [f"{name} {value:.3f}" for name, value in shown.items()]
-        self._bar.set_postfix_str(", ".join([stage, *parts, f"{speed.scans_per_s:.1f} scans/s"]), refresh=False)
         self._bar.total = int(progress.state.end)
-        self._bar.update(1)
+        shown = f"loss {values['loss']:.3f}, {speed.scans_per_s:.1f} scans/s"
+        self._add_row(self._bar, record.step, f"K={record.stage.max_group}", values, shown)
         if time.perf_counter() - self._saved_at > SAVE_EVERY_S:
             self.save(progress)
 
-    def _append(self, step: int, stage: str, values: dict[str, float]) -> None:
+    def _add_row(self, bar: tqdm[Any], step: int, stage: str, values: dict[str, float], shown: str) -> None:
         measured = {name: f"{value:.7g}" for name, value in values.items() if math.isfinite(value)}
         row = {"step": step, "stage": stage, "run_s": round(self.run_s, 3), **measured}
         self.run.append_row(HISTORY, **dict.fromkeys(COLUMNS, "") | row)
+        bar.set_postfix_str(f"{stage}, {shown}", refresh=False)
+        bar.update(1)
 
     def steps_left(self, step: int, *, total_s: float) -> int:
         """Returns the number of steps in the seconds that remain of `total_s`; 0 does not change the plan.
@@ -187,9 +302,7 @@ class Records:
                 self.run_s = earlier_s + time.perf_counter() - begun
                 values = {"overlap_loss": record.loss, "overlap_accuracy": record.accuracy}
                 values |= {"learning_rate": record.learning_rate}
-                self._append(num_before + record.step, "overlap", values)
-                bar.set_postfix_str(f"loss {record.loss:.3f}, right {record.accuracy:.2f}", refresh=False)
-                bar.update(1)
+                self._add_row(bar, num_before + record.step, "overlap", values, f"loss {record.loss:.3f}")
                 if time.perf_counter() - self._saved_at > SAVE_EVERY_S:
                     self._of_overlap.save(record.step, state)
                     self._saved_at = time.perf_counter()
@@ -244,10 +357,6 @@ def run_training(
             trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
             records.save(trained.progress)
             if records.takes_last:
-                trained = trained._replace(model=with_params(trained.model, trained.progress.state.params))
+                params = jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), trained.progress.state.params)
+                trained = trained._replace(model=trained.model.replace(params=params))
         return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, hooks.stop)
-
-
-def with_params(model: dpm.Model, params: Any) -> dpm.Model:
-    """Returns the model with the parameters of another step, on the device."""
-    return model.replace(params=jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), params))
