@@ -26,8 +26,8 @@ TOWN = "town"
 TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
 # A car of 10 m/s and a lidar of 10 turns a second, as in KITTI: one scan each metre, with up to 3 degrees of turn.
 ROUTE_SPEED_M_S, ROUTE_RATE_HZ, ROUTE_TURN_DEG_S = 10.0, 10.0, 30.0
+# Unit of the integer coordinates of kept scans: 16 bits reach 128 m.
 STEP_M = 2.0**-8
-"""Unit of the integer coordinates of kept scans: 16 bits reach 128 m."""
 # Time of a turn of a lidar whose scans have no times of points.
 TURN_S = 0.1
 

@@ -32,9 +32,8 @@ from dpmjax.sequences import LidarSequence
 
 # Overlap is cheap: more pairs, of each kind.
 OVERLAP_FACTOR = 4
+# Seed of the first town; no training, selection or calibration uses these towns.
 FIRST_TOWN = 5_000_000
-"""Seed of the first town; no training, selection or calibration uses these towns."""
-
 TOWN_LENGTH_M = 400.0
 BANDS = ("near", "middle", "far")
 STAGES = ("network", "verified", "refined")

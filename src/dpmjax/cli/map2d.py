@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation, viz
@@ -55,9 +54,8 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
-    """Initial poses. auto: odometry if there is any, else icp-plane. If the map from odometry cannot be trusted,
-    icp-plane is tried, too. global: exhaustive search of scan pairs, without a first guess. FILE: poses (TUM, KITTI, or
-    x y theta)."""
+    """Initial poses. auto: odometry if there is any, else icp-plane, also if the map from odometry cannot be trusted.
+    global: exhaustive search of scan pairs, without a first guess. FILE: poses (TUM, KITTI, or x y theta)."""
     ordered: bool = True
     """Scans are in time order. --no-ordered ignores the order, and needs --init global."""
     refine: bool = True
@@ -67,8 +65,7 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
     """Stop the fit after S seconds of run time, without compile time."""
     world: Literal[0, 1, 2, "grove", "crowd"] = 0
-    """Built-in world, if no DATA is given. The numbered worlds have walls. grove: trees, bushes and rocks, no straight
-    wall. crowd: an office with walking people."""
+    """Built-in world without DATA: numbered ones have walls, grove has trees and rocks, crowd has walking people."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 
@@ -115,41 +112,37 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
-    """Registers the scans with the recorder as engine of the fit, and prints each stage and one bar."""
+    """Registers the scans with the recorder as engine of the fit, and prints each stage."""
     import jax
 
-    fit, is_metric = fit_settings(options, sequence), sequence.unit == "m"
+    fit = fit_settings(options, sequence)
     config = registration2d.RegistrationConfig(
         is_ordered=options.ordered,
         refine=options.refine,
         fit=fit,
-        min_distance=MIN_DISTANCE_M if is_metric else None,
+        min_distance=MIN_DISTANCE_M if sequence.unit == "m" else None,
         min_turn=MIN_TURN_RAD,
     )
-    with tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}]", desc="registration") as bar:
 
-        def show(stage: str, share: float) -> None:
-            if share == 0.0:
-                bar.write(f"{stage} ...")
+    def show(stage: str, share: float) -> None:
+        if share == 0.0:
+            print(f"{stage} ...", flush=True)
 
-        def engine(rows: np.ndarray) -> Callable[..., deepmapping.Fit]:
-            if len(rows) < len(sequence):
-                bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
-            fitted = sequence.take(rows)
-            unit = fit.unit or geometry.typical_range(fitted.points, fitted.mask)
-            return partial(recorder, measure=ate_of(fitted, unit))
+    def engine(rows: np.ndarray) -> Callable[..., deepmapping.Fit]:
+        if len(rows) < len(sequence):
+            print(f"{len(rows)} of the scans are registered, chosen by their motion")
+        fitted = sequence.take(rows)
+        unit = fit.unit or geometry.typical_range(fitted.points, fitted.mask)
+        return partial(recorder, measure=ate_of(fitted, unit))
 
-        def advance(share: float) -> None:
-            bar.update(share - bar.n)
-
-        return registration2d.register_scans(
-            scan_set_of(sequence),
-            config,
-            key=jax.random.key(options.seed),
-            start=start,
-            odometry=sequence.odometry_poses if options.ordered else None,
-            hooks=registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine, advance),
-        )
+    return registration2d.register_scans(
+        scan_set_of(sequence),
+        config,
+        key=jax.random.key(options.seed),
+        start=start,
+        odometry=sequence.odometry_poses if options.ordered else None,
+        hooks=registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine),
+    )
 
 
 def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> cli.Numbers:
@@ -205,18 +198,13 @@ def read_scans(options: Map2dOptions) -> ScanSequence:
 
 def starting_poses(options: Map2dOptions, sequence: ScanSequence) -> str | FloatArray:
     """Returns the name of the initial poses, or the poses of the file of `--init` for all scans."""
-    init = options.init
+    init, words = options.init, ("auto", *registration2d.START_NAMES)
     if init == "odometry" and sequence.odometry_poses is None:
-        raise ValueError(
-            f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
-            "missing); use --init icp-plane"
-        )
-    words = ("auto", *registration2d.START_NAMES)
-    if init in words:
-        return init
-    if not Path(init).exists():
+        reason = "has no odometry of its own (its odometry column repeats the corrected pose, or is missing)"
+        raise ValueError(f"{sequence.name}: {reason}; use --init icp-plane")
+    if init not in words and not Path(init).exists():
         raise ValueError(f"--init {init}: no such file, and none of {', '.join(words)}")
-    return io.read_planar_poses(init, len(sequence), sequence.unit)
+    return init if init in words else io.read_planar_poses(init, len(sequence), sequence.unit)
 
 
 def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.DeepMappingConfig:
@@ -244,10 +232,10 @@ def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
 def trust_verdict(assessment: Mapping[str, Any]) -> str:
     """Returns the verdict on trust with its reason, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
-    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     # Near zero the difference of two shares has either sign.
-    more = f"{max(contradiction, 0.0):.1%} more beams than between the best pairs"
-    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {more} end in the free space of another scan"
+    contradiction, weakest = max(assessment["contradiction"], 0.0), assessment["weakest_connection"]
+    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {contradiction:.1%} more beams than between "
+    text += "the best pairs end in the free space of another scan"
     if assessment["fault"] is not None:
         text += f"; {assessment['fault']}"
     if count := len(assessment["uncertain_scans"]):

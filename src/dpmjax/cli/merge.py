@@ -97,7 +97,6 @@ def merge_numbers(
         shown = ", ".join(names[number - 1] for number in members)
         texts.append(f"{shown}: {text}, {counted(num_keyframes, 'keyframe')}, {file}")
     meetings = Counter(map(tuple, np.sort(merged.joined.map_of_keyframe[ends] + 1, axis=1).tolist()))
-    of_maps = enumerate(zip(names, maps, strict=True), start=1)
     return {
         "status": "done" if all(part["num_measured_parts"] < 2 for part in parts) else "uncertain",
         "verdict": "; ".join(texts),
@@ -107,7 +106,7 @@ def merge_numbers(
         "num_candidates": len(merged.loops),
         "num_keyframes": len(merged.joined.slam_map),
         "parts": parts,
-        "maps": [{"map": number, "file": name, "num_keyframes": len(each)} for number, (name, each) in of_maps],
+        "maps": names,
         "loops_between": [{"maps": list(pair), "num_loops": number} for pair, number in sorted(meetings.items())],
     }
 

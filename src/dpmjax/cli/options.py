@@ -67,8 +67,7 @@ class RunOptions(OutputOptions):
     seed: Annotated[int, Bound(0)] = 0
     """Seed of all random numbers."""
     resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run: the latest one, or the one in OUT. Options that you do not give keep
-    their earlier values."""
+    """Continue the latest run, or the one in OUT. Options that you do not give keep their earlier values."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,8 +39,7 @@ class SlamOptions(cli.DriveOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans"})
 
     data: Annotated[Positional[tuple[Path, ...]], arg(metavar="[DATA ...]")] = ()
-    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Default: a simulated town. Give
-    several with --cluster."""
+    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Several with --cluster."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Name of the drive, if DATA holds several."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
@@ -48,22 +47,18 @@ class SlamOptions(cli.DriveOptions):
     preset: Literal["default", "paper"] = "default"
     """Settings of SLAM: the default, or the method of the paper, by the decoder alone."""
     odometry: Annotated[str | None, arg(metavar="prediction|network|FILE")] = None
-    """Source of the first guess of a pose: the previous motion, the network for every scan, or a file of odometry. The
-    file has poses by time (TUM), or one pose for each scan. Poses of the robot's frame need --base-from-lidar. Without
-    it, the preset decides."""
+    """First guess of a pose: the previous motion, the network, or a file of odometry, by time (TUM) or one pose a scan.
+    Poses of the robot's frame need --base-from-lidar."""
     max_rmse: float | None = None
-    """With --preset paper: largest error of an accepted registration, metres. The published 0.5 needs a decoder with
-    exact offsets; 2.5 suits dpm_small."""
+    """With --preset paper: largest error of an accepted registration, m; the published 0.5, or 2.5 for dpm_small."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     base_from_lidar: Annotated[tuple[float, ...], arg(metavar="X Y Z QX QY QZ QW")] = ()
-    """Pose of the lidar in the frame of the robot, metres and a quaternion, as of ROS. The run then also writes the
-    trajectory of the robot, as trajectory_base."""
+    """Pose of the lidar in the robot's frame, metres and quaternion; the run writes the robot's trajectory, too."""
     cluster: Annotated[str | None, arg(metavar="local|HOST:PORT")] = None
-    """Map each of several drives on a worker of this Dask cluster (extra cluster), and merge their maps. local: one
-    process here for each drive, at most one a core."""
+    """Map several drives on workers of this Dask cluster, and merge their maps. local: processes here, one a drive."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
     """Show the run in the live viewer (extra viewer). Without a screen, OUT gets a recording, slam.rrd."""
 

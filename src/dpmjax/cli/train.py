@@ -57,11 +57,9 @@ class TrainOptions(RunOptions):
     preset: Literal["tiny", "small", "paper"] = "tiny"
     """Size of the network and length of its training."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """Continue from these weights at a fifth of the learning rate. Their network replaces the network of the preset.
-    Without it, begin from random weights."""
+    """Tune these weights, at a fifth of the learning rate, by their network. Without it, begin at random."""
     stages: tuple[Literal["registration", "overlap"], ...] = ("registration", "overlap")
-    """Stages of the training. registration: all networks except the overlap head; overlap: this head alone. If overlap
-    is the only stage, the head of --weights is trained."""
+    """Stages. registration: all networks but the overlap head. overlap: this head alone, of --weights or the first."""
     calibrate: bool = True
     """Fit the confidence and the overlap afterwards, on pairs of the data."""
     without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
@@ -73,25 +71,19 @@ class TrainOptions(RunOptions):
     groups: Annotated[tuple[int, ...], arg(metavar="N ..."), cli.Bound(2)] = ()
     """Largest group of scans in each stage of the curriculum, such as 8 16 8 16. Without it, the preset decides."""
     scans: Annotated[int | None, arg(metavar="N"), cli.Bound(2)] = None
-    """Number of scans of a step. More scans keep a GPU busy, because it computes all of them at once. Without it, the
-    preset decides."""
+    """Number of scans of a step; more keep a GPU busy. Without it, the preset decides."""
     num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """Number of towns for training, if town is among the data."""
     refine_labels: FlagCreatePairsOff[bool] = False
-    """Align the scans of each group by point-to-plane ICP, from the given poses. Use it if the poses of neighbours are
-    decimetres off."""
+    """Align the scans of each group by ICP, from the given poses, for poses of neighbours that are decimetres off."""
     hours: Annotated[float | None, arg(metavar="H"), cli.Bound(0, is_allowed=False)] = None
-    """Train for about H hours, with at most the steps of the preset. The learning rate falls until the end. Without it,
-    the steps decide."""
+    """Train for about H hours, with at most the steps of the preset. The learning rate falls until the end."""
     finish: FlagCreatePairsOff[bool] = False
-    """Let the learning rate fall faster, and end. With --resume, a longer run ends after a quarter of the steps that it
-    has done."""
+    """With --resume, let the learning rate fall faster, and end after a quarter of the steps that are done."""
     cache: Annotated[Path, arg(metavar="DIR")] = Path("results/train/cache")
-    """Folder that keeps prepared scans between runs: 0.3 MB for each scan of `tiny`, 0.5 MB of `small`. The run prints
-    the needed and the free space first."""
+    """Folder that keeps prepared scans between runs, 0.3 to 0.8 MB each; the run prints needed and free space."""
     variants: Annotated[int | None, arg(metavar="N"), cli.Bound(0)] = None
-    """Prepare each scan N times; steps choose among these variants. Each one needs disk, 0.8 MB for `paper`. 0: prepare
-    it anew at each use, as published, which keeps many cores busy. Without it, the preset decides (`paper`: 0)."""
+    """Prepare each scan N times; steps choose among them. 0: anew at each use. Without it, the preset decides."""
     validate: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
     """Folders of scans with poses whose pairs choose the model, instead of held-out places of --data."""
     recall_every: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 100
@@ -155,7 +147,21 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     trained = run_training(records, store, settings, hooks, seed=options.seed, total_s=total_s)
     if records is None:
         return {}
-    numbers = training_numbers(trained, records) | {"num_scans": num_scans, "bad_scans": store.bad, "calibration": {}}
+    numbers = {
+        "seed": options.seed,
+        "num_scans": num_scans,
+        "bad_scans": store.bad,
+        "steps": int(trained.progress.state.step),
+        "best_step": int(trained.progress.best_step) or None,
+        "selection_score": float(trained.progress.best_score),
+        "chosen_by": "the last step, as published" if records.takes_last else records.selection.chosen_by,
+        "trained": trained.model.config.trained,
+        "overlap_steps": 0 if trained.overlap is None else int(trained.overlap.step),
+        "train_s": records.run_s,
+        "compile_s": trained.speed.compile_s,
+        "scans_per_s": trained.speed.scans_per_s,
+        "calibration": {},
+    }
     origin = f"{options.preset}, trained on {', '.join(options.data)}"
     # A stopped run has no minutes for the evaluation and the calibration.
     numbers |= {} if run.is_stopped else evaluate(trained, records)
@@ -250,22 +256,6 @@ def calibrate_on_sources(
     if calibrated.config.overlap is None:
         print("the overlap is not calibrated: pairs with overlap or without are missing; give more drives, or town too")
     return calibrated, numbers
-
-
-def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers:
-    """Returns steps, selection score and seconds for `metrics.json`."""
-    return {
-        "seed": records.seed,
-        "steps": int(trained.progress.state.step),
-        "best_step": int(trained.progress.best_step) or None,
-        "selection_score": float(trained.progress.best_score),
-        "chosen_by": "the last step, as published" if records.takes_last else records.selection.chosen_by,
-        "trained": trained.model.config.trained,
-        "overlap_steps": 0 if trained.overlap is None else int(trained.overlap.step),
-        "train_s": records.run_s,
-        "compile_s": trained.speed.compile_s,
-        "scans_per_s": trained.speed.scans_per_s,
-    }
 
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> Numbers:

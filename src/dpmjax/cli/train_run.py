@@ -36,9 +36,8 @@ from dpmjax.types import Poses
 NUM_AT_ONCE = 16
 # Largest number of scans of an evaluation, all drives together.
 MAX_EVALUATED_SCANS = 96
+# Pairs of scans, near and far, which choose the model, and the names of their recalls.
 KINDS = {dpm.PairKind(2.0, 10.0): "recall", dpm.PairKind(10.0, 20.0): "recall_far"}
-"""Pairs of scans, near and far, which choose the model, and the names of their recalls."""
-
 OVERLAP_CHECKPOINTS = "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
