@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -15,14 +15,14 @@ from tqdm import tqdm
 from dpmjax import geometry, metrics, saved_maps, slam, viz
 from dpmjax.cli.drives import ScanReader
 from dpmjax.cli.run import Numbers, write_table
-from dpmjax.saved_maps import RunState
 from dpmjax.sequences import LidarSequence, counted
+
+if TYPE_CHECKING:
+    AnyScan = slam.TimedScan | np.ndarray
 
 STATE = "run_state.npz"
 # Seconds between writings of the state; a killed run repeats the scans since the last one.
 SAVE_EVERY_S = 10.0
-# A scan from its file, and the same scan prepared for SLAM.
-Prepared = tuple[slam.TimedScan | np.ndarray, slam.TimedScan | slam.PreparedInput]
 MAP_VOXEL_M, MAX_MAP_POINTS = 0.2, 3_000_000
 MAP_RANGES_M = (2.0, 60.0)
 LOOP_COLUMNS = ("found_by", "status", "overlap", "probability", "rmse_m")
@@ -82,10 +82,10 @@ class _Clock:
             self.compile_s += duration_secs
 
 
-def find_beginning(folder: Path | None, methods: slam.SlamMethods, start: slam.SlamState) -> RunState:
+def find_beginning(folder: Path | None, methods: slam.SlamMethods, start: slam.SlamState) -> saved_maps.RunState:
     """Reads the state in the folder of an earlier run, if any; raises a `ValueError` for a run with other weights."""
     if folder is None or not (folder / STATE).is_file():
-        return RunState(start, ())
+        return saved_maps.RunState(start, ())
     found = saved_maps.load_state(folder / STATE)
     require_same_weights(folder / STATE, found.state.slam_map, methods, "give those, or start again")
     return found
@@ -116,7 +116,7 @@ def run_scans(
     folder: Path,
     reader: ScanReader,
     methods: slam.SlamMethods,
-    beginning: RunState,
+    beginning: saved_maps.RunState,
     *,
     stop: Callable[[], bool],
     viewer: viz.LiveViewer | None = None,
@@ -139,9 +139,9 @@ def run_scans(
     clock, sequence, error = _Clock(), reader.sequence, None
     state, reports, scan_s = beginning.state, list(beginning.reports), list[float]()
     first, started, saved = len(reports), clock.now_s(), time.perf_counter()
-    resumable: RunState | None = None
+    resumable: saved_maps.RunState | None = None
 
-    def prepare(index: int) -> Prepared:
+    def prepare(index: int) -> tuple[AnyScan, AnyScan | slam.PreparedInput]:
         scan = reader(index)
         return scan, slam.prepare_ahead(methods, scan)
 
@@ -158,7 +158,7 @@ def run_scans(
                 scan_s.append(clock.now_s() - before)
                 reports.append(report)
                 if report.is_keyframe:
-                    resumable = RunState(state, tuple(reports))
+                    resumable = saved_maps.RunState(state, tuple(reports))
                 if resumable is not None and time.perf_counter() - saved > SAVE_EVERY_S:
                     saved_maps.save_state(folder / STATE, *resumable)
                     resumable, saved = None, time.perf_counter()
@@ -176,9 +176,7 @@ def run_scans(
     return SlamRun(state, tuple(reports), clock.compile_s, clock.now_s() - started, tuple(scan_s), error)
 
 
-def show_live(
-    viewer: viz.LiveViewer, scan: slam.TimedScan | np.ndarray, state: slam.SlamState, report: slam.ScanReport
-) -> None:
+def show_live(viewer: viz.LiveViewer, scan: AnyScan, state: slam.SlamState, report: slam.ScanReport) -> None:
     """Shows a scan in the viewer, and the map after a new keyframe."""
     T_world_keyframe = state.slam_map.T_world_keyframe
     if not len(T_world_keyframe):
