@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import signal
-
 import jax
 import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli import localize
 from dpmjax.cli.program import main
 from dpmjax.cli.run import EXIT_FAILED, EXIT_OK, load_json
 from dpmjax.geometry import rigid
@@ -117,20 +113,6 @@ def test_bad_input_is_told_in_one_line(case, refused, changes, message) -> None:
     weights = given["weights"] if given["weights"] == "no_such_model" else case / given["weights"]
     arguments = (case / given["map"], scans, "--weights", weights)
     assert message in refused("localize", *arguments)
-
-
-@pytest.mark.slow
-def test_a_stopped_run_is_interrupted(case, tmp_path, monkeypatch) -> None:
-    def stopped(*arguments):
-        for result in localize_each(*arguments):
-            os.kill(os.getpid(), signal.SIGINT)
-            yield result
-
-    localize_each = localize.slam.localize_each
-    monkeypatch.setattr("dpmjax.slam.localize_each", stopped)
-    arguments = (case / "map.npz", scans_of(case), "--weights", case / "model.safetensors", "-o", tmp_path / "out")
-    assert run(*arguments) == 130
-    assert load_json(tmp_path / "out" / "metrics.json")["status"] == "interrupted"
 
 
 def test_a_damaged_scan_leaves_the_results_so_far(case, tmp_path, capsys) -> None:
