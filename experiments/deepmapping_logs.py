@@ -122,8 +122,8 @@ def measure_run(folder: Path, log: Path, corrected: Path | None) -> cli.Row:
 
 def row_of(numbers: cli.Row) -> cli.Row:
     """Returns the row of a run; cells are None for what its log has no reference for, all of a run that was refused."""
-    worst_m, trusted = numbers.get("worst_scan_m"), numbers.get("assessment", {}).get("is_trusted")
-    right = None if worst_m is None else worst_m < RIGHT_M
+    assessment, worst_m = numbers.get("assessment", {}), numbers.get("worst_scan_m")
+    trusted, right = assessment.get("is_trusted"), None if worst_m is None else worst_m < RIGHT_M
     return {
         **{name: numbers.get(name) for name in NUMBERS},
         "deepmapping_ate_m": numbers.get("candidates", {}).get(DEEPMAPPING, {}).get("ate_m"),
@@ -131,7 +131,7 @@ def row_of(numbers: cli.Row) -> cli.Row:
         "right": right,
         "right_if_trusted": right if trusted else None,
         "trusted_if_right": trusted if right else None,
-        "uncertain_scans": " ".join(cli.spans_of(numbers.get("assessment", {}).get("uncertain_scans", ()))),
+        "uncertain_scans": " ".join(cli.spans_of(assessment.get("uncertain_scans", ()))),
     }
 
 

@@ -248,7 +248,8 @@ def map_by_peer(folder: Path, drive: LidarSequence, stop: Stop, name: str) -> cl
     ]
     map_bytes = peer.map_bytes(drive.read_points(number).astype(np.float64) for number in taken)
     row = measure_trajectory(folder, drive, T_taken[rows], loops) | mean_seconds(scan_s)
-    return row | {"map_mb": map_bytes / 1e6, "version": importlib.metadata.version(name)}
+    map_mb = None if map_bytes is None else map_bytes / 1e6
+    return row | {"map_mb": map_mb, "version": importlib.metadata.version(name)}
 
 
 def is_indoors(drive: LidarSequence) -> bool:

@@ -117,10 +117,11 @@ def test_the_second_stage_goes_on_where_it_was_broken_off_and_has_rows_of_its_ow
 
 
 @pytest.mark.slow
-def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_path: Path) -> None:
-    nothing = train_run.draw_selection(TRAINING, 2, [lambda: toy.drive(num_scans=1)], "the drives")
+def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(monkeypatch) -> None:
+    monkeypatch.setattr(train_run, "NUM_HELD_OUT_PAIRS", 4)
+    nothing = train_run.draw_selection(TRAINING, [lambda: toy.drive(num_scans=1)], "the drives")
     assert nothing == Selection(None, "the last step: no drive has held-out places")
-    some = train_run.draw_selection(TRAINING, 4, [toy.drive, lambda: toy.drive(1)], "the drives")
+    some = train_run.draw_selection(TRAINING, [toy.drive, lambda: toy.drive(1)], "the drives")
     assert some.chosen_by == "the drives"
     assert [pairs.kind for pairs in some.pairs.pairs] == list(KINDS)
     assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 2

@@ -335,37 +335,7 @@ def run_numbers(result: slam.SlamResult, sequence: LidarSequence) -> Numbers:
         "scan_statuses": dict(collections.Counter(report.status for report in result.reports)),
         "loop_statuses": dict(loops),
     }
-    return {"status": status_of(numbers), "verdict": verdict_of(numbers), **numbers}
-
-
-def why_failed(statuses: Mapping[str, int]) -> str | None:
-    """Returns the reason why a finished run, with these numbers of scans by status, has no result; or None."""
-    num_scans, num_empty = sum(statuses.values()), statuses.get("empty", 0)
-    if num_scans and num_empty == num_scans:
-        return f"{num_empty} of {counted(num_scans, 'scan')} without enough points, no map was made"
-    if num_scans > 1 and not {"tracked", "network", "coasting"} & statuses.keys():
-        return f"none of {counted(num_scans, 'scan')} could be aligned with those before, the trajectory is no result"
-    return None
-
-
-def status_of(numbers: Numbers) -> str:
-    """Returns the status of a run that came to its end.
-
-    Args:
-        numbers: of the run.
-
-    Returns:
-        "done", "uncertain" or "failed". A run is uncertain if more than one scan and more than a tenth of all scans
-        were not aligned in all directions. It is also uncertain if no loop joins all parts of the map. It failed if no
-        scan was aligned.
-    """
-    statuses = numbers["scan_statuses"]
-    if why_failed(statuses) is not None:
-        return "failed"
-    num_scans = sum(statuses.values())
-    num_guessed = num_scans - sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
-    is_sure = numbers["num_parts"] < 2 and num_guessed <= max(1, MAX_GUESSED_SHARE * num_scans)
-    return "done" if is_sure else "uncertain"
+    return {**judge(numbers), **numbers}
 
 
 def count_parts(slam_map: slam.KeyframeMap) -> int:
@@ -373,23 +343,42 @@ def count_parts(slam_map: slam.KeyframeMap) -> int:
     return len(set(slam.measured_parts(slam_map).tolist()))
 
 
-def verdict_of(numbers: Numbers) -> str:
-    """Returns the verdict: the size of the map, and its uncertain or wrong parts."""
-    if (reason := why_failed(numbers["scan_statuses"])) is not None:
-        return f"{reason}: check that the scans are 3-D, in metres, and follow each other"
-    text = f"{counted(numbers['num_scans'], 'scan')}, {numbers['path_m']:.1f} m driven, "
-    text += counted(numbers["num_new_keyframes"], "keyframe")
+def judge(numbers: Numbers) -> Numbers:
+    """Returns status and verdict of a run that came to its end.
+
+    Args:
+        numbers: of the run.
+
+    Returns:
+        The status "done", "uncertain" or "failed", and one sentence. A run is uncertain if more than one scan and more
+        than a tenth of all scans were not aligned in all directions. It is also uncertain if no loop joins all parts of
+        the map. It failed if no scan was aligned. The sentence names the size of the map, and its uncertain or wrong
+        parts.
+    """
+    statuses, num_parts = numbers["scan_statuses"], numbers["num_parts"]
+    num_scans = sum(statuses.values())
+    scans, reason = counted(num_scans, "scan"), None
+    if num_scans and statuses.get("empty") == num_scans:
+        reason = f"{num_scans} of {scans} without enough points, no map was made"
+    elif num_scans > 1 and not {"tracked", "network", "coasting"} & statuses.keys():
+        reason = f"none of {scans} could be aligned with those before, the trajectory is no result"
+    if reason is not None:
+        advice = "check that the scans are 3-D, in metres, and follow each other"
+        return {"status": "failed", "verdict": f"{reason}: {advice}"}
+    num_guessed = num_scans - sum(statuses.get(status, 0) for status in ("first", "tracked", "network"))
+    is_sure = num_parts < 2 and num_guessed <= max(1, MAX_GUESSED_SHARE * num_scans)
+    text = f"{scans}, {numbers['path_m']:.1f} m driven, {counted(numbers['num_new_keyframes'], 'keyframe')}"
     if numbers["num_keyframes"] > numbers["num_new_keyframes"]:
         text += f" ({numbers['num_keyframes']} in the map)"
     text += f", {counted(numbers['num_loops'], 'loop closure')}"
-    for status, reason in UNSURE.items():
-        if status in numbers["scan_statuses"]:
-            text += f"; {counted(numbers['scan_statuses'][status], 'scan')} {reason} (scans.csv has the reasons)"
-    if numbers["num_parts"] > 1:
-        text += f"; the map has {numbers['num_parts']} parts that no loop joins; their relative pose is a guess"
+    for status, found in UNSURE.items():
+        if status in statuses:
+            text += f"; {counted(statuses[status], 'scan')} {found} (scans.csv has the reasons)"
+    if num_parts > 1:
+        text += f"; the map has {num_parts} parts that no loop joins; their relative pose is a guess"
     if numbers["reference_doubt"] is not None:
         text += f"; warning: {numbers['reference_doubt']}"
     for suffix, name in (("_odometry", "odometry alone"), ("", "SLAM")):
         if f"ate{suffix}_m" in numbers:
             text += f"; ATE of {name} {numbers[f'ate{suffix}_m']:.3f} m"
-    return text
+    return {"status": "done" if is_sure else "uncertain", "verdict": text}

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 MODEL = "model.safetensors"
 # Share of the learning rate at which trained weights are tuned: at the full rate they forget pairs far apart.
 TUNING_SHARE = 0.2
-TOWN_LENGTH_M, NUM_HELD_OUT_PAIRS = 400.0, 32
+TOWN_LENGTH_M = 400.0
 SHOWN_CURVES = ("loss", "pairing", "offset", "top1_accuracy", "recall", "recall_far", "overlap_loss")
 
 
@@ -187,18 +187,14 @@ def training_settings(options: TrainOptions, first: deeppointmap.Model | None = 
         if "overlap" not in first.config.trained:  # this head begins, whatever is tuned
             rate_share = settings.overlap.rate_share / TUNING_SHARE
             settings = replace(settings, overlap=replace(settings.overlap, rate_share=rate_share))
-    if options.variants is not None:
-        settings = replace(settings, num_variants=options.variants)
-    if options.epochs is not None:
-        settings = replace(settings, num_epochs=options.epochs)
-    stages, num_scans = settings.curriculum, options.scans or settings.sampling.num_scans
+    given = {"num_variants": options.variants, "num_epochs": options.epochs}
+    changed: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    num_scans = options.scans or settings.sampling.num_scans
     if options.groups:
         num_steps = max(1, settings.num_steps // len(options.groups))
-        stages = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in options.groups)
-    sampling = replace(settings.sampling, num_scans=num_scans)
-    settings = replace(
-        settings, curriculum=stages, sampling=sampling, stages=options.stages, refines_labels=options.refine_labels
-    )
+        changed["curriculum"] = tuple(deeppointmap.CurriculumStage(group, num_steps) for group in options.groups)
+    changed |= {"sampling": replace(settings.sampling, num_scans=num_scans), "stages": options.stages}
+    settings = replace(settings, refines_labels=options.refine_labels, **changed)
     if jax.default_backend() != "cpu":
         settings = replace(settings, scans_at_once=num_scans)
     for part in options.without:
@@ -224,10 +220,10 @@ def select_pairs(
     if "registration" not in options.stages:
         return Selection(None, "given weights")
     if options.validate:
-        given: list[cli.Source] = [partial(io.open_lidar_sequence, path) for path in options.validate]
-        return draw_selection(settings, NUM_HELD_OUT_PAIRS, given, "drives of --validate")
-    drives: list[cli.Source] = [partial(part_of_drive, source, "held_out") for source in chosen]
-    return draw_selection(settings, NUM_HELD_OUT_PAIRS, drives, f"held-out places of the {kind}")
+        given = [partial(io.open_lidar_sequence, path) for path in options.validate]
+        return draw_selection(settings, given, "drives of --validate")
+    drives = [partial(part_of_drive, source, "held_out") for source in chosen]
+    return draw_selection(settings, drives, f"held-out places of the {kind}")
 
 
 def without_impossible_stage(

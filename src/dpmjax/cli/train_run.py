@@ -34,8 +34,8 @@ from dpmjax.types import Poses
 # Scans of a drive that a processor prepares at a time; with more the bar stands still, with fewer the drive is opened
 # more often.
 NUM_AT_ONCE = 16
-# Largest number of scans of an evaluation, all drives together.
-MAX_EVALUATED_SCANS = 96
+# Largest number of scans of an evaluation, and number of its pairs of each kind, all drives together.
+MAX_EVALUATED_SCANS, NUM_HELD_OUT_PAIRS = 96, 32
 # Pairs of scans, near and far, which choose the model, and the names of their recalls.
 KINDS = {dpm.PairKind(2.0, 10.0): "recall", dpm.PairKind(10.0, 20.0): "recall_far"}
 OVERLAP_CHECKPOINTS = "checkpoints_overlap"
@@ -179,14 +179,11 @@ class Selection(NamedTuple):
     chosen_by: str
 
 
-def draw_selection(
-    settings: dpm.TrainingConfig, num_pairs: int, drives: Sequence[cli.Source], chosen_by: str
-) -> Selection:
+def draw_selection(settings: dpm.TrainingConfig, drives: Sequence[cli.Source], chosen_by: str) -> Selection:
     """Draws the pairs that choose the model.
 
     Args:
         settings: settings of training.
-        num_pairs: number of pairs of each kind, all drives together.
         drives: held-out places, or drives of `--validate`.
         chosen_by: a name of the pairs, for `metrics.json`.
 
@@ -199,10 +196,11 @@ def draw_selection(
             drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
             yield drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
 
-    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model, kinds=tuple(KINDS))
-    if not pairs.pairs:
-        return Selection(None, "the last step: no drive has held-out places")
-    return Selection(pairs, chosen_by)
+    num_pairs = max(1, NUM_HELD_OUT_PAIRS // len(drives))
+    pairs = dpm.draw_evaluation_pairs(opened(), num_pairs, settings.model, kinds=tuple(KINDS))
+    return (
+        Selection(pairs, chosen_by) if pairs.pairs else Selection(None, "the last step: no drive has held-out places")
+    )
 
 
 class Records:
