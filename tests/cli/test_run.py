@@ -187,7 +187,7 @@ def test_a_check_of_the_options_says_what_it_expects():
     ("words", "message"),
     [
         ("a -n x", "--steps: .*'x'"),
-        ("a --device tpu", "'tpu' for argument '--device'. Expected one of .*'cpu'"),
+        ("a --world 7", "'7' for argument '--world'. Expected one of .*'grove'"),
         ("a --seconds", "Missing value for argument '--seconds'"),
         ("a --second 3", "Unrecognized options: --second, 3"),
         ("a b", "Unrecognized options: b"),

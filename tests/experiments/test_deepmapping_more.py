@@ -17,7 +17,6 @@ from tests.experiments.running import read_rows, run
     ("module", "options", "message"),
     [
         (toy_1d, ["--seeds", 0], "--seeds"),
-        (toy_1d, ["--device", "tpu"], "--device"),
         (deepmapping_ablations, ["--only", "colour"], "--only"),
         (deepmapping_rgbd, ["--methods", "guess"], "--methods"),
         (deepmapping_rgbd, ["--limit", 0], "--limit"),

@@ -19,7 +19,6 @@ from .evaluate import summarize_pairs as summarize_pairs
 from .info import environment as environment
 from .info import peak_rss_gb as peak_rss_gb
 from .info import require_importable as require_importable
-from .info import select_device as select_device
 from .info import why_not_importable as why_not_importable
 from .map2d import named_initial as named_initial
 from .map2d import spans_of as spans_of

@@ -18,7 +18,7 @@ import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from dpmjax import cli
 from dpmjax.compile_cache import cpu_model, enable_compile_cache
@@ -60,25 +60,6 @@ def main(options: InfoOptions, run: cli.Run) -> cli.Numbers:
         reasons = filter(None, map(why_not_importable, packages))
         print(f"extra      {extra}: {'; '.join(reasons) or 'installed'}")
     return {}
-
-
-def select_device(device: Literal["cpu", "gpu"] | None) -> None:
-    """Selects the device of JAX; None leaves the choice to JAX.
-
-    Raises:
-        ValueError: there is no such device here.
-    """
-    if device is None:
-        return
-    # JAX reads this with its first array, so the device can be selected after the options are parsed.
-    import jax
-
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError) as error:  # the second where the plugin of the device is not installed
-        reason = "JAX finds no such device here; leave the option out or install its plugin"
-        raise ValueError(f"--device {device}: {reason}") from error
 
 
 def environment() -> dict[str, Any]:

@@ -10,7 +10,7 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, arg
@@ -43,8 +43,6 @@ class OutputOptions:
     """Folder for the results, instead of results/<command>/<time>."""
     force: FlagCreatePairsOff[bool] = False
     """Replace OUT and everything in it, if it holds an earlier run."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Device for the computation. Without it, JAX chooses."""
 
     def __post_init__(self) -> None:
         """Checks the bounds of all options."""

@@ -36,7 +36,7 @@ import numpy as np
 
 from dpmjax import io
 from dpmjax.cli import program
-from dpmjax.cli.info import environment, select_device
+from dpmjax.cli.info import environment
 from dpmjax.cli.options import parse_options
 from dpmjax.cli.report import write_report
 from dpmjax.compile_cache import enable_compile_cache
@@ -47,9 +47,7 @@ CONFIG, METRICS, HISTORY, LOG, CHECKPOINTS = "config.json", "metrics.json", "met
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
 RESULTS, LOGGER = Path("results"), logging.getLogger("dpmjax")
 # Options that do not change the result.
-FREE_OPTIONS = frozenset(
-    {"output", "resume", "force", "device", "coordinator", "num_processes", "process_id", "visualize"}
-)
+FREE_OPTIONS = frozenset({"output", "resume", "force", "coordinator", "num_processes", "process_id", "visualize"})
 
 Numbers = dict[str, Any]
 
@@ -236,8 +234,6 @@ def run_command(
         enable_compile_cache()
         options = _read_options(main, name, description, list(sys.argv[1:] if args is None else args))
         run = Run(name, options)
-        if getattr(options, "coordinator", None) is None:  # several processes find each other first
-            select_device(getattr(options, "device", None))
         for number in previous:
             signal.signal(number, run.on_signal)
         return _finish(run, main(options, run))

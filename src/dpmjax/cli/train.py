@@ -113,8 +113,6 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     from dpmjax.deeppointmap.training.processes import is_first, join_processes
 
     join_processes(options.coordinator, options.num_processes, options.process_id)
-    if options.coordinator is not None:  # not before the processes have found each other
-        cli.select_device(options.device)
     import jax
 
     from dpmjax.cli.train_run import Records, part_of_drive, prepare_sources, run_training

@@ -27,7 +27,6 @@ from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.run import CHECKPOINTS, HISTORY, Run
-from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import LidarSequence
 from dpmjax.types import Poses
 
@@ -145,7 +144,6 @@ def _workers() -> Iterator[ProcessPoolExecutor]:
 def _begin_worker() -> None:
     # The device belongs to the process that trains, and so does the answer to Ctrl-C.
     jax.config.update("jax_platforms", "cpu")
-    enable_compile_cache()  # the caster of each lidar compiles for ten seconds
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
