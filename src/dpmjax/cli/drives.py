@@ -23,9 +23,6 @@ from dpmjax.sequences import InputError, LidarSequence, Note
 
 LOGGER = logging.getLogger("dpmjax.drives")
 TOWN = "town"
-TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
-# A car of 10 m/s and a lidar of 10 turns a second, as in KITTI: one scan each metre, with up to 3 degrees of turn.
-ROUTE_SPEED_M_S, ROUTE_RATE_HZ, ROUTE_TURN_DEG_S = 10.0, 10.0, 30.0
 # Unit of the integer coordinates of kept scans: 16 bits reach 128 m.
 STEP_M = 2.0**-8
 # Time of a turn of a lidar whose scans have no times of points.
@@ -98,10 +95,9 @@ def with_raised_beams(drive: LidarSequence) -> LidarSequence:
 
 def demo_drive(seed: int) -> LidarSequence:
     """Simulates a drive once round a town and on over the first streets, with an HDL-64 of half the columns."""
-    town = simulation.TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
-    driving = simulation.DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
-    sensor = simulation.HDL64E.with_azimuths(TOWN_AZIMUTHS)
-    return simulation.simulate_scene(simulation.Scene(seed, town, driving, sensor))
+    town = simulation.TownConfig("suburb", "loop", route_length_m=400.0, block_m=90.0)
+    driving = simulation.DriveConfig(rate_hz=3.0, length_m=480.0)
+    return simulation.simulate_scene(simulation.Scene(seed, town, driving, simulation.HDL64E.with_azimuths(900)))
 
 
 def route_drive(path: Path, seed: int) -> LidarSequence:
@@ -122,7 +118,8 @@ def route_drive(path: Path, seed: int) -> LidarSequence:
     """
     T_world_lidar = io.read_lidar_trajectory(path)
     T_world_lidar[:, :3, 3] -= T_world_lidar[0, :3, 3]  # float32 holds no centimetres at the coordinates of a country
-    driving = simulation.DriveConfig(ROUTE_SPEED_M_S, ROUTE_RATE_HZ, max_turn_deg_s=ROUTE_TURN_DEG_S)
+    # As in KITTI: 10 m/s and 10 turns a second, so one scan each metre, with up to 3 degrees of turn.
+    driving = simulation.DriveConfig(10.0, 10.0, max_turn_deg_s=30.0)
     try:
         scene = simulation.Scene(seed, simulation.TownConfig(), driving, simulation.HDL64E)
         drive = simulation.simulate_scene(scene, trajectory=T_world_lidar)

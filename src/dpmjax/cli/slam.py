@@ -210,5 +210,5 @@ def write_map_results(
     run.write_numbers(numbers)  # also where a picture fails
     cloud = slam_run.gather_map(slam_map.T_world_keyframe, read_keyframe)
     io.write_ply(run / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
-    slam_run.draw_pictures(run.path, sequence, result, cloud, num_before)
+    slam_run.draw_pictures(run, sequence, result, cloud, numbers)
     return {**numbers, "map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from dpmjax import geometry, metrics, saved_maps, slam, viz
 from dpmjax.cli.drives import ScanReader
-from dpmjax.cli.run import Numbers, write_table
+from dpmjax.cli.run import Numbers, Run, write_table
 from dpmjax.sequences import LidarSequence, counted
 
 if TYPE_CHECKING:
@@ -260,36 +260,32 @@ def gather_map(T_world_scan: np.ndarray, read_scan: Callable[[int], np.ndarray])
     return Cloud(whole[:, :3], whole[:, 3], voxel_m)
 
 
-def draw_pictures(
-    folder: Path, sequence: LidarSequence, result: slam.SlamResult, cloud: Cloud, num_keyframes_before: int = 0
-) -> None:
+def draw_pictures(run: Run, sequence: LidarSequence, result: slam.SlamResult, cloud: Cloud, numbers: Numbers) -> None:
     """Draws trajectory.png and map.png."""
-    T, slam_map, num_old = result.T_world_scan, result.map, num_keyframes_before
+    T, slam_map, name = result.T_world_scan, result.map, sequence.name
+    reference, ends = sequence.T_world_lidar, accepted_ends(result.loops)
+
+    def track(label: str, color: str, T_world_scan: np.ndarray, suffix: str) -> viz.Track:
+        ate_m = numbers.get(f"ate{suffix}_m")
+        return viz.Track(T_world_scan[:, :3, 3], color, label if ate_m is None else f"{label}, ATE {ate_m:.3f} m")
+
     # Odometry alone begins where the drive begins, also in a map that was there before.
     odometry = T[0] @ geometry.rigid.inverse(result.T_odometry_scan[0]) @ result.T_odometry_scan
-    reference, ends = sequence.T_world_lidar, accepted_ends(result.loops)
-    tracks = [_track("odometry alone", viz.ODOMETRY, odometry, reference)] if len(ends) else []
-    if num_old:
-        tracks = [viz.Track(slam_map.T_world_keyframe[:num_old, :3, 3], viz.INK, "the map before", "--"), *tracks]
-    tracks.append(_track("SLAM", viz.PATH, T, reference))
+    tracks = [track("odometry alone", viz.ODOMETRY, odometry, "_odometry")] if len(ends) else []
+    if num_old := numbers["num_keyframes"] - numbers["num_new_keyframes"]:
+        tracks.insert(0, viz.Track(slam_map.T_world_keyframe[:num_old, :3, 3], viz.INK, "the map before", "--"))
+    tracks.append(track("SLAM", viz.PATH, T, ""))
     shown, known = None, sequence.has_reference
     if reference is not None and known.any():
         positions = reference[known, :3, 3]
         T_map_reference = metrics.align_rigid(positions, T[known, :3, 3])
         shown = positions @ T_map_reference[:3, :3].T + T_map_reference[:3, 3]
-    title = f"{sequence.name}: {counted(len(T), 'scan')}"
-    figure = viz.trajectory_figure(title, tracks, shown, slam_map.T_world_keyframe[ends, :3, 3])
-    viz.save_figure(figure, folder / "trajectory.png")
-    title, num_parts = f"{sequence.name}: {counted(len(result.keyframes), 'keyframe')}", count_parts(slam_map)
-    if num_parts > 1:
-        title += f", {num_parts} parts at guessed relative poses"
-    viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), folder / "map.png")
-
-
-def _track(name: str, color: str, T_world_scan: np.ndarray, reference: np.ndarray | None) -> viz.Track:
-    errors = metrics.distances_to_reference(T_world_scan, reference)
-    label = name if errors is None else f"{name}, ATE {np.sqrt(np.nanmean(errors**2)):.3f} m"
-    return viz.Track(T_world_scan[:, :3, 3], color, label)
+    title, loops = f"{name}: {counted(len(T), 'scan')}", slam_map.T_world_keyframe[ends, :3, 3]
+    viz.save_figure(viz.trajectory_figure(title, tracks, shown, loops), run / "trajectory.png")
+    title = f"{name}: {counted(len(result.keyframes), 'keyframe')}"
+    if numbers["num_parts"] > 1:
+        title += f", {numbers['num_parts']} parts at guessed relative poses"
+    viz.save_figure(viz.height_map_figure(title, cloud.points, cloud.heights_m, T[:, :3, 3]), run / "map.png")
 
 
 def open_map(path: Path, methods: slam.SlamMethods) -> slam.KeyframeMap:
