@@ -56,9 +56,10 @@ def kinds(monkeypatch) -> list[str | None]:
         return StagedRegistration(T, T, T, evidence, 0.5, 0.0)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(deeppointmap, "encode", lambda model, points, num_elements: points)
-    monkeypatch.setattr(deeppointmap, "register_in_stages", staged)
-    monkeypatch.setattr(deeppointmap, "register_clouds", lambda *_: motions[-1])
+    module = "dpmjax.deeppointmap.calibration"
+    monkeypatch.setattr(f"{module}.encode", lambda model, points, num_elements: points)
+    monkeypatch.setattr(f"{module}.register_in_stages", staged)
+    monkeypatch.setattr(f"{module}.register_clouds", lambda *_: motions[-1])
     return kinds
 
 
