@@ -219,16 +219,24 @@ def check_names_differ(drives: Iterable[LidarSequence]) -> None:
 
 
 class ScanReader:
-    """Reads scans, with point times for deskewing.
+    """Reads scans, with point times for deskewing and with odometry.
 
     Args:
         sequence: the drive.
         is_deskewed: True for points with times.
         jump: stride of the scans of the drive, for drives without times.
+        odometry: (n, 4, 4) poses of the lidar, as first guesses; None without odometry.
     """
 
-    def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
-        self.sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
+    def __init__(
+        self,
+        sequence: LidarSequence,
+        *,
+        is_deskewed: bool = False,
+        jump: int = 1,
+        odometry: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.sequence, self.odometry, self._is_deskewed, self._jump = sequence, odometry, is_deskewed, jump
         self._has_warned = False
 
     def __call__(self, index: int) -> slam.TimedScan | np.ndarray:
