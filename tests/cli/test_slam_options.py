@@ -13,8 +13,7 @@ import dpmjax
 from dpmjax.cli import slam
 from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, with_raised_beams
 from dpmjax.cli.info import why_not_importable
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, slam_preset
@@ -54,7 +53,6 @@ def test_a_saved_map_is_extended(room, tmp_path, refused) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     assert run(drive, "--weights", weights, "-n", 8, "-o", first) == EXIT_OK
     before = dpmjax.load_map(first / "map.npz")
-    assert load_json(first / "metrics.json")["map_bytes_int8"] < load_json(first / "metrics.json")["map_bytes"]
     assert run(drive, "--weights", weights, "--map", first / "map.npz", "-o", second) == EXIT_OK
     after = dpmjax.load_map(second / "map.npz")
     assert len(after) > len(before)
