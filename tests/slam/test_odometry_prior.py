@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpmjax.slam import SlamConfig, SlamMethods, compare_odometry, run_slam
+from dpmjax.metrics import compare_odometry
+from dpmjax.slam import SlamConfig, SlamMethods, run_slam
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose, scans_of
 
 TRUTH = laps(1, side_m=30.0, step_m=1.0)
@@ -19,8 +20,8 @@ def test_late_odometry_is_told_from_a_bad_one(delay: int) -> None:
     late = truth[np.clip(np.arange(80) - delay, 0, 79)]
     found = compare_odometry(pose(5.0, 3.0, 1.0) @ late, truth)
     assert found.delay_scans == delay
-    assert found.undelayed_step_m < 1e-9
-    assert (found.step_m < 1e-9) == (delay == 0)
+    assert found.undelayed_step < 1e-9
+    assert (found.step < 1e-9) == (delay == 0)
 
 
 def test_noise_is_no_delay() -> None:
@@ -29,9 +30,9 @@ def test_noise_is_no_delay() -> None:
     noisy[:, :3, 3] += 0.2 * rng.standard_normal((len(TRUTH), 3))
     found = compare_odometry(noisy, TRUTH)
     assert found.delay_scans == 0
-    assert 0.2 < found.step_m < 0.7
+    assert 0.2 < found.step < 0.7
     noisy[40:50] = np.nan
-    assert np.isfinite(compare_odometry(noisy, TRUTH).step_m)
+    assert np.isfinite(compare_odometry(noisy, TRUTH).step)
 
 
 def test_scans_without_odometry_keep_the_last_motion() -> None:

@@ -4,6 +4,7 @@ from .drives import Source as Source
 from .drives import check_names_differ as check_names_differ
 from .drives import find_sources as find_sources
 from .drives import keep_scans as keep_scans
+from .drives import odometry_numbers as odometry_numbers
 from .drives import open_drive as open_drive
 from .drives import with_reference_only as with_reference_only
 from .evaluate import FIRST_TOWN as FIRST_TOWN

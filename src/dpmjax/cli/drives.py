@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tyro.conf import FlagCreatePairsOff, arg
 
-from dpmjax import deeppointmap, io, scans, simulation, slam
+from dpmjax import deeppointmap, io, metrics, scans, simulation, slam
 from dpmjax.cli.options import Bound, ModelOptions, RunOptions, ScanOptions
-from dpmjax.cli.run import RESULTS
-from dpmjax.sequences import InputError, LidarSequence, Note
+from dpmjax.cli.run import RESULTS, Run
+from dpmjax.sequences import InputError, LidarSequence, Note, ScanSequence
 
 LOGGER = logging.getLogger("dpmjax.drives")
 TOWN = "town"
@@ -264,3 +264,27 @@ class ScanReader:
             return None
         interval_s = float(times[last] - times[last - 1])
         return interval_s if interval_s > 0 else None
+
+
+def odometry_numbers(
+    run: Run, odometry: np.ndarray, T_world_scan: np.ndarray, drive: LidarSequence | ScanSequence
+) -> dict[str, float]:
+    """Returns and prints the error of given odometry against the map, and the delay of its stamps.
+
+    Args:
+        run: prints the line.
+        odometry: (n, d+1, d+1) poses of the sensor by odometry.
+        T_world_scan: (n, d+1, d+1) poses of the same scans in the map.
+        drive: the scans, with their times.
+
+    Returns:
+        Numbers of `metrics.json`.
+    """
+    found, unit = metrics.compare_odometry(odometry, T_world_scan), getattr(drive, "unit", "m")
+    text = f"odometry: {found.step:.2g} {unit} off a step in the median"
+    if found.delay_scans:
+        step, of = (1.0, "scans") if drive.times is None else (float(np.median(np.diff(drive.times))), "s")
+        late = f"{abs(found.delay_scans) * step:.2g} {of} {'late' if found.delay_scans > 0 else 'early'}"
+        text += f"; its stamps are {late} ({found.undelayed_step:.2g} {unit} off)"
+    run.say(text)
+    return {f"odometry_step_{unit}": found.step, "odometry_delay_scans": found.delay_scans}

@@ -89,6 +89,9 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
     recorder = cli.FitRecorder(run, sequence.unit, max_s=math.inf if options.seconds is None else options.seconds)
     result = register_sequence(sequence, start, options, recorder, run)
     numbers = {**map_numbers(sequence, result, options), **recorder.numbers}
+    if sequence.odometry_poses is not None and options.ordered:
+        T_odometry = geometry.se2.to_matrix(sequence.odometry_poses)
+        numbers |= cli.odometry_numbers(run, T_odometry, result.T_world_scan, sequence)
     start_poses = result.recording.between(result.candidates[result.start].poses)
     for name, poses in (("trajectory", result.poses), ("start", start_poses)):
         cli.write_poses(run.path, poses, name, times=sequence.times, unit=sequence.unit)

@@ -120,9 +120,7 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     numbers = {"weights": options.weights, **slam_run.run_numbers(result, placed), "scans_per_s": scans_per_s}
     numbers |= {"run_s": mapped.run_s, "compile_s": mapped.compile_s}
     if odometry is not None and len(result.reports) > 2:
-        errors = slam.compare_odometry(odometry[: len(result.reports)], result.T_world_scan)
-        numbers |= {"odometry_step_m": errors.step_m, "odometry_delay_scans": errors.delay_scans}
-        run.say(odometry_text(errors, placed))
+        numbers |= cli.odometry_numbers(run, odometry[: len(result.reports)], result.T_world_scan, placed)
     if result.reports:
         if options.T_base_lidar is not None:
             poses = options.T_base_lidar @ result.T_world_scan @ geometry.rigid.inverse(options.T_base_lidar)
@@ -131,16 +129,6 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     if scans_per_s is not None:
         run.say(f"{scans_per_s:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
     return numbers
-
-
-def odometry_text(found: slam.OdometryErrors, sequence: LidarSequence) -> str:
-    """Returns the error of the given odometry against the trajectory, and the delay of its stamps."""
-    text = f"odometry: {found.step_m:.2g} m off a step in the median"
-    if found.delay_scans:
-        step, unit = (1.0, "scans") if sequence.times is None else (float(np.median(np.diff(sequence.times))), "s")
-        late = f"{abs(found.delay_scans) * step:.2g} {unit} {'late' if found.delay_scans > 0 else 'early'}"
-        text += f"; its stamps are {late} ({found.undelayed_step_m:.2g} m off)"
-    return text
 
 
 def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:

@@ -7,6 +7,8 @@ from .drives import loop_recall as loop_recall
 from .drives import path_lengths as path_lengths
 from .drives import relation_errors as relation_errors
 from .drives import segment_error as segment_error
+from .odometry import OdometryErrors as OdometryErrors
+from .odometry import compare_odometry as compare_odometry
 from .poses import RegistrationRecall as RegistrationRecall
 from .poses import RelativePoseError as RelativePoseError
 from .poses import absolute_trajectory_error as absolute_trajectory_error

@@ -40,8 +40,6 @@ from .loops import DESCRIPTOR_INFORMATION as DESCRIPTOR_INFORMATION
 from .loops import Loop as Loop
 from .model_methods import NetworkMatcher as NetworkMatcher
 from .model_methods import make_methods as make_methods
-from .odometry_prior import OdometryErrors as OdometryErrors
-from .odometry_prior import compare_odometry as compare_odometry
 from .odometry_prior import with_guess as with_guess
 from .surface_geometry import SurfaceGeometry as SurfaceGeometry
 from .system import SlamResult as SlamResult
