@@ -63,9 +63,8 @@ def _classical(sequence: ScanSequence, case: str) -> list[Row]:
         "icp-plane, refined": lambda: refine(lines, poses).poses,
     }
     for name, method in methods.items():
-        timing, at = measure(method, repeats=1), f"{case}: {name}"
-        rows += [Row(at, "compile", timing.compile_s, "s"), Row(at, "run", timing.median_s, "s")]
-        rows.append(_ate_row(at, "ate", sequence, method()))
+        rows += measure(method, repeats=1).rows(f"{case}: {name}")
+        rows.append(_ate_row(f"{case}: {name}", "ate", sequence, method()))
     return rows
 
 
@@ -99,8 +98,8 @@ def _from_zero(quick: bool) -> list[Row]:
         rows += [Row(case, "wall", time.perf_counter() - begun, "s")]
         rows += [_ate_row(case, "ate", sequence, np.asarray(fitted.poses))]
     seconds, ates = np.array([row.value for row in rows]).reshape(-1, 2).T
-    ours = (np.mean(ates < _SUCCESS_PX), np.median(ates), np.median(seconds))
-    for case, numbers in ((f"{len(ates)} walks, from zero", ours), ("the paper's 75 walks (GPU)", _PAPER)):
-        names = (("success", ""), ("median ate", "px"), ("median wall", "s"))
-        rows += [Row(case, name, float(value), unit) for (name, unit), value in zip(names, numbers, strict=True)]
+    ours = (float(np.mean(ates < _SUCCESS_PX)), float(np.median(ates)), float(np.median(seconds)))
+    for case, (success, ate, wall) in ((f"{len(ates)} walks, from zero", ours), ("the paper's 75 walks (GPU)", _PAPER)):
+        rows += [Row(case, "success", success, ""), Row(case, "median ate", ate, "px")]
+        rows.append(Row(case, "median wall", wall, "s"))
     return rows

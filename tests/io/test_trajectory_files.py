@@ -98,7 +98,7 @@ def test_the_names_of_the_columns_order_the_quaternion(tmp_path, names, is_w_fir
         ("1 2 3\n1 2 nan\n", "NaN"),
         ("1 2 3\n1 2\n", "columns"),
         ("1 2\n1 2\n", "columns"),
-        ("1 2 3\n1 2 x\n", "not a number"),
+        ("1 2 3\n1 2 x\n", "could not convert"),
         ("0 1 2 3 0 0 0 2\n1 1 2 3 0 0 0 1\n", "quaternions"),
         ("1 0 0 0 0 0 -1 0 0 1 0 0\n" * 2, "tilted by 90"),
         ("# x_px y_px theta_rad\n1 2 3\n1 2 3\n", "poses in px"),

@@ -77,12 +77,13 @@ def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
     Raises:
         InputError: the module cannot be imported.
     """
-    try:
-        return importlib.import_module(module)
-    except Exception as error:  # a package may be broken in any way
-        why = "which is not installed" if isinstance(error, ModuleNotFoundError) else "whose import fails"
-        found = f"needs {module.partition('.')[0]}, {why}"
-        raise InputError(source, found, f"pip install 'dpmjax[{extra}]'") from error
+    package = module.partition(".")[0]
+    with refusing(source, f"needs {package}, whose import fails", f"pip install 'dpmjax[{extra}]'", (Exception,)):
+        try:
+            return importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            found = f"needs {package}, which is not installed"
+            raise InputError(source, found, f"pip install 'dpmjax[{extra}]'") from error
 
 
 def log_notes(notes: Iterable[Note]) -> None:
@@ -192,10 +193,10 @@ def read_lines(path: str | Path) -> list[str]:
     return content.decode(encoding, errors="replace").splitlines()
 
 
-def is_number(word: str, kind: type[int | float] = float) -> bool:
-    """Returns True for a word that Python reads as a number of this kind."""
+def is_number(word: str) -> bool:
+    """Returns True for a word that Python reads as a number."""
     try:
-        kind(word)
+        float(word)
     except ValueError:
         return False
     return True
@@ -212,19 +213,20 @@ def to_numbers(rows: Sequence[tuple[int, Sequence[str]]], source: str | Path) ->
         (n, k).
 
     Raises:
-        InputError: there is no row, rows differ in length, or a word is no number; line and column are named.
+        InputError: there is no row, rows differ in length, or a word is no number; the line is named.
     """
     require(len(rows) > 0, source, "no row", "write rows of numbers")
+    for line, words in rows:
+        found = f"line {line}: {len(words)} columns, line {rows[0][0]} has {len(rows[0][1])}"
+        require(len(words) == len(rows[0][1]), source, found, "give rows of equal length")
+    table: list[list[float]] = []
     try:
-        return np.array([[float(word) for word in words] for _, words in rows])
+        for _, words in rows:
+            table.append([float(word) for word in words])
     except ValueError as error:
-        for line, words in rows:
-            found = f"line {line} has {len(words)} columns, line {rows[0][0]} has {len(rows[0][1])}"
-            require(len(words) == len(rows[0][1]), source, found, "give rows of equal length")
-            for column, word in enumerate(words, 1):
-                found = f"line {line}, column {column}: {word[:40]!r} is not a number"
-                require(is_number(word), source, found, "write plain decimal numbers")
-        raise InputError(source, f"no table of numbers ({error})", "write plain decimal numbers") from error
+        found = f"line {rows[len(table)][0]}: {str(error)[:100]}"
+        raise InputError(source, found, "write plain decimal numbers") from error
+    return np.array(table)
 
 
 def read_table(path: str | Path, width: int | None = None) -> FloatArray:
@@ -271,13 +273,10 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     Raises:
         InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
     """
-    require(not Path(path).is_dir(), path, "a folder", "give one file")
     content = read_bytes(path)
     require(len(content) > 0, path, "an empty file of 0 bytes", "copy it again")
-    advice = "save it again with numpy.save or numpy.savez"
-    is_numpy = content.startswith((npy_format.MAGIC_PREFIX, b"PK"))
-    require(is_numpy, path, "not a readable NumPy file (it has no header of NumPy)", advice)
     # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
+    advice = "save it again with numpy.save or numpy.savez"
     with refusing(path, "not a readable NumPy file ({error})", advice, (Exception,)):
         if content.startswith(npy_format.MAGIC_PREFIX):
             return {"points": _parse_npy(content)}

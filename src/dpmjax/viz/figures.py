@@ -6,7 +6,6 @@ import math
 import os
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,14 +184,8 @@ def figure(
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes the figure as a PNG; the file appears whole or not at all."""
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.tmp")
-    try:
-        figure.savefig(unfinished, dpi=dpi, format="png", facecolor=figure.get_facecolor())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    """Writes the figure as a PNG."""
+    figure.savefig(path, dpi=dpi, format="png", facecolor=figure.get_facecolor())
 
 
 def add_legend(drawn: Figure, entries: dict[str, Any], num_columns: int) -> None:
