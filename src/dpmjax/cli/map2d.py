@@ -69,9 +69,9 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     """Stop after N steps, rounded up to whole calls of the compiled program. Without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
     """Stop the fit after S seconds of run time, without compile time."""
-    world: Literal[0, 1, 2, "grove", "crowd"] = 0
+    world: Literal[0, 1, 2, "grove"] = 0
     """Built-in world, if no DATA is given. The numbered worlds have walls. grove: trees, bushes and rocks, no straight
-    wall. crowd: an office with walking people."""
+    wall."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 

@@ -25,17 +25,6 @@ _FORMS = {
     "FLASER": "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp",
     "ROBOTLASER1": "a line has 7 numbers of the laser, n r1..rn, m i1..im, poses of laser and robot, 5 numbers, times",
 }
-_SHORTEST_SCALE_M = 7.9  # Least range of the code for "no echo" of the lasers of these logs.
-_LONGEST_RANGE_M = 1e6
-_CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
-# Poses of a log as recorded are those of its ODOM lines, within the distance from one such line to the next.
-_SAME_PLACE_M = 0.5
-# Equal poses, metres and radians.
-_SAME_POSE = 1e-4
-# A line is moved to the position of its time stamp if that shortens the detour of its odometry to this share.
-_SHORTER_WAY = 0.5
-# The odometry does not jump in steps of up to this many times the median.
-_USUAL_STEP = 4.0
 
 
 class _Scan(NamedTuple):
@@ -76,7 +65,8 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
         _log.warning("%s: only its FLASER lines are read, its ROBOTLASER1 lines are left out", path)
     scans = [_parse_scan(words, f"{path}:{number}") for number, words in found]
     largest = max(float(scan.ranges.max()) for scan in scans)
-    limit = min(largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf, _LONGEST_RANGE_M)
+    # Codes for "no echo" are 7.9 m and more, and scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
+    limit = min(largest - 0.1 if largest >= 7.9 else np.inf, 1e6)
     ends = [
         np.where((scan.ranges > 0) & (scan.ranges < limit), scan.ranges, np.nan)[:, None]
         * np.column_stack([np.cos(scan.angles), np.sin(scan.angles)])
@@ -88,7 +78,7 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
         # The second pose is that of the robot, on which the laser is fixed somewhere.
         mounting = np.median(se2.relative(odometry, poses), axis=0)
         odometry = np.asarray(se2.compose(odometry, np.broadcast_to(mounting, odometry.shape)))
-    are_equal = bool(np.abs(poses - odometry).max() < _SAME_POSE)
+    are_equal = bool(np.abs(poses - odometry).max() < 1e-4)
     # NEFF lines are those of the SLAM program GMapping.
     is_raw = (are_equal and is_newer) or _is_at_wheels([words for _, words in lines["ODOM"]], poses, times)
     reference = None if is_raw and not lines["NEFF"] else poses
@@ -149,7 +139,8 @@ def _is_at_wheels(lines: list[list[str]], poses: FloatArray, times: FloatArray) 
     ordered = wheels[np.argsort(wheels[:, 0], kind="stable")]
     after = np.searchsorted(ordered[:, 0], times)
     beside = ordered[np.clip([after - 1, after], 0, len(ordered) - 1), 1:]
-    return float(np.median(np.linalg.norm(beside - poses[:, :2], axis=-1).min(axis=0))) < _SAME_PLACE_M
+    # Poses of a log as recorded differ from those of its ODOM lines by the way from one such line to the next.
+    return float(np.median(np.linalg.norm(beside - poses[:, :2], axis=-1).min(axis=0))) < 0.5
 
 
 def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
@@ -173,7 +164,8 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     given = sequence.odometry_poses
     odometry = np.zeros((len(rows), 3)) if given is None else given
     by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
-    is_moved = np.isin(rows, late[by_time < _SHORTER_WAY * by_row])
+    # A line is moved to the position of its time stamp if that halves the detour of its odometry.
+    is_moved = np.isin(rows, late[by_time < 0.5 * by_row])
     if len(late):
         message = "%s: %d of %d lines are of another moment; %d are moved to their time, the others are interpolated"
         _log.warning(message, path, len(late), len(times), is_moved.sum())
@@ -182,7 +174,8 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
     if given is not None:
         # Lines that join lines in order by usual steps alone have the odometry of their place.
         lengths = _step_lengths(odometry[:-1], odometry[1:])
-        piece = np.concatenate([[0], np.cumsum(lengths > _USUAL_STEP * np.median(lengths))])
+        # Steps of up to four times the median are no jumps.
+        piece = np.concatenate([[0], np.cumsum(lengths > 4.0 * np.median(lengths))])
         is_right = is_known | np.isin(piece, piece[ordered])
         heading = np.unwrap(odometry[ordered, 2])
         columns = (*odometry[ordered, :2].T, heading)

@@ -21,8 +21,6 @@ _PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int":
 _PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 _PCD_ENCODINGS = ("ascii", "binary", "binary_compressed")
-_PADDING = "_"  # the Point Cloud Library's name of a field without values
-_MOST_EXPANSION = 88  # three bytes of LZF unpack to up to 264
 _DAMAGED = (KeyError, ValueError, IndexError, TypeError, ArithmeticError, StopIteration)
 
 
@@ -125,7 +123,8 @@ def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDA
     # The Point Cloud Library counts some padding as 0; the places of the fields behind it are unknown.
     fields = [header.record[i] for i in range(len(header.names))]
     known = next((i for i, field in enumerate(fields) if field.itemsize == 0), len(fields))
-    kept = [i for i in range(known) if header.names[i] != _PADDING]
+    # The Point Cloud Library calls padding "_".
+    kept = [i for i in range(known) if header.names[i] != "_"]
     if header.encoding == "ascii":
         return _read_text(content, header, kept, source)
     body, sizes = content[header.size :], [header.num_points * field.itemsize for field in fields]
@@ -177,7 +176,8 @@ def unpack_lzf(packed: bytes, size: int) -> bytes:
         ValueError: the block is damaged, or holds another number of bytes.
         IndexError: the block ends within a copy.
     """
-    if size > _MOST_EXPANSION * len(packed):
+    # Three bytes of LZF unpack to up to 264.
+    if size > 88 * len(packed):
         raise ValueError(f"{len(packed)} bytes cannot unpack to {size}")
     out, at = bytearray(), 0
     while at < len(packed):

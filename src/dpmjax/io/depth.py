@@ -26,7 +26,6 @@ from dpmjax.io.poses import check_poses
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, homogeneous, require
 
 _log = logging.getLogger(__name__)
-_NOTHING_MM = 65535  # besides 0
 _MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
 
 
@@ -127,7 +126,8 @@ def _read_clouds(
         is_good = depth_mm.shape == (camera.height, camera.width) and np.greater_equal(depth_mm.shape, shape).all()
         advice = "give images of the camera's size, not smaller than a cloud"
         require(is_good, image, f"{depth_mm.shape} pixels, the camera has {camera.height, camera.width}", advice)
-        depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
+        # Some cameras write the largest number for nothing.
+        depth_m = np.where(depth_mm == 65535, 0, depth_mm) / 1000.0
         depths.append(float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0)
         clouds.append(depth_m[np.ix_(rows, columns)])
     depth = np.stack(clouds)

@@ -25,11 +25,6 @@ DRIVES = (
     "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
 )
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
-_EARTH_RADIUS_M = 6378137.0
-# MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
-_MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
-_MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
-_MULRAN_SLACK_S = 0.5
 
 
 class SideData(NamedTuple):
@@ -206,9 +201,10 @@ def _read_mulran(folder: Path, files: list[Path]) -> SideData:
     rows = read_table(path, 13)  # stamp and pose
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
-    R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
-    poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    return _interpolate(times, times, StampedPoses(poses, pose_times), path, slack=_MULRAN_SLACK_S)
+    # The published calibration: the Ouster in the car's frame.
+    R_car_lidar = Rotation.from_euler("xyz", (0.0001, 0.0003, 179.6654), degrees=True).as_matrix()
+    poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array((1.7042, -0.021, 1.8047)))
+    return _interpolate(times, times, StampedPoses(poses, pose_times), path, slack=0.5)
 
 
 def _interpolate(
@@ -264,7 +260,8 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     found = "records that are not finite, or beyond 89 degrees of latitude, 361 of longitude, or 1000 km of height"
     require(is_good, source, found, "copy them again")
     latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
-    scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    # The radius of the Earth, m.
+    scale = np.cos(latitude[0]) * 6378137.0
     east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
     rotations = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
     return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))

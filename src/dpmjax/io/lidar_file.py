@@ -33,22 +33,10 @@ _TO_CONVERT = {
 _NPZ_KEYS, _NPZ_TIMES = ("lidar_pcd", "points", "xyz", "arr_0"), "times"
 # Least range, usual range and largest range of lidars on the ground, m; nearly all points are within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
-_LEAST_USUAL_SHARE = 0.05
-# An array of fewer rows and more columns than this has the coordinates in its rows.
-_MOST_ROWS_OF_TRANSPOSE = 16
-# Points in map coordinates are nearer to their middle than to the origin by this factor.
-_MAP_RATIO = 5.0
 # LAZ packs a point of 20 bytes or more to 3, to less only where all points are alike; a record has 54 bytes or more.
-_MOST_POINTS_PER_BYTE, _RECORD_BYTES = 100, 54
 _COLUMN_COUNTS, _USUAL_COLUMNS, _NUSCENES_COLUMNS = (3, 4, 5, 6, 7, 8), 4, 5
 # NCLT packs a point to the 8 bytes of two float32: 5 mm from -100 m as uint16, intensity, and one of 32 lasers.
 _NCLT_COLUMNS, _NCLT_RECORD, _NCLT_LASERS = 2, np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]), 32
-# Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
-_MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
-# Mutual information of column and value: least value of the best layout, bits, and least ratio to the next layout.
-_LEAST_BITS, _LEAST_RATIO = 0.05, 1.3
-# Six and eight columns repeat the order of three and four, so their information must be larger by this ratio.
-_DOUBLED_RATIO = 1.1
 
 
 def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
@@ -149,7 +137,8 @@ def _read_arrays(path: Path) -> TimedCloud:
     values = next((table[key] for key in _NPZ_KEYS if key in table), np.zeros(0))
     found = f"an array of {values.shape} {values.dtype}" if values.size else "no array of points"
     is_good = values.ndim in (2, 3) and values.shape[-1] >= 3 and values.dtype.kind in "fiu"
-    is_good = is_good and not (values.ndim == 2 and len(values) < _MOST_ROWS_OF_TRANSPOSE < values.shape[1])
+    # An array of few rows and many columns has the coordinates in its rows.
+    is_good = is_good and not (values.ndim == 2 and len(values) < 16 < values.shape[1])
     advice = f"give points (n, 3), or organised (rows, columns, 3), in metres, as one of {', '.join(_NPZ_KEYS)}"
     require(is_good, path, found, advice)
     points, times = values.reshape(-1, values.shape[-1])[:, :3], table.get(_NPZ_TIMES)
@@ -173,7 +162,7 @@ def _parse_las(content: bytes, source: str) -> TimedCloud:
     with refusing(source, found, advice, (Exception,)), np.errstate(all="ignore"):
         try:
             header_size, start, num_records = struct.unpack_from("<HII", content, 94)
-            if content[:4] != b"LASF" or not header_size + num_records * _RECORD_BYTES <= start <= len(content):
+            if content[:4] != b"LASF" or not header_size + num_records * 54 <= start <= len(content):
                 raise ValueError("no LAS header, or more records than bytes before the points")
             with laspy.open(io.BytesIO(content), **options) as reader:
                 _require_points(reader.header, content)
@@ -197,7 +186,8 @@ def _require_points(header: Any, content: bytes) -> None:
         (place,) = struct.unpack_from("<q", content, start)
         (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
         version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
-        is_good = count <= _MOST_POINTS_PER_BYTE * size and version == 0 and num_chunks <= size
+        # LAZ packs a point of 20 bytes or more to 3, to less only where all points are alike.
+        is_good = count <= 100 * size and version == 0 and num_chunks <= size
     if not is_good:
         raise ValueError(f"truncated: {count} points, {size} bytes are there")
 
@@ -249,7 +239,7 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
         The note, or None.
     """
     share = float((np.linalg.norm(points.astype(np.float64), axis=1) < _USUAL_M).mean()) if len(points) else 1.0
-    if share >= _LEAST_USUAL_SHARE:
+    if share >= 0.05:
         return None
     found = f"{100 * share:.1f} % of the points lie within {_USUAL_M:g} m"
     what = "coordinates of a map" if _is_far_place(points) else "millimetres or centimetres"
@@ -259,7 +249,8 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
 def _is_far_place(points: NDArray[Any]) -> bool:
     """Returns True for points around one place far from the origin."""
     middle = np.median(points, axis=0)
-    return bool(np.median(np.linalg.norm(points - middle, axis=1)) * _MAP_RATIO < np.linalg.norm(middle))
+    # Points in map coordinates are five times as near to their middle as to the origin.
+    return bool(np.median(np.linalg.norm(points - middle, axis=1)) * 5.0 < np.linalg.norm(middle))
 
 
 def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[int, Note | None]:
@@ -283,7 +274,8 @@ def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[
     """
     if given is None and _is_nclt(content):
         return _NCLT_COLUMNS, Note(f"{path}: points of 8 bytes, as of NCLT; y and z are turned, so that z is up")
-    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")[:_MOST_VALUES]
+    # Bins hold 50 values or more.
+    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")[:60_000]
     are_doubles = given is None and _are_doubles(values)
     require(not are_doubles, path, "the values are float64", "save them as float32, or the points as .npy")
     inferred = _columns_by_values(values)
@@ -348,7 +340,7 @@ def _are_doubles(values: NDArray[np.float32]) -> bool:
 
 def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     """Finds the layout of the largest mutual information of column and value; None where no layout stands out."""
-    num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(_COLUMN_COUNTS)))
+    num_bins = min(64, len(values) // (50 * max(_COLUMN_COUNTS)))
     if num_bins < 4:
         return None
     with np.errstate(invalid="ignore"):
@@ -356,9 +348,11 @@ def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
     bins = np.searchsorted(edges, finite, side="right")
     bits = {n: _information_bits(bins, n, len(edges) + 1) for n in _COLUMN_COUNTS}
-    layouts = [n for n in _COLUMN_COUNTS if n not in (6, 8) or bits[n] >= _DOUBLED_RATIO * bits[n // 2]]
+    # Six and eight columns repeat the order of three and four, so their information must be larger by this ratio.
+    layouts = [n for n in _COLUMN_COUNTS if n not in (6, 8) or bits[n] >= 1.1 * bits[n // 2]]
     best, second, *_ = sorted(layouts, key=lambda n: -bits[n])
-    return best if bits[best] >= max(_LEAST_BITS, _LEAST_RATIO * bits[second]) else None
+    # The best layout stands out by its bits, and by their ratio to the next one.
+    return best if bits[best] >= max(0.05, 1.3 * bits[second]) else None
 
 
 def _information_bits(bins: NDArray[np.int64], columns: int, num_bins: int) -> float:

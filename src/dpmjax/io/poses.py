@@ -21,7 +21,6 @@ _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), EuRoC (with its line of names), KITTI (12 numbers a row), or .npy of "
     "(n, 3), (n, 3, 3) or (n, 4, 4)"
 )
-_LARGEST_TILT_DEG = 10.0
 # Names of the columns of quaternions that begin with their real part, as of EuRoC: q_RS_w, q_RS_x or qw, qx.
 _IS_W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b", re.IGNORECASE)
 _W_FIRST_COLUMNS = [0, 1, 2, 3, 5, 6, 7, 4]
@@ -97,7 +96,7 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         return poses
     tilt = np.rad2deg(np.arccos(np.clip(poses[:, 2, 2], -1, 1)))
     found = f"pose {tilt.argmax()} is tilted by {tilt.max():.0f} degrees"
-    require(tilt.max() <= _LARGEST_TILT_DEG, path, found, "give poses of an upright sensor, z up (not of a camera)")
+    require(tilt.max() <= 10.0, path, found, "give poses of an upright sensor, z up (not of a camera)")
     return np.column_stack([poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
 
 

@@ -15,18 +15,12 @@ from dpmjax.io.poses import StampedPoses, interpolate_poses, read_poses
 from dpmjax.io.scan_names import last_numbers, stamps_in_names
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, counted, require
 
-# Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.
-_LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
 # Stamps since 1970 and steps of stamps from 0, of which these are the smallest, in nano-, micro- and milliseconds.
 _UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
 # Nanoseconds since 1970 are below this for three thousand years.
 _LARGEST_STAMP = 1e20
-# A lidar moves along its x axis, a camera along its z axis: least share of the squared distance, and least distance, m.
-_CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-# Largest height, roll and pitch of relations in the plane, metres and radians.
-_FLAT = 1e-3
 
 
 def match_rows(rows: NDArray[Any], files: Sequence[Path], path: Path) -> NDArray[Any]:
@@ -153,7 +147,8 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
     with np.errstate(over="ignore", invalid="ignore"):
         way_m, squares = float(np.linalg.norm(steps, axis=1).sum()), (steps**2).sum(axis=0)
         share = float(squares[2] / max(squares.sum(), 1e-30))
-    if not _CAMERA_WAY_M <= way_m < np.inf or not share >= _CAMERA_SHARE:
+    # A lidar moves along its x axis, a camera along its z axis.
+    if not 2.0 <= way_m < np.inf or not share >= 0.8:
         return None
     found = f"the poses move along their own z axis ({share:.0%} of the way), as a camera does, not a lidar"
     advice = "their rotations are off by 90 degrees; give poses of the lidar, or a calib.txt with Tr beside them"
@@ -215,7 +210,7 @@ def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[
     """Interpolates poses at the times of the scans, NaN where no pose is near; and returns the tolerance."""
     stamps, first = np.unique(stamps, return_index=True)
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    tolerance_s = max(min(0.5 * step, _LARGEST_TOLERANCE_S), _SMALLEST_TOLERANCE_S)
+    tolerance_s = max(min(0.5 * step, 0.1), 0.001)
     after = np.clip(np.searchsorted(stamps, times), 1, max(len(stamps) - 1, 1))
     nearest = np.minimum(np.abs(times - stamps[after - 1]), np.abs(times - stamps[np.minimum(after, len(stamps) - 1)]))
     # Times since 1970 in nanoseconds are good to 256 ns.
@@ -254,6 +249,6 @@ def read_relations(path: str | Path) -> Relations:
             that leave the plane.
     """
     table = read_table(path, 8)  # t1 t2 x y z roll pitch yaw: seconds, metres, radians
-    is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
+    is_flat = bool((np.abs(table[:, 4:7]) < 1e-3).all())
     require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")
     return Relations(table[:, 0], table[:, 1], table[:, [2, 3, 7]])

@@ -27,20 +27,10 @@ _CLOUDS = ("sensor_msgs/msg/PointCloud2", "livox_ros_driver/msg/CustomMsg", "liv
 _PLANAR_SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 _ODOMETRY, _TRANSFORMS = ("nav_msgs/msg/Odometry",), ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _SUFFIXES = (".bag", ".mcap", ".db3")
-# Advice for bags without scans of the wanted kind, by the types that they have.
-_OTHER_KINDS = {
-    "LaserScan": "planar scans are mapped by dpmjax map2d",
-    "PointCloud2 CustomMsg": "clouds are mapped by dpmjax slam",
-    "VelodyneScan PacketMsg VelodynePacket RslidarPacket UdpFrame HesaiScan PandarScan": (
-        "raw packets are not read: play them through the driver and record its PointCloud2"
-    ),
-}
 # sensor_msgs/PointField: the numbers of its data types.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Frames whose motion against the robot is the result of a mapping, not odometry.
 _MAP_FRAMES = ("map", "world", "earth")
-# A stamp that steps back further than this, s, comes from a clock that was set, not from messages out of order.
-_OVERTAKING_S = 1.0
 # Odometry may end this long before or after a scan, s, for this share of the scans at least.
 _SLACK_S, _LEAST_SHARE = 0.2, 0.9
 _KINDS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError)
@@ -123,11 +113,8 @@ class _Bag:
         found = f"no topic {topic}, it has {held}"
         require(topic is None or len(named) > 0, self.path, found, "name one of those with --topic")
         wanted = [name for name in named if self.topics[name][0] in kinds]
-        others = (
-            advice for others, advice in _OTHER_KINDS.items() if {types[name] for name in named} & {*others.split()}
-        )
         found = f"no {what}{'' if topic is None else f' in topic {topic}'}; its topics are {held}"
-        advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
+        advice = "dpmjax map2d reads LaserScan, dpmjax slam PointCloud2 and CustomMsg; raw packets need their driver"
         require(len(wanted) > 0, self.path, found, advice)
         fitting = [name for name in wanted if self.topics[name][1] > 0]
         found = f"the topic {', '.join(wanted)} has no message"
@@ -180,7 +167,8 @@ def _fault_of_stamps(stamps: FloatArray, path: Path) -> tuple[Note, ...]:
     back = np.diff(stamps, prepend=stamps[:1])
     if len(stamps) and stamps.min() <= 0:
         fault = "a header without a time"
-    elif len(stamps) and back.min() < -_OVERTAKING_S:
+    # A stamp that steps back by more than a second comes from a clock that was set, not from messages out of order.
+    elif len(stamps) and back.min() < -1.0:
         fault = f"the stamps step back by {-back.min():.3g} s at message {int(back.argmin())}"
     else:
         return ()

@@ -17,11 +17,8 @@ from dpmjax.sequences import FloatArray, Note, require
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
               "trajectory.npy", "gt_poses.txt", "groundtruth.txt", "groundtruth.csv", "poses.csv")  # fmt: skip
 _NUMBER = re.compile(r"\d+(?:\.\d+)?|\.\d+")
-# A number of that many digits is a time stamp: seconds since 1970, or a smaller unit.
-_STAMP_DIGITS = 10
 # Seconds since 1970 with nanoseconds as a number of their own.
 _SPLIT_STAMP = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})$")
-_LEAST_NUMBERED = 3
 
 
 def scan_files(folder: Path) -> list[Path]:
@@ -107,7 +104,7 @@ def strays_among(files: Sequence[Path]) -> list[Path]:
     """
     plain = [file for file in files if not re.search(r"\d", _stem_of(file))]
     num_numbered = len(files) - len(plain)
-    return plain if num_numbered >= max(_LEAST_NUMBERED, len(plain) + 1) else []
+    return plain if num_numbered >= max(3, len(plain) + 1) else []
 
 
 def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
@@ -123,7 +120,8 @@ def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
     """
     found = [_NUMBER.findall(_SPLIT_STAMP.sub(r"\1.\2", _stem_of(file))) for file in files]
     last = [numbers[-1] if numbers else "" for numbers in found]
-    if not last or not all("." in number or _STAMP_DIGITS <= len(number) < 20 for number in last):
+    # A number of ten digits is a time stamp: seconds since 1970, or a smaller unit.
+    if not last or not all("." in number or 10 <= len(number) < 20 for number in last):
         return None
     stamps = np.array(last, np.float64)
     return stamps if bool((np.diff(stamps) > 0).all()) else None

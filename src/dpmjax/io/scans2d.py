@@ -26,14 +26,11 @@ _PLAUSIBLE_RANGE = {"m": (0.05, 500.0), "px": (2.0, 20000.0)}
 # Few planar lidars measure farther; a sequence with hardly any shorter beam may be in millimetres.
 _USUAL_M, _LEAST_USUAL_SHARE = 100.0, 0.05
 # Least number of scans with beams at the largest range, and least share of scans that keep others.
-_LEAST_SCANS, _LEAST_OTHERS = 3, 0.5
 _KEYS = "points (n, b, 2), or ranges (n, b) and angles (b,); optional mask (n, b), times (n,), poses, odometry, unit"
 # Largest difference between the third coordinates of planar points.
-_LARGEST_HEIGHT = 1e-3
 _LARGEST_SPAN = 1.05 * 2.0 * np.pi  # Angles of one scan that span more are no radians.
 # The DeepMapping authors' files: coordinates of PCD files are pixels / 512, so that a picture of 2048 pixels has a
 # diagonal of 5.7. Poses are pixels and radians, in the variable `pose`.
-_PIXELS_PER_UNIT, _LARGEST_STORED, _LARGEST_LENGTH, _POSE_FILE = 512.0, 8.0, 1e7, "gt_pose.mat"
 _LEAST_BEAMS = 17  # Lines are fitted to up to 17 neighbouring beams.
 
 
@@ -106,7 +103,7 @@ def _without_maxima(sequence: ScanSequence, path: Path) -> ScanSequence:
     is_echo = np.linalg.norm(sequence.points.astype(np.float64), axis=2) < radius
     mask, is_blind = sequence.mask & is_echo, sequence.mask & ~is_echo
     # A sensor that hardly sees anything else stands in a round room.
-    if is_blind.any(axis=1).sum() < _LEAST_SCANS or mask.any(axis=1).mean() < _LEAST_OTHERS:
+    if is_blind.any(axis=1).sum() < 3 or mask.any(axis=1).mean() < 0.5:
         return sequence
     share = 100 * is_blind.sum() / sequence.mask.sum()
     found = f"{share:.1f} % of the beams lie at the largest range, from {radius:.4g} {sequence.unit} on: no echo"
@@ -179,7 +176,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
         points = _take_array(table, "points", (-1, -1, -1), path)
         require(points.shape[2] in (2, 3), path, f"points are {points.shape}", f"give {_KEYS}")
         heights = points[np.isfinite(points).all(axis=2) & points.any(axis=2)][:, 2:]
-        is_planar = not heights.size or float(np.ptp(heights)) <= _LARGEST_HEIGHT
+        is_planar = not heights.size or float(np.ptp(heights)) <= 1e-3
         found = "the third coordinates of the points differ"
         require(is_planar, path, found, "give planar scans, or 3-D scans to `dpmjax slam`")
         points = points[..., :2]
@@ -253,12 +250,13 @@ def read_deepmapping_folder(path: str | Path, *, unit: Unit | None = None) -> Sc
     points, mask = pad_scans(scans)
     largest = float(np.abs(points).max(initial=0.0))
     found = f"coordinates up to {largest:g}, too large for {unit or 'pixels / 512'}"
-    is_small = largest <= (_LARGEST_STORED if unit is None else _LARGEST_LENGTH)
+    is_small = largest <= (8.0 if unit is None else 1e7)
     require(is_small, path, found, "give pixels / 512, or name the unit m if they are metres")
     if unit != "m":
-        points *= np.float32(_PIXELS_PER_UNIT)
+        # Coordinates of the authors' files are pixels / 512; their poses are pixels.
+        points *= np.float32(512.0)
     reference = None
-    for name in [name for name in files if PurePosixPath(name).name == _POSE_FILE][:1]:
+    for name in [name for name in files if PurePosixPath(name).name == "gt_pose.mat"][:1]:
         pose = np.asarray(load_mat(files[name], f"{path}/{name}").get("pose", np.zeros(0)))
         reference = planar_rows(pose, len(names), f"{path}/{name}: pose")
     return ScanSequence(Path(path).stem, points, mask, unit or "px", reference)

@@ -15,8 +15,6 @@ from dpmjax.sequences import Relations
 from dpmjax.types import AnyArray
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-# Largest difference between the times of a scan and of a relation.
-_SAME_TIME_S = 0.005
 
 
 class SegmentError(NamedTuple):
@@ -112,7 +110,7 @@ def relation_errors(
     ends = (relations.times_from, relations.times_to)
     first, second = (order[np.searchsorted(middles, wanted)] for wanted in ends)
     off_s = [np.abs(times[rows] - wanted) for rows, wanted in zip((first, second), ends, strict=True)]
-    is_used = np.asarray(np.max(off_s, axis=0) <= _SAME_TIME_S)
+    is_used = np.asarray(np.max(off_s, axis=0) <= 0.005)
     if not is_used.any():
         raise ValueError("relations: expected times of the scans, no relation has both of its scans")
     found = se2.relative(poses[first], poses[second])[is_used]

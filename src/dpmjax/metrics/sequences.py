@@ -22,8 +22,6 @@ from dpmjax.sequences import DepthSequence, FloatArray, LidarSequence, ScanSeque
 _LEVER = 0.1
 # Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres.
 _MAX_LENGTH_RATIO, _MIN_WAY_M = 30.0, 1.0
-# Share of the error of the reference, below which the error of its inverse makes the reference doubtful.
-_INVERTED_SHARE = 0.2
 
 
 def planar_errors(sequence: ScanSequence, poses: FloatArray) -> dict[str, float]:
@@ -129,7 +127,7 @@ def reference_doubt(T_world_scan: FloatArray, sequence: LidarSequence) -> str | 
         return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
     references = reference, geometry.rigid.inverse(reference)
     given, inverted = (relative_pose_error(T, poses).translation_rmse for poses in references)
-    if inverted < _INVERTED_SHARE * given:
+    if inverted < 0.2 * given:
         errors = f"RPE {given:.3g} m; with each pose inverted it would be {inverted:.3g} m"
         return f"{errors}: does the reference map the world to the lidar, not the lidar to the world?"
     return None

@@ -13,7 +13,6 @@ from dpmjax.viz.figures import INK, WRONG, Edges, Layer, Panel, Points, Track, f
 
 # These colours and black differ in lightness too, so that they differ in grey.
 SOURCE, TARGET = "#3a86c0", "#f0a840"
-_APART_M = 5.0
 # Points farther out than this share of them do not set the distance of two scans side by side.
 _SHOWN_SHARE = 0.995
 # Most lines of matches of one kind; hundreds would hide the scans.
@@ -76,7 +75,7 @@ def matches_figure(
     )
     right, ((label, T),) = np.asarray(is_right, bool), pair.motions.items()
     end_of_a, start_of_b = (np.quantile(each[:, 0], q) for each, q in ((a, _SHOWN_SHARE), (b, 1 - _SHOWN_SHARE)))
-    apart = np.array([end_of_a - start_of_b + _APART_M, 0.0])
+    apart = np.array([end_of_a - start_of_b + 5.0, 0.0])
     lines = np.stack([starts, ends + apart], axis=1)
     layers: list[Layer] = [Points(a, SOURCE, pair.names[0]), Points(b + apart, TARGET, pair.names[1])]
     layers += [_match_lines(lines[right], "right", INK, "-"), _match_lines(lines[~right], "wrong", WRONG, "--")]

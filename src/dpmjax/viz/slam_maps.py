@@ -17,7 +17,6 @@ from dpmjax.viz.figures import INK, LOOP, PATH, POINTS, WRONG, Bar, Edges, Layer
 # Heights above the lidar that the colours of maps span.
 HEIGHTS_M = (-2.5, 5.5)
 # Length of an arrow as a share of the extent of the map.
-_ARROW_SHARE = 0.04
 _ROOF_M = 1.0
 
 
@@ -92,7 +91,7 @@ def localization_figure(
     T = np.asarray(T_map_scan, float).reshape(-1, 4, 4)
     wrong = np.zeros(len(T), bool) if is_wrong is None else np.asarray(is_wrong, bool)
     shown = np.concatenate([points, keyframes])
-    length_m = _ARROW_SHARE * float(np.ptp(np.quantile(shown[:, :2], [0.005, 0.995], axis=0), axis=0).max())
+    length_m = 0.04 * float(np.ptp(np.quantile(shown[:, :2], [0.005, 0.995], axis=0), axis=0).max())
     ends = np.stack([T[:, :3, 3], T[:, :3, 3] + length_m * T[:, :3, 0]], axis=1)
     # Crosses are wider than the marks of scans: a keyframe under a scan is visible.
     layers: list[Layer] = [Points(points, POINTS), Track(keyframes, INK, counted(len(keyframes), "keyframe"), "x", 7)]
