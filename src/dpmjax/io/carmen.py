@@ -225,7 +225,7 @@ def _carry_reference(sequence: ScanSequence, is_moved: BoolArray) -> ScanSequenc
 def _longest_ascending(values: FloatArray) -> NDArray[np.int64]:
     """Finds the indices of the longest subsequence that never falls (patience sorting)."""
     tails: list[float] = []
-    chains: list[tuple[int, Any]] = []
+    chains: list[Any] = []
     for index, value in enumerate(values.tolist()):
         pile = bisect.bisect_right(tails, value)
         tails[pile : pile + 1] = [value]

@@ -8,6 +8,7 @@ count a quarter there, and chi2 differs. In the plane chi2 is that of g2o. Quate
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -198,7 +199,7 @@ def write_g2o(path: str | Path, graph: PoseGraph | None) -> Path:
     rows, columns = np.triu_indices(graph.tangent_size)
     edges = graph.edges
 
-    def text(tag: str, ids: list[NDArray[np.integer]], values: FloatArray) -> list[str]:
+    def text(tag: str, ids: Sequence[NDArray[np.integer]], values: FloatArray) -> list[str]:
         ends = zip(*ids, strict=True)
         return [f"{tag} {' '.join(map(str, nodes))} " + " ".join(f"{x:.17g}" for x in row)
                 for nodes, row in zip(ends, values.tolist(), strict=True)]  # fmt: skip

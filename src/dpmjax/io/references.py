@@ -78,7 +78,7 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     Returns:
         (n,) s or None, and a note where times.txt does not fit.
     """
-    stamps, notes = stamps_in_names(files), ()
+    stamps, notes = stamps_in_names(files), tuple[Note, ...]()
     path = next((home / "times.txt" for home in homes if (home / "times.txt").is_file()), None)
     try:
         if path is not None:

@@ -171,7 +171,7 @@ def read_arrays(path: str | Path, *, unit: Unit | None = None) -> ScanSequence:
         InputError: the file is missing or damaged, lacks an array, has wrong shapes, or holds NaN or infinite values
             other than for invalid beams.
     """
-    table, notes = load_arrays(path), ()
+    table, notes = load_arrays(path), tuple[Note, ...]()
     if "points" in table:
         points = _take_array(table, "points", (-1, -1, -1), path)
         require(points.shape[2] in (2, 3), path, f"points are {points.shape}", f"give {_KEYS}")

@@ -99,7 +99,8 @@ def align_poses(
     """
     poses = checked_poses(T_estimated=T_estimated, T_reference=T_reference)
     arms = lever * np.concatenate([-np.eye(3), np.eye(3)])
-    return align_rigid(*(_transform(T, np.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses))
+    ends = (_transform(T, np.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses)
+    return np.asarray(align_rigid(*ends))
 
 
 def absolute_trajectory_error(

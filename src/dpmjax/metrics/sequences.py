@@ -85,7 +85,7 @@ def depth_errors(sequence: DepthSequence, T_world_camera: FloatArray) -> dict[st
     count = len(sequence)
     points, mask = sequence.points.reshape(count, -1, 3), sequence.mask.reshape(count, -1)
     lever = _LEVER * geometry.typical_range(points, mask)
-    aligned = np.asarray(align_poses(T_world_camera, reference, lever=lever)) @ T_world_camera
+    aligned = align_poses(T_world_camera, reference, lever=lever) @ T_world_camera
     off = np.einsum("nij,nbj->nbi", aligned[:, :3, :3] - reference[:, :3, :3], points)
     off += aligned[:, None, :3, 3] - reference[:, None, :3, 3]
     moved, true = (Rotation.from_matrix(T[:, :3, :3]) for T in (T_world_camera, reference))

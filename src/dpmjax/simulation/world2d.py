@@ -299,7 +299,7 @@ def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> 
 
     start = np.asarray(origins, np.float64).reshape(-1, 2)
     theta = np.asarray(angles, np.float64).reshape(-1)
-    is_inside = ((start >= 0) & (start < is_obstacle.shape[::-1])).all(axis=1)
+    is_inside = np.asarray(((start >= 0) & (start < is_obstacle.shape[::-1])).all(axis=1))
     cell = np.floor(np.where(is_inside[:, None], start, 0)).astype(np.int64)
     is_good = is_inside & ~is_obstacle[cell[:, 1], cell[:, 0]]
     if not is_good.all():
