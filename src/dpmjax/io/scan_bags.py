@@ -295,7 +295,7 @@ def _odometry(
     what, is_upside_down = f"odometry of the transforms to {frame}", bool(T_top_laser[2, 2] < 0)
     if len(topics) == 1 and not is_chain:
         what = f"odometry of {topics[0]}"
-        (moving,) = _motions(bag, topics, by_recording=by_recording).values()
+        *_, moving = _motions(bag, topics, by_recording=by_recording).values()
     elif moving is None or is_chain or moving.is_constant or moving.parent in _MAP_FRAMES:
         found = f"no odometry, of {len(topics)} topics ({', '.join(topics)}) and moving transforms to {frame}"
         notes = (Note(f"{bag.path}: {found}", is_doubt=True),) if topics or is_chain else ()
