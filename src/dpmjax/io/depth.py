@@ -92,7 +92,12 @@ def read_active_vision(
         raise ValueError(f"num_views: expected at least 2, got {num_views}")
     scene = Path(path)
     poses = _read_scene_poses(scene / "image_structs.mat")
-    links = _read_links(scene / "annotations.json")
+    path, kinds = scene / "annotations.json", (ValueError, AttributeError, RecursionError)
+    content = read_bytes(path)
+    with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
+        links = {
+            name: {kind: str(other) for kind, other in entry.items()} for name, entry in json.loads(content).items()
+        }
     depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
     known = sorted(name for name in poses if name in links and depth_of[name].is_file())
     found = "no image with links, pose and depth"
@@ -178,13 +183,6 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
             if R.shape == (3, 3) and t.shape == (3,) and np.isfinite(R).all() and np.isfinite(t).all():
                 poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
     return poses
-
-
-def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    content, kinds = read_bytes(path), (ValueError, AttributeError, RecursionError)
-    with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
-        links = json.loads(content)
-        return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
 
 
 def _read_colmap_camera(path: Path) -> Camera:

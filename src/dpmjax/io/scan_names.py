@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,7 +35,7 @@ def scan_files(folder: Path) -> list[Path]:
 
 
 def folder_note(folder: Path) -> Note | None:
-    """Names files that are not read, of rarer endings or such as map.pcd, and scans whose names are of several kinds.
+    """Names files that are not read, of rarer endings, or such as map.pcd.
 
     Args:
         folder: folder of the scans.
@@ -48,11 +47,6 @@ def folder_note(folder: Path) -> Note | None:
     strays, doubts = strays_among(most), []
     if strays:
         doubts.append(f"{strays[0].name} is no scan, as its name has no number; {len(strays)} such left out")
-    scans = [_NUMBER.sub("*", _stem_of(file)) for file in most if file not in strays]
-    kinds = [f"{count} {kind}" for kind, count in sorted(collections.Counter(scans).items()) if count > 1]
-    if len(kinds) > 1:
-        listed = ", ".join(kinds[:4])
-        doubts.append(f"names of {len(kinds)} kinds, {listed}; give each lidar, and each drive, its own folder")
     for suffix in SCAN_SUFFIXES:
         others = _files_of_one_ending(folder, (suffix,))
         if others and not {*others} & {*most}:

@@ -276,18 +276,17 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Any]:
     square: Any = {"marker": "s", "ms": 5, "ls": "none"}
     for panel in panels:
         if panel.reference is not None:
-            entries["reference"] = Line2D([], [], color=REFERENCE, lw=6)
-        clouds = [layer for layer in panel.layers if isinstance(layer, Points)]
+            entries["reference"] = {"color": REFERENCE, "lw": 6}
         for layer in panel.layers:
-            if layer.label and isinstance(layer, Points) and isinstance(layer.color, str):
-                entries[layer.label] = Line2D([], [], color=layer.color, **square)
-            elif layer.label and isinstance(layer, Track):
-                entries[layer.label] = Line2D([], [], **_style_of(layer))
-            elif layer.label and isinstance(layer, Edges) and len(layer.ends):
-                entries[layer.label] = Line2D([], [], color=layer.color, ls=layer.style, lw=1.0)
-        if len(clouds) > 1:
-            entries["points of two or more"] = Line2D([], [], color=INK, **square)
-    return entries
+            if isinstance(layer, Track):
+                entries[layer.label] = _style_of(layer)
+            elif isinstance(layer, Edges) and len(layer.ends):
+                entries[layer.label] = {"color": layer.color, "ls": layer.style, "lw": 1.0}
+            elif isinstance(layer, Points) and isinstance(layer.color, str):
+                entries[layer.label] = {"color": layer.color, **square}
+        if sum(isinstance(layer, Points) for layer in panel.layers) > 1:
+            entries["points of two or more"] = {"color": INK, **square}
+    return {label: Line2D([], [], **style) for label, style in entries.items() if label}
 
 
 def _style_of(track: Track) -> dict[str, Any]:
