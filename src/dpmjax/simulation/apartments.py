@@ -135,16 +135,7 @@ def _place_furniture(rng: np.random.Generator, size: tuple[float, float], doorwa
         yaw = np.pi / 2
     if np.linalg.norm(place - [wall_x, door_z]) < _DOOR_M + 0.3 and kind != "picture":
         return []
-    return _build_furniture(rng, kind, place, (width, depth, yaw))
-
-
-def _build_furniture(
-    rng: np.random.Generator, kind: str, place: FloatArray, footprint: tuple[float, float, float]
-) -> list[_Box]:
-    """Builds the boxes of a piece; the footprint is width, depth and yaw."""
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
-    width, depth, yaw = footprint
-    x, z = place
     if kind == "cupboard":
         height = rng.uniform(0.7, 2.1)
         parts = [(floor - height / 2, [width / 2, height / 2, depth / 2])]
@@ -159,7 +150,7 @@ def _build_furniture(
         parts = [(floor - 0.22, [width / 2, 0.22, depth / 2]), (floor - back / 2, [width / 2, back / 2, 0.05])]
     else:
         parts = [(floor - 0.74, [width / 2 + 0.2, 0.03, depth / 2 + 0.15]), (floor - 0.37, [0.1, 0.37, 0.1])]
-    return [([x, y, z], half, yaw) for y, half in parts]
+    return [([place[0], y, place[1]], half, yaw) for y, half in parts]
 
 
 @jax.jit
@@ -300,11 +291,9 @@ def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.rand
         neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
         reachable = [place for place in neighbours[inside] if is_free[tuple(place)]]
-        if config.steps == "one":
-            does_move = bool(reachable) and rng.random() < _MOVE_SHARE
-            does_turn = not does_move
-        else:
-            does_move, does_turn = bool(reachable) and rng.random() < _BOTH_SHARE, rng.random() < _BOTH_SHARE
+        share = _MOVE_SHARE if config.steps == "one" else _BOTH_SHARE
+        does_move = bool(reachable) and rng.random() < share
+        does_turn = not does_move if config.steps == "one" else rng.random() < share
         if does_move:
             at = reachable[rng.integers(len(reachable))]
         if does_turn:

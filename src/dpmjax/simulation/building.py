@@ -88,14 +88,11 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
             _furniture(into, rng, room, route, is_hall=config.kind == "hall")
     none, lanes = jnp.zeros(64), jnp.zeros(64, jnp.int32)
     nobody = RoadUsers(jnp.zeros((2, 64, 3)), jnp.ones(2), lanes, none, none, none, jnp.zeros((64, 3)), none > 0)
-    whole = TownPrimitives(*into.packed(), _floor(plan), nobody)
-    return Building(f"{config.kind}-{seed}", plan, route, whole)
-
-
-def _floor(plan: Plan) -> Ground:
     low = np.min([room.low for room in plan.rooms], axis=0) - 20.0
     heights = np.tile(plan.floor_at(low[0] + CELL_M * np.arange(256)), (256, 1))
-    return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
+    floor = Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
+    whole = TownPrimitives(*into.packed(), floor, nobody)
+    return Building(f"{config.kind}-{seed}", plan, route, whole)
 
 
 def _place(x: float, y: float, heading: float = 0.0) -> Place:
