@@ -113,7 +113,8 @@ def require_whole_files(sequence: LidarSequence, *, bin_columns: int | None = No
     files = [Path(source) for source in sequence.sources if source.lower().endswith(".bin")]
     columns = bin_columns or columns_of_drive(files)[0]
     for file in files:
-        check_size(file, file.stat().st_size if file.is_file() else 1, columns)
+        require(file.is_file(), file, "no such file", "copy it again")
+        check_size(file, file.stat().st_size, columns)
 
 
 def list_lidar_sequences(path: str | Path) -> list[str]:

@@ -207,16 +207,21 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
         InputError: see `read_lidar_file`.
     """
     points, times = cloud
+    # Three products are much faster than `numpy.linalg.norm`.
     with np.errstate(invalid="ignore"):
-        ranges = np.linalg.norm(points.astype(np.float64), axis=1)
-    is_kept = np.isfinite(ranges) & (ranges > 0)
-    kept, ranges = points[is_kept], ranges[is_kept]
+        x, y, z = points.astype(np.float64).T
+    squared = x * x + y * y + z * z
+    is_kept = np.isfinite(squared) & (squared > 0)
+    kept = points.take(np.flatnonzero(is_kept), axis=0)
     if not len(kept):
         why = f": all {len(points)} are zero or not finite" if len(points) else ""
         raise EmptyScanError(source, f"no point in the scan{why}", "remove the file, or copy it again")
-    median_m = float(np.median(ranges))
+    ranges = np.sqrt(squared[is_kept])
+    # A sample of the points suffices for medians.
+    some = slice(None, None, max(1, len(kept) // 4096))
+    median_m = float(np.median(ranges[some]))
     found, advice = f"the median range is {median_m:.4g} m", "convert millimetres or centimetres to metres"
-    if _is_far_place(kept.astype(np.float64)):
+    if _is_far_place(kept[some].astype(np.float64)):
         at = " ".join(f"{value:.0f}" for value in np.median(kept, axis=0))
         found = f"{found}, around one place far away: coordinates of a map, such as UTM"
         advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
