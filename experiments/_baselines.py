@@ -16,7 +16,7 @@ import itertools
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from dpmjax import ScanSet, estimate_normals
 from dpmjax.deepmapping import DeepMappingConfig, init, mapping_data, mapping_problem
 from dpmjax.geometry import rigid, se2, typical_range
+from dpmjax.metrics import align_rigid
 
 
 def optimize_directly(scans: ScanSet, config: DeepMappingConfig, *, num_iterations: int, key: jax.Array) -> np.ndarray:
@@ -57,51 +58,13 @@ def optimize_directly(scans: ScanSet, config: DeepMappingConfig, *, num_iteratio
     return np.asarray(solution[0], np.float64) * [unit, unit, 1.0]
 
 
-class Swarms(NamedTuple):
-    """Sizes of the swarms.
-
-    Attributes:
-        num_particles: relative poses that are tried at a time.
-        num_iterations: number of iterations of a swarm.
-        num_beams: beams of each scan that are compared.
-    """
-
-    num_particles: int = 32
-    num_iterations: int = 60
-    num_beams: int = 86
-
-
-SWARMS = Swarms()
-
-
-def _swarm(
-    misfit: Any, key: jax.Array, *, sizes: Swarms, num_unknowns: int
-) -> tuple[Float[Array, " u"], Float[Array, ""]]:
-    """Returns the best particle of one swarm in the box from -1 to 1, and its misfit."""
-    from evosax.algorithms import PSO
-
-    start_key, init_key, key = jax.random.split(key, 3)
-    algorithm = PSO(population_size=sizes.num_particles, solution=jnp.zeros(num_unknowns))
-    particles = jax.random.uniform(start_key, (sizes.num_particles, num_unknowns), minval=-1.0, maxval=1.0)
-    state = algorithm.init(init_key, particles, misfit(particles), algorithm.default_params)
-
-    def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
-        ask_key, tell_key = jax.random.split(key)
-        particles, state = algorithm.ask(ask_key, state, algorithm.default_params)
-        state, _ = algorithm.tell(tell_key, particles, misfit(particles), state, algorithm.default_params)
-        return state, None
-
-    state, _ = jax.lax.scan(iterate, state, jax.random.split(key, sizes.num_iterations))
-    return state.best_solution, state.best_fitness
-
-
+# Poses that a swarm tries at a time, iterations of a swarm, and beams of each scan that are compared.
+NUM_PARTICLES, NUM_ITERATIONS, NUM_BEAMS = 32, 60, 86
 # Particles over all poses start within this: one typical range along each axis, and half a turn.
-_POSE_SPREAD = (1.0, 1.0, np.pi)
+POSE_SPREAD = (1.0, 1.0, np.pi)
 
 
-def swarm_poses(
-    scans: ScanSet, config: DeepMappingConfig, sizes: Swarms = SWARMS, *, cpu_s: float, key: jax.Array
-) -> np.ndarray:
+def swarm_poses(scans: ScanSet, config: DeepMappingConfig, *, cpu_s: float, key: jax.Array) -> np.ndarray:
     """Returns poses by swarms over all poses at once on the Chamfer distance of the fit (DeepMapping section 4.1).
 
     As in the paper, rounds of fresh swarms follow each other until a time is used. Without evosax it ends in a
@@ -109,28 +72,43 @@ def swarm_poses(
 
     Args:
         scans: n scans in order of time.
-        config: settings; its first cold phase gives the loss, here of the whole set, with `sizes.num_beams` beams.
-        sizes: of the swarms.
+        config: settings; its first cold phase gives the loss, here of the whole set.
         cpu_s: process time of all rounds, without compilation; a round that has begun is finished.
         key: key of the swarms and of the pairs that are compared.
 
     Returns:
         (n, 3) T_world_scan, x, y, heading; the first one zero.
     """
+    from evosax.algorithms import PSO
+
     data, unit = mapping_data(scans)
-    whole = {"poses": "free", "scans_per_window": None, "occupancy_weight": 0.0, "beams_per_step": sizes.num_beams}
+    whole = {"poses": "free", "scans_per_window": None, "occupancy_weight": 0.0, "beams_per_step": NUM_BEAMS}
     phase = replace(config.cold_phases[0], **whole, scans_per_step=len(scans.points))
     problem = mapping_problem(replace(config, cold_phases=(phase,)), data)
     start, count = init(problem, data, key=key).params, len(scans.points) - 1
-    widths = jnp.array(_POSE_SPREAD)
+    widths = jnp.array(POSE_SPREAD)
 
     def misfit(particle: Float[Array, " u"]) -> Float[Array, ""]:
         poses = jnp.concatenate([jnp.zeros((1, 3)), particle.reshape(count, 3) * widths])
         return problem.loss(problem.config, phase, replace(start, poses=poses), data, jnp.asarray(0), key)[0]
 
+    algorithm = PSO(population_size=NUM_PARTICLES, solution=jnp.zeros(3 * count))
+    misfits = partial(jax.lax.map, misfit)
+
     @jax.jit
     def run_round(key: jax.Array) -> tuple[Array, Array]:
-        return _swarm(partial(jax.lax.map, misfit), key, sizes=sizes, num_unknowns=3 * count)
+        start_key, init_key, key = jax.random.split(key, 3)
+        particles = jax.random.uniform(start_key, (NUM_PARTICLES, 3 * count), minval=-1.0, maxval=1.0)
+        state = algorithm.init(init_key, particles, misfits(particles), algorithm.default_params)
+
+        def iterate(state: Any, key: jax.Array) -> tuple[Any, None]:
+            ask_key, tell_key = jax.random.split(key)
+            particles, state = algorithm.ask(ask_key, state, algorithm.default_params)
+            state, _ = algorithm.tell(tell_key, particles, misfits(particles), state, algorithm.default_params)
+            return state, None
+
+        state, _ = jax.lax.scan(iterate, state, jax.random.split(key, NUM_ITERATIONS))
+        return state.best_solution, state.best_fitness
 
     program = run_round.lower(key).compile()
     best, least, begun, number = jnp.zeros(3 * count), np.inf, time.process_time(), 0
@@ -139,10 +117,11 @@ def swarm_poses(
         if float(value) < least:
             best, least = particle, float(value)
         number += 1
-    poses = np.asarray(best, np.float64).reshape(count, 3) * np.array(_POSE_SPREAD) * [unit, unit, 1.0]
+    poses = np.asarray(best, np.float64).reshape(count, 3) * np.array(POSE_SPREAD) * [unit, unit, 1.0]
     return np.concatenate([np.zeros((1, 3)), poses])
 
 
+Floats = NDArray[np.float64]
 # Largest distances of matched points in the first round, and in the second round and the graph, in typical ranges of
 # the scans.
 _COARSE, _FINE = 0.09, 0.0225
@@ -193,12 +172,10 @@ def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> np.ndarra
     """
     import open3d
 
-    coarse, fine = _COARSE * unit, _FINE * unit
-    registration = open3d.pipelines.registration
-    estimation = registration.TransformationEstimationPointToPlane()
+    coarse, fine, registration = _COARSE * unit, _FINE * unit, open3d.pipelines.registration
+    graph, estimation = registration.PoseGraph(), registration.TransformationEstimationPointToPlane()
     if is_planar:  # planes of flat clouds leave three directions open
         estimation = registration.TransformationEstimationPointToPoint()
-    graph = registration.PoseGraph()
 
     def add_edge(source: int, target: int, T: np.ndarray, *, is_doubtful: bool) -> np.ndarray:
         """Adds the motion of a pair with its information, matched from a first guess; returns the motion."""
@@ -219,15 +196,11 @@ def _registered(clouds: list[Any], unit: float, *, is_planar: bool) -> np.ndarra
     apart = np.linalg.norm(placed[:, None, :3, 3] - placed[None, :, :3, 3], axis=-1)
     for source, target in np.argwhere(np.triu(apart < _RADIUS * unit, k=2)).tolist():
         add_edge(source, target, rigid.inverse(placed[target]) @ placed[source], is_doubtful=True)
+    solver = registration.GlobalOptimizationLevenbergMarquardt()
+    limits = registration.GlobalOptimizationConvergenceCriteria()
+    option = registration.GlobalOptimizationOption(fine, _PRUNE, reference_node=0)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        registration.global_optimization(
-            graph,
-            registration.GlobalOptimizationLevenbergMarquardt(),
-            registration.GlobalOptimizationConvergenceCriteria(),
-            registration.GlobalOptimizationOption(
-                max_correspondence_distance=fine, edge_prune_threshold=_PRUNE, reference_node=0
-            ),
-        )
+        registration.global_optimization(graph, solver, limits, option)
     return np.stack([node.pose for node in graph.nodes])
 
 
@@ -236,8 +209,6 @@ def _cloud(points: np.ndarray) -> Any:
 
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
 
-
-Floats = NDArray[np.float64]
 
 # Numbers of the published program: a step ends after this many iterations, or when the mean distance changes by less
 # than this share of the typical range; a normal is fitted to this many points.
@@ -285,20 +256,12 @@ def align(source: Floats, target: Floats, metric: Literal["point", "plane"], tol
         if abs(before - distance.mean()) < tolerance:
             break
         before = distance.mean()
-        step = (
-            _step_to_points(moved, target[nearest])
-            if normals is None
-            else _step_to_lines(moved, target[nearest], normals[nearest])
-        )
+        if normals is None:
+            step = se2.from_matrix(align_rigid(moved, target[nearest]))
+        else:
+            step = _step_to_lines(moved, target[nearest], normals[nearest])
         pose = se2.compose(step, pose)
     return pose
-
-
-def _step_to_points(source: Floats, matched: Floats) -> Floats:
-    """Returns the motion of the least sum of squared distances between points (closed form)."""
-    a, b = source - source.mean(axis=0), matched - matched.mean(axis=0)
-    heading = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    return np.append(matched.mean(axis=0) - se2.rotation(heading) @ source.mean(axis=0), heading)
 
 
 def _step_to_lines(source: Floats, matched: Floats, normals: Floats) -> Floats:

@@ -21,7 +21,6 @@ from experiments._baselines import chain_icp, multiway, optimize_directly, swarm
 
 Candidates = dict[str, np.ndarray]
 
-_LBFGS_ITERATIONS = 150
 # Process time of the fast preset from zero poses, seconds a scan (deepmapping_suite_zero.json), as of the swarms.
 _FIT_CPU_S = 0.13
 
@@ -89,7 +88,7 @@ def fit(task: Task, start: np.ndarray | None, config: dm.DeepMappingConfig | Non
 
 def optimize_by_lbfgs(task: Task) -> np.ndarray:
     """Returns poses by DeepMapping's loss without L-Net, from zero poses by L-BFGS."""
-    num_iterations = _LBFGS_ITERATIONS if task.steps is None else max(1, task.steps // 4)
+    num_iterations = 150 if task.steps is None else max(1, task.steps // 4)
     return optimize_directly(task.scans, dm.preset("fast"), num_iterations=num_iterations, key=task.key)
 
 
@@ -105,18 +104,18 @@ def optimize_by_adam(task: Task, *, has_windows: bool) -> np.ndarray:
     return fit(task, None, config)
 
 
-def fit_from_icp(task: Task) -> Candidates:
-    """Returns incremental ICP, and DeepMapping from it by the phases of a cold start, L-Net's among them."""
-    start, config = align_incrementally(task), dm.preset("fast")
-    fitted = fit(task, start, replace(config, warm_phases=config.cold_phases))
-    return {START_NAMES["icp-plane"]: start, DEEPMAPPING: fitted}
-
-
 def find_by_swarms(task: Task) -> np.ndarray:
     """Returns poses by swarms over all poses, in the time of the fast preset or of a part of its steps."""
     config = dm.preset("fast")
     share = 1.0 if task.steps is None else task.steps / sum(phase.num_steps for phase in config.cold_phases)
     return swarm_poses(task.scans, config, cpu_s=_FIT_CPU_S * share * len(task.sequence), key=task.key)
+
+
+def fit_from_icp(task: Task) -> Candidates:
+    """Returns incremental ICP, and DeepMapping from it by the phases of a cold start, L-Net's among them."""
+    start, config = align_incrementally(task), dm.preset("fast")
+    fitted = fit(task, start, replace(config, warm_phases=config.cold_phases))
+    return {START_NAMES["icp-plane"]: start, DEEPMAPPING: fitted}
 
 
 def fit_from_search(task: Task) -> Candidates:
@@ -126,8 +125,18 @@ def fit_from_search(task: Task) -> Candidates:
 
 
 def fit_from_refined(task: Task) -> Candidates:
-    """Returns the better of refined ICP and refined global registration, DeepMapping from it, and that refined."""
-    name, start = _best_start(task)
+    """Returns refined ICP or refined global registration, DeepMapping from it, and that refined.
+
+    ICP is taken if it can be trusted, else of both the one of the stronger weakest connection. Between two different
+    maps the sharper one may be wrong, so the code length does not decide here.
+    """
+    starts: list[tuple[registration2d.Assessment, str, np.ndarray]] = []
+    for name, find in (("icp-plane", align_incrementally), ("global", search)):
+        if (name == "global" or task.is_ordered) and not (starts and starts[0][0].is_trusted):
+            poses = refine(task, find(task))
+            assessment = registration2d.assess_trajectory(task.planar, poses)
+            starts.append((assessment, f"{START_NAMES[name]}, refined", poses))
+    _, name, start = max(starts, key=lambda one: one[0].weakest_connection)
     fitted = fit(task, start)
     return {name: start, DEEPMAPPING: fitted, f"{DEEPMAPPING}, refined": refine(task, fitted)}
 
@@ -137,21 +146,6 @@ def find_all_candidates(task: Task) -> Candidates:
     found = {START_NAMES["icp-plane"]: align_incrementally(task)} if task.is_ordered else {}
     found |= fit_from_search(task)
     return found | {f"{name}, refined": refine(task, poses) for name, poses in found.items()}
-
-
-def _best_start(task: Task) -> tuple[str, np.ndarray]:
-    """Returns refined ICP if trusted; else of it and refined global registration the more strongly connected one."""
-
-    def assessed(name: str, poses: np.ndarray) -> tuple[registration2d.Assessment, str, np.ndarray]:
-        return registration2d.assess_trajectory(task.planar, poses), f"{name}, refined", poses
-
-    starts = []
-    if task.is_ordered:
-        starts.append(assessed(START_NAMES["icp-plane"], refine(task, align_incrementally(task))))
-    if not starts or not starts[0][0].is_trusted:
-        starts.append(assessed(START_NAMES["global"], refine(task, search(task))))
-    # Between two different maps the sharper one may be wrong, so the code length does not decide here.
-    return max(starts, key=lambda start: start[0].weakest_connection)[1:]
 
 
 METHODS: dict[str, Callable[[Task], Candidates | np.ndarray]] = {

@@ -6,8 +6,8 @@ its documentation, and half as large indoors. None of them corrects scans for th
 either.
 
 A program takes the scans in order by `step`, (n, 3) float64, not empty. `finish` returns (n, 4, 4) poses of all scans,
-and the loops. Then `map_bytes` returns the bytes of the map of the whole way, with floats of 4 bytes. It takes the
-scans again, because some programs drop far points on the way.
+and the loops. Then `map_bytes` returns the bytes of the map of the whole way, with floats of 4 bytes, or None. It takes
+the scans again, because KISS-ICP drops far points on the way.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ import numpy as np
 from dpmjax.geometry import rigid
 
 MAX_RANGE_M, INDOOR_MAX_RANGE_M = 60.0, 30.0
-# Three coordinates; with the six numbers of a covariance.
-POINT_BYTES, GAUSSIAN_BYTES = 12, 36
-_UNLIMITED_M, _UNLIMITED_SCANS = 1e9, 10**9
+# Three coordinates, and a range that drops no point of a map.
+POINT_BYTES, UNLIMITED_M = 12, 1e9
 
 
 class FoundLoop(NamedTuple):
@@ -40,29 +39,40 @@ class FoundLoop(NamedTuple):
     T_older_newer: np.ndarray
 
 
-class KissIcp:
+class _Odometry:
+    """Poses of a program without loops."""
+
+    def __init__(self) -> None:
+        self._poses = list[np.ndarray]()
+
+    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
+        return np.array(self._poses), []
+
+    def map_bytes(self, scans: Iterable[np.ndarray]) -> int | None:
+        return None
+
+
+class KissIcp(_Odometry):
     """KISS-ICP (Vizzo et al. 2023), with a voxel map of the whole way: the program itself drops far points."""
 
     def __init__(self, *, is_indoors: bool) -> None:
+        super().__init__()
         from kiss_icp.config import load_config
         from kiss_icp.kiss_icp import KissICP
 
         self._config = load_config(None)
         _set_range(self._config.data, self._config.mapping, is_indoors)
-        self._odometry, self._poses = KissICP(self._config), list[np.ndarray]()
+        self._odometry = KissICP(self._config)
 
     def step(self, points: np.ndarray) -> None:
         self._odometry.register_frame(points, np.zeros(0))
         self._poses.append(self._odometry.last_pose)
 
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        return np.array(self._poses), []
-
     def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
         from kiss_icp.mapping import VoxelHashMap
 
         mapping, odometry = self._config.mapping, self._odometry
-        whole = VoxelHashMap(mapping.voxel_size, _UNLIMITED_M, mapping.max_points_per_voxel)
+        whole = VoxelHashMap(mapping.voxel_size, UNLIMITED_M, mapping.max_points_per_voxel)
         for points, T in zip(scans, self._poses, strict=True):
             frame = odometry.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
             whole.add_points(odometry.voxelize(frame)[1] @ T[:3, :3].T + T[:3, 3])
@@ -103,18 +113,19 @@ class KissSlam:
         return POINT_BYTES * sum(len(cloud.point.positions) for cloud in clouds)
 
 
-class SmallGicp:
+class SmallGicp(_Odometry):
     """Odometry by small_gicp (Koide 2024): each scan onto its incremental Gaussian voxel map, from a steady motion."""
 
     def __init__(self, *, is_indoors: bool) -> None:
+        super().__init__()
         import small_gicp
 
         self._library, self._threads = small_gicp, os.cpu_count() or 1
-        self._point_m, self._voxel_m = (0.125, 0.5) if is_indoors else (0.25, 1.0)
-        self._map, self._poses = small_gicp.GaussianVoxelMap(self._voxel_m), list[np.ndarray]()
+        self._point_m = 0.125 if is_indoors else 0.25
+        self._map = small_gicp.GaussianVoxelMap(4 * self._point_m)
 
     def step(self, points: np.ndarray) -> None:
-        scan, T = self._thin(points), np.eye(4)
+        scan, T = self._library.preprocess_points(points, self._point_m, num_threads=self._threads)[0], np.eye(4)
         if self._poses:
             before, last = (self._poses * 2)[-2:]
             # The transpose would treble the rounding errors of the rotations at each scan.
@@ -122,19 +133,6 @@ class SmallGicp:
             T = self._library.align(self._map, scan, start, num_threads=self._threads).T_target_source
         self._map.insert(scan, T)
         self._poses.append(T)
-
-    def _thin(self, points: np.ndarray) -> Any:
-        return self._library.preprocess_points(points, self._point_m, num_threads=self._threads)[0]
-
-    def finish(self) -> tuple[np.ndarray, list[FoundLoop]]:
-        return np.array(self._poses), []
-
-    def map_bytes(self, scans: Iterable[np.ndarray]) -> int:
-        whole = self._library.GaussianVoxelMap(self._voxel_m)
-        whole.set_lru(horizon=_UNLIMITED_SCANS)
-        for points, T in zip(scans, self._poses, strict=True):
-            whole.insert(self._thin(points), T)
-        return GAUSSIAN_BYTES * int(whole.size())
 
 
 # The peers by name: the module that must be there, and the class.

@@ -25,13 +25,12 @@ from dpmjax.registration2d import DEEPMAPPING, START_NAMES
 
 ENDINGS = (".log", ".clf", ".log.gz", ".clf.gz", ".npz")
 RIGHT_M = 0.5
-# Columns of rows.csv that are numbers of the run; those of the table.
+# Numbers of a run in rows.csv and in the table.
 NUMBERS = (
     "num_scans", "num_registered", "ate_initial_m", "ate_m", "worst_scan_m", "relations_initial_m",
     "relations_initial_deg", "relations_m", "relations_deg", "ate_corrected_initial_m", "ate_corrected_m", "kept",
     "wall_s", "peak_rss_gb",
 )  # fmt: skip
-COLUMNS = (*NUMBERS[:11], "deepmapping_ate_m", "right", "trusted", "wall_s", "peak_rss_gb")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +77,10 @@ def main(options: LogOptions, run: cli.Run) -> cli.Row:
     if rows and not done:
         raise ValueError("every run was refused, for the reasons above")
     refused = [f"Refused: {row['log']} from {row['init']}." for row in rows if row["num_scans"] is None]
-    shares = cli.summarize(
-        [row | {"trust": "all"} for row in done], ("trust",), ("right_if_trusted", "trusted_if_right")
-    )
-    return cli.write_summary(run, cli.summarize(done, ("log", "init"), COLUMNS), cli.format_table(shares), *refused)
+    columns = ("trusted", "right", "right_if_trusted", "trusted_if_right")
+    shares = cli.format_table(cli.summarize([row | {"trust": "all"} for row in done], ("trust",), columns))
+    summary = [{name: row[name] for name in ("log", "init", *NUMBERS, *columns[:2])} for row in done]
+    return cli.write_summary(run, summary, shares, *refused)
 
 
 def list_logs(folder: Path) -> list[Path]:
@@ -123,8 +122,8 @@ def measure_run(folder: Path, log: Path, corrected: Path | None) -> cli.Row:
 
 def row_of(numbers: cli.Row) -> cli.Row:
     """Returns the row of a run; cells are None for what its log has no reference for, all of a run that was refused."""
-    worst_m, trusted = numbers.get("worst_scan_m"), numbers.get("assessment", {}).get("is_trusted")
-    right = None if worst_m is None else worst_m < RIGHT_M
+    assessment, worst_m = numbers.get("assessment", {}), numbers.get("worst_scan_m")
+    trusted, right = assessment.get("is_trusted"), None if worst_m is None else worst_m < RIGHT_M
     return {
         **{name: numbers.get(name) for name in NUMBERS},
         "deepmapping_ate_m": numbers.get("candidates", {}).get(DEEPMAPPING, {}).get("ate_m"),
@@ -132,7 +131,7 @@ def row_of(numbers: cli.Row) -> cli.Row:
         "right": right,
         "right_if_trusted": right if trusted else None,
         "trusted_if_right": trusted if right else None,
-        "uncertain_scans": " ".join(cli.spans_of(numbers.get("assessment", {}).get("uncertain_scans", ()))),
+        "uncertain_scans": " ".join(cli.spans_of(assessment.get("uncertain_scans", ()))),
     }
 
 

@@ -55,8 +55,13 @@ def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
     run.open()
     sequence = simulation.simulate_sequence(options.world, NUM_SCANS, seed=options.seed)
     grid, key = simulation.make_world(options.world).is_obstacle, jax.random.key(options.seed)
-    fitted, begun = fit(options, sequence), time.perf_counter()
-    scans = ScanSet(sequence.points, sequence.mask)
+    scans, start = ScanSet(sequence.points, sequence.mask), None
+    if options.init == "icp-plane":
+        start = registration2d.incremental_icp(
+            registration2d.planar_scans(sequence.points, sequence.mask), "plane"
+        ).poses
+    fitted = dm.fit_deepmapping(scans, dm.preset(options.preset), key=key, start=start)
+    begun = time.perf_counter()
     trained = jax.block_until_ready(dm.train_localization(fitted, scans, num_steps=NUM_STEPS, key=key))
     training_s, begun = time.perf_counter() - begun, time.perf_counter()
     truth = free_poses(grid, options)
@@ -65,41 +70,24 @@ def main(options: RelocalizeOptions, run: cli.Run) -> cli.Row:
     numbers["ate_of_fit_px"] = metrics.planar_errors(sequence, fitted.poses)["ate_px"]
     distance, nearest = KDTree(sequence.reference_poses[:, :2]).query(truth[:, :2])
     turned = np.column_stack([truth[:, :2], sequence.reference_poses[nearest, 2]])
-    network = fitted if can_localize_alone(fitted) else trained
+    is_one = all(phase.poses == "network" and phase.scans_per_window is None for phase in fitted.config.cold_phases)
+    # One L-Net has moved all scans from zero poses, or else the trained one is used.
+    network = fitted if is_one and not np.any(np.asarray(fitted.params.start)) else trained
     alone = localize_alone(network, scan_all(grid, turned, sequence))
-    mapped, names = is_mapped(truth, fitted, sequence), [f"{low} px or more from the scans" for low in (0, *BINS_PX)]
-    places = np.where(mapped, np.array(names)[np.digitize(distance, BINS_PX)], "not mapped")
+    names = np.array([f"{low} px or more from the scans" for low in (0, *BINS_PX)])
+    places, is_known = names[np.digitize(distance, BINS_PX)], found.is_known
     errors_px, _ = ours = errors_at(found.pose, truth, fitted, sequence)
     errors = {"L-Net and M-Net": ours, "L-Net alone, known heading": errors_at(alone, turned, fitted, sequence)}
     rows = [
         dict(zip(("method", "place", *COLUMNS), (method, place, px, deg, bool(px < RIGHT_PX), known), strict=True))
         for method, of_method in errors.items()
-        for place, known, px, deg in zip(places, found.is_known.tolist(), *of_method, strict=True)
+        for place, known, px, deg in sorted(
+            zip(places.tolist(), is_known.tolist(), *of_method, strict=True), key=lambda row: int(row[0].split()[0])
+        )
     ]
-    rows.sort(key=lambda row: (row["method"], [*names, "not mapped"].index(row["place"])))
-    np.savez(run / "places.npz", truth=truth, errors_px=errors_px, is_known=found.is_known, is_mapped=mapped)
-    numbers |= summarize_known(errors_px, found.is_known, mapped)
+    np.savez(run / "places.npz", truth=truth, errors_px=errors_px, is_known=is_known)
+    numbers["precision_of_known"] = float((errors_px[is_known] < RIGHT_PX).mean()) if is_known.any() else None
     return numbers | cli.write_summary(run, cli.summarize(rows, ("method", "place"), COLUMNS))
-
-
-def fit(options: RelocalizeOptions, sequence: ScanSequence) -> dm.Fitted:
-    """Fits the scans from incremental ICP, or from zero poses."""
-    start = None
-    if options.init == "icp-plane":
-        planar = registration2d.planar_scans(sequence.points, sequence.mask)
-        start = registration2d.incremental_icp(planar, "plane").poses
-    scans, key = ScanSet(sequence.points, sequence.mask), jax.random.key(options.seed)
-    return dm.fit_deepmapping(scans, dm.preset(options.preset), key=key, start=start)
-
-
-def summarize_known(errors_px: np.ndarray, is_known: np.ndarray, is_mapped: np.ndarray) -> cli.Row:
-    """Returns the median error of mapped places, and how right the answer is whether a scan is known."""
-    return {
-        "median_of_mapped_px": float(np.median(errors_px[is_mapped])),
-        "precision_of_known": float((errors_px[is_known] < RIGHT_PX).mean()) if is_known.any() else None,
-        "share_of_mapped_known": float(is_known[is_mapped].mean()),
-        "share_of_unmapped_known": float(is_known[~is_mapped].mean()),
-    }
 
 
 def free_poses(grid: np.ndarray, options: RelocalizeOptions) -> np.ndarray:
@@ -116,12 +104,6 @@ def scan_all(grid: np.ndarray, poses: np.ndarray, sequence: ScanSequence) -> Sca
     return ScanSet(*simulation.scan_world(grid, poses, num_beams=sequence.points.shape[1]))
 
 
-def can_localize_alone(fitted: dm.Fitted) -> bool:
-    """Returns True where one L-Net has moved all scans of the fit from zero poses."""
-    is_one = all(phase.poses == "network" and phase.scans_per_window is None for phase in fitted.config.cold_phases)
-    return is_one and not np.any(np.asarray(fitted.params.start))
-
-
 def localize_alone(fitted: dm.Fitted, scans: ScanSet) -> np.ndarray:
     """Returns the output of L-Net for each scan as its pose, in the world of the fit; no search, no M-Net."""
     parts = []
@@ -130,19 +112,6 @@ def localize_alone(fitted: dm.Fitted, scans: ScanSet) -> np.ndarray:
         found = dm.propose_poses(fitted.params.localization, part, num_turns=1, fit_config=fitted.config)
         parts.append(np.asarray(found[:, 0], np.float64))
     return np.concatenate(parts) * [fitted.unit, fitted.unit, 1.0]
-
-
-def is_mapped(truth: np.ndarray, fitted: dm.Fitted, sequence: ScanSequence) -> np.ndarray:
-    """Returns True for places of true poses that some beam of the fit's scans has passed."""
-    picture = dm.map_picture(fitted, sequence.points, sequence.mask)
-    T_fit_world = metrics.align_rigid(sequence.reference_poses[:, :2], fitted.poses[:, :2])
-    places = truth[:, :2] @ T_fit_world[:2, :2].T + T_fit_world[:2, 2]
-    x_min, x_max, y_min, y_max = picture.extent
-    height, width = picture.explored.shape
-    cells = np.floor((places - [x_min, y_min]) / [x_max - x_min, y_max - y_min] * [width, height]).astype(int)
-    is_inside = ((cells >= 0) & (cells < [width, height])).all(axis=1)
-    column, row = np.where(is_inside[:, None], cells, 0).T
-    return is_inside & picture.explored[row, column]
 
 
 def errors_at(

@@ -38,8 +38,8 @@ SUCCESS_M = 0.45
 RIGHT_SHARE, RIGHT_DEG, RIGHT_M = 0.1, 2.0, 0.1
 # Settings were chosen on apartments below 15; each hard walk has an apartment of its own.
 NUM_APARTMENTS, FIRST_HARD = 15, 1000
-# Images of a folder that are registered together.
-WINDOW = 8
+# Images of a folder that are registered together, and their distance from the next window.
+WINDOW, WINDOW_STEP = 8, 4
 ICP_POINTS = 800
 
 Scans = rgbd.DepthScans
@@ -60,9 +60,6 @@ class RgbdOptions(cli.RunOptions):
     """Number of walks."""
     methods: tuple[str, ...] = ("zero", "placed", "deepmapping", "deepmapping-cold", "direct")
     """Methods to compare; also icp and multiway (Open3D, extra `baselines`)."""
-
-    window_step: Annotated[int, arg(metavar="N"), cli.Bound(1)] = WINDOW // 2
-    """Windows of 8 images of a folder begin so many images apart."""
 
     def __post_init__(self) -> None:
         """Checks bounds and names."""
@@ -95,7 +92,7 @@ def num_walks(options: RgbdOptions) -> int:
     """Returns the number of walks; of a folder of images at most that of its windows."""
     if options.data is None or io.is_active_vision(options.data):
         return options.limit
-    return min(options.limit, max(1, (len(io.read_pose_folder(options.data)) - WINDOW) // options.window_step + 1))
+    return min(options.limit, max(1, (len(io.read_pose_folder(options.data)) - WINDOW) // WINDOW_STEP + 1))
 
 
 def read_walk(options: RgbdOptions, walk: int) -> io.DepthSequence:
@@ -110,7 +107,7 @@ def read_walk(options: RgbdOptions, walk: int) -> io.DepthSequence:
     sequence = io.read_pose_folder(options.data)
     if sequence.T_world_camera is None:
         raise ValueError(f"{options.data}: has no pose files, so nothing to compare to")
-    begin = walk * options.window_step
+    begin = walk * WINDOW_STEP
     return sequence.take(slice(begin, begin + WINDOW))
 
 

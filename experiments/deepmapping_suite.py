@@ -33,14 +33,12 @@ COLUMNS = ("success", "ate_px", "point_distance_px", "is_best", "seconds", "cpu_
 class SuiteOptions(cli.RunOptions):
     """Options of the suite."""
 
-    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "walks", "methods"})
+    may_change: ClassVar[frozenset[str]] = frozenset({"limit", "methods"})
 
     methods: tuple[str, ...] = tuple(name for name in METHODS if name not in PACKAGES)
     """Methods to compare; also multiway, swarm-poses and direct-lbfgs (extra `baselines`)."""
     limit: Annotated[int | None, arg(metavar="N"), cli.Bound(1)] = None
     """Only the first N trajectories; they go through worlds and lengths in turn."""
-    walks: tuple[int, ...] = ()
-    """Only the trajectories of these numbers: 0 to 49 of 128 poses, 100 to 124 of 256; without it, all."""
     stride: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 1
     """Use every Nth scan."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
@@ -54,9 +52,6 @@ class SuiteOptions(cli.RunOptions):
         """Checks bounds and names."""
         super().__post_init__()
         cli.check_names("--methods", self.methods, METHODS)
-        known = [entry["walk"] for entry in list_walks()]
-        if unknown := set(self.walks) - set(known):
-            raise ValueError(f"--walks: expected some of 0 to {NUM_SHORT - 1} and 100 to {max(known)}, got {unknown}")
 
 
 def list_walks() -> list[dict[str, int]]:
@@ -78,8 +73,8 @@ def main(options: SuiteOptions, run: cli.Run) -> cli.Row:
         task, bound_px = prepare(world, num_poses, walk)
         return run_method(method, task) | {"bound_px": bound_px}
 
-    walks = [entry for entry in list_walks() if not options.walks or entry["walk"] in options.walks][: options.limit]
-    rows = cli.fill_table(run, [{**walk, "method": name} for walk in walks for name in options.methods], work)
+    cases = [{**walk, "method": name} for walk in list_walks()[: options.limit] for name in options.methods]
+    rows = cli.fill_table(run, cases, work)
     columns = COLUMNS if options.range_noise_px == 0 else (*COLUMNS, "bound_px")
     return cli.write_summary(run, cli.summarize(rows, ("method",), columns))
 
@@ -108,8 +103,8 @@ def run_method(name: str, task: Task) -> cli.Row:
         kept, _ = registration2d.choose_trajectory(task.planar, candidates)
     seconds = {"seconds": time.perf_counter() - begun, "cpu_s": time.process_time() - begun_cpu}
     errors = {other: metrics.planar_errors(task.sequence, poses) for other, poses in candidates.items()}
-    least = min(numbers["ate_px"] for numbers in errors.values())
-    success = errors[kept]["ate_px"] < SUCCESS_PX
+    ates = {other: numbers["ate_px"] for other, numbers in errors.items()}
+    success = ates[kept] < SUCCESS_PX
     is_trusted = registration2d.assess_trajectory(task.planar, candidates[kept]).is_trusted
     return {
         **errors[kept],
@@ -119,8 +114,8 @@ def run_method(name: str, task: Task) -> cli.Row:
         "success_if_trusted": success if is_trusted else None,
         "kept": kept,
         # By no more than 0.1 px above the least ATE of the candidates.
-        "is_best": errors[kept]["ate_px"] <= least + 0.1,
-        "candidates": "; ".join(f"{other} {numbers['ate_px']:.4g} px" for other, numbers in errors.items()),
+        "is_best": ates[kept] <= min(ates.values()) + 0.1,
+        "candidates": "; ".join(f"{other} {ate:.4g} px" for other, ate in ates.items()),
     }
 
 

@@ -1,8 +1,7 @@
 """Calibrates a DeepPointMap model on towns that it was not trained on: its confidence, and its overlap probability.
 
     python -m experiments.dpm_calibrate results/train/latest/model.safetensors
-    python -m experiments.dpm_calibrate MODEL --check       on places that no fit has seen
-    python -m experiments.dpm_calibrate --evidence          weights of register
+    python -m experiments.dpm_calibrate --evidence                    weights of register
 
 Pairs of scans of held-out towns, overlapping and not, are registered. A logistic regression then predicts whether the
 motion is right within 2 m and 5 degrees. Its few features include the consensus support, the share of points that meet
@@ -16,18 +15,13 @@ The file model.safetensors is the model with all regressions. The file metrics.j
 calibration errors and the AUC of overlap. All are measured on places that were left out of the fits. The pictures
 reliability*.png show them. On drives of your own, `dpmjax train --stages overlap --weights MODEL` calibrates.
 
-With --check, the calibration of the model rates pairs of other ambiguous places. The file table.md has the shares of
-pairs that are right, sure (a confidence of 0.9 or more), and wrong though sure.
-
 With --evidence, all motions that `register` tries for pairs of simulated scenes are compared with the truth. A
 regression on `evidence_shares` predicts the right ones. The file metrics.json has the weights for
-`dpmjax.deeppointmap.EvidenceWeights`. The file table.md has, for each scene, the pairs whose right motion has the
-highest score, by a fit without this scene.
+`dpmjax.deeppointmap.EvidenceWeights`, and the shares of pairs whose right motion has the highest score.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from functools import lru_cache
@@ -51,16 +45,14 @@ BEAMS = {16: simulation.VLP16, 32: simulation.HDL32E, 64: simulation.OS1_64}
 NUM_SCANS, NUM_OTHER_SCANS = 36, 12
 TOWN_BANDS_M = ((2.0, 10.0), (10.0, 20.0), (dpm.FAR_M, np.inf))
 AMBIGUOUS_BANDS_M = ((1.0, 10.0), (10.0, 20.0), (dpm.FAR_M, np.inf))
-CHECKED_BANDS_M = ((1.0, 5.0), (5.0, 10.0), (10.0, 20.0), (dpm.FAR_M, np.inf))
 # Far from the seeds of the towns of training, also of its held-out one, and apart from each other.
-FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_CHECKED, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_200_000, 3_500_000
+FIRST_TOWN, FIRST_AMBIGUOUS, FIRST_OVERLAP_TOWN = 3_000_000, 3_100_000, 3_500_000
 FIRST_SCENE = 6_500_000
 TOWN_LENGTH_M, SCENE_LENGTH_M = 400.0, 200.0
 # The kinds of town, of which there are nine, and of ambiguous place take turns, so that each counts the same.
-NUM_TOWNS, NUM_AMBIGUOUS, NUM_CHECKED, NUM_OVERLAP_TOWNS = 9, 30, 15, 24
+NUM_TOWNS, NUM_AMBIGUOUS, NUM_OVERLAP_TOWNS = 9, 30, 24
 # Pairs of each band of a place, of each town of the overlap, and of each band of a scene.
-NUM_PAIRS, NUM_CHECKED_PAIRS, NUM_OVERLAP_PAIRS, NUM_SCENE_PAIRS = 30, 8, 96, 20
-SURE, NEAR_M = 0.9, 5.0
+NUM_PAIRS, NUM_OVERLAP_PAIRS, NUM_SCENE_PAIRS = 30, 96, 20
 # Whole scans, and scans thinned to 1,400 points within 30 m.
 SCENES = {
     False: "suburb HDL64E, campus OS1_64, canyon HDL64E, country HDL32E, wood OS1_64, car_park HDL32E, "
@@ -81,58 +73,44 @@ class CalibrateOptions(cli.RunOptions):
 
     model: Annotated[Positional[str], arg(metavar="NAME|FILE")] = "dpm_small"
     """The model: a .safetensors file, or the name of a shipped one."""
-    check: FlagCreatePairsOff[bool] = False
-    """Rate the calibration that the model has, on places that no fit has seen."""
     evidence: FlagCreatePairsOff[bool] = False
     """Fit the weights by which `register` scores motions."""
 
-    def __post_init__(self) -> None:
-        """Checks options that do not go together."""
-        super().__post_init__()
-        if self.check and self.evidence:
-            raise ValueError("--check and --evidence: give one of them")
-
 
 def main(options: CalibrateOptions, run: cli.Run) -> cli.Row:
-    """Registers and compares the pairs, fits, and writes the model; or checks it."""
+    """Registers and compares the pairs, fits, and writes the model."""
     model = load_model(options.model)
-    if options.check:
-        return check_calibration(options, run, model)
     run.open()
     if options.evidence:
         return fit_evidence(options, run, model)
-    kinds = itertools.cycle(kind for kind, _ in simulation.SceneMixture().kinds)
-    places = [{"place": FIRST_TOWN + number, "kind": next(kinds), "beams": 0} for number in range(NUM_TOWNS)]
-    places += list_ambiguous(FIRST_AMBIGUOUS, NUM_AMBIGUOUS)
-    pairs = measure_places(run, model, places, AMBIGUOUS_BANDS_M, NUM_PAIRS, options.seed)
-    matches = measure_towns(run, model, options.seed)
+    pairs, matches = measure_places(run, model, options.seed), measure_towns(run, model, options.seed)
     if run.is_stopped:
         return {"verdict": f"stopped after {len(pairs)} registrations and {len(matches)} matches: nothing is fitted"}
     calibration, numbers, held_out = dpm.fit_confidence(pairs)
     overlap, overlap_numbers, held_out["overlap"] = dpm.fit_overlap(matches)
-    numbers |= overlap_numbers
     note = f"Confidence calibrated on {NUM_TOWNS} towns and {NUM_AMBIGUOUS} ambiguous places, {len(pairs)} pairs; "
     note += f"overlap fitted on {NUM_OVERLAP_TOWNS} towns, {len(matches)} pairs"
     calibrated = model.replace(config=replace(model.config, calibration=calibration, overlap=overlap))
-    save_model(calibrated, run / MODEL, card=f"{card_of(options.model)} {note}.".strip())
+    card = read_card(Path(options.model)) if options.model.endswith(".safetensors") else options.model
+    save_model(calibrated, run / MODEL, card=f"{card} {note}.".strip())
     for kind, name in (("of_scans", ""), ("of_elements", "_clouds"), ("overlap", "_overlap")):
         labels = {"labels": ("overlap probability", "share of overlapping pairs")} if kind == "overlap" else {}
         figure = viz.reliability_figure(*held_out[kind], title=f"{kind}, places left out of the fit", **labels)
         viz.save_figure(figure, run / f"reliability{name}.png")
-    return {"model": options.model, **numbers, "verdict": note}
+    return {"model": options.model, **numbers, **overlap_numbers, "verdict": note}
 
 
-def card_of(model: str) -> str:
-    """Returns the description of a model file; the name of a shipped model."""
-    return read_card(Path(model)) if model.endswith(".safetensors") else model
-
-
-def list_ambiguous(first: int, num: int) -> list[cli.Row]:
-    """Returns ambiguous places: their kinds take turns, then lidars do."""
-    lidars = list(BEAMS)
-    return [
-        {"place": first + k, "kind": AMBIGUOUS[k % len(AMBIGUOUS)], "beams": lidars[k // len(AMBIGUOUS) % len(BEAMS)]}
-        for k in range(num)
+def list_places() -> list[cli.Row]:
+    """Returns towns of all kinds, and ambiguous places: their kinds take turns, then lidars do."""
+    kinds, lidars = [kind for kind, _ in simulation.SceneMixture().kinds], list(BEAMS)
+    towns = [{"place": FIRST_TOWN + k, "kind": kinds[k % len(kinds)], "beams": 0} for k in range(NUM_TOWNS)]
+    return towns + [
+        {
+            "place": FIRST_AMBIGUOUS + k,
+            "kind": AMBIGUOUS[k % len(AMBIGUOUS)],
+            "beams": lidars[k // len(AMBIGUOUS) % len(BEAMS)],
+        }
+        for k in range(NUM_AMBIGUOUS)
     ]
 
 
@@ -144,15 +122,13 @@ def open_place(place: int, kind: str, beams: int) -> LidarSequence:
     return simulation.simulate_drive(place, length_m=TOWN_LENGTH_M, kind=kind, sensor=BEAMS[beams], mixture=true_size)
 
 
-def measure_places(
-    run: cli.Run, model: dpm.Model, places: Sequence[cli.Row], bands_m: dpm.Bands, num_pairs: int, seed: int
-) -> list[cli.Row]:
+def measure_places(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
     """Registers pairs of each place and band of distances; a row for each pair, fewer where a place has fewer."""
 
     @lru_cache(maxsize=1)
     def read(place: int, kind: str, beams: int) -> list[dpm.ScanPair]:
-        bands = bands_m if kind in AMBIGUOUS else TOWN_BANDS_M
-        return list(dpm.draw_calibration_pairs(open_place(place, kind, beams), bands, num_pairs, seed))
+        bands = AMBIGUOUS_BANDS_M if kind in AMBIGUOUS else TOWN_BANDS_M
+        return list(dpm.draw_calibration_pairs(open_place(place, kind, beams), bands, NUM_PAIRS, seed))
 
     def work(place: int, kind: str, beams: int, pair: int) -> cli.Row:
         pairs = read(place, kind, beams)
@@ -161,7 +137,8 @@ def measure_places(
         row = dpm.measure_pair(model, pairs[pair])
         return row | {"is_end": kind in AMBIGUOUS and row["distance_m"] >= dpm.FAR_M}
 
-    cases = [{**place, "pair": number} for place in places for number in range(num_pairs * len(bands_m))]
+    numbers = range(NUM_PAIRS * len(TOWN_BANDS_M))
+    cases = [{**place, "pair": number} for place in list_places() for number in numbers]
     return [row for row in cli.fill_table(run, cases, work, "pairs.csv") if row["is_right"] is not None]
 
 
@@ -187,39 +164,6 @@ def measure_towns(run: cli.Run, model: dpm.Model, seed: int) -> list[cli.Row]:
     return cli.fill_table(run, cases, work, "overlap.csv")
 
 
-def check_calibration(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> cli.Row:
-    """Registers pairs of ambiguous places that no fit has seen, and rates them by the calibration of the model."""
-    if model.config.calibration is None:
-        raise ValueError(f"{options.model}: expected a calibrated model; run experiments.dpm_calibrate")
-    run.open()
-    places = list_ambiguous(FIRST_CHECKED, NUM_CHECKED)
-    pairs = measure_places(run, model, places, CHECKED_BANDS_M, NUM_CHECKED_PAIRS, options.seed)
-    rated = rate_pairs(model.config.calibration, pairs)
-    summary = cli.summarize(
-        [row | {"kind": kind} for row in rated for kind in (row["kind"], "all")],
-        ("match", "kind"),
-        ("right", "sure", "wrong_if_sure", "sure_and_right_if_near"),
-    )
-    numbers: cli.Row = {"model": options.model}
-    for match in ("scans", "clouds"):
-        found = [np.array([row[name] for row in rated if row["match"] == match]) for name in ("confidence", "right")]
-        numbers |= {f"brier_of_{match}": metrics.brier_score(*found)}
-        numbers |= {f"calibration_error_of_{match}": metrics.expected_calibration_error(*found)}
-    return numbers | cli.write_summary(run, summary)
-
-
-def rate_pairs(calibration: dpm.Calibration, pairs: Sequence[cli.Row]) -> list[cli.Row]:
-    """Returns a row for each pair matched as scans and as clouds: whether it is right, sure, and wrong though sure."""
-    rated = []
-    for row, match in itertools.product(pairs, ("scans", "clouds")):
-        confidence = dpm.rate_pair(calibration, row, of_clouds=match == "clouds")
-        right, sure = row["is_right" if match == "scans" else "is_right_of_clouds"], confidence >= SURE
-        answers = {"confidence": confidence, "right": right, "sure": sure, "wrong_if_sure": not right if sure else None}
-        near = sure and right if row["distance_m"] <= NEAR_M else None
-        rated.append({"match": match, "kind": row["kind"], **answers, "sure_and_right_if_near": near})
-    return rated
-
-
 def fit_evidence(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> cli.Row:
     """Compares the motions of pairs of simulated scenes with the truth, and fits `EvidenceWeights`.
 
@@ -229,9 +173,8 @@ def fit_evidence(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> c
         model: encoder and decoder.
 
     Returns:
-        The weights, and the table.
+        The weights, and shares of pairs whose motion of the highest score is right.
     """
-    scenes = [(*scene.split(), thinned) for thinned, some in SCENES.items() for scene in some.split(", ")]
 
     def work(scene: int, kind: str, sensor: str, thinned: bool) -> cli.Row | None:
         drive = simulation.simulate_drive(
@@ -247,6 +190,7 @@ def fit_evidence(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> c
         np.savez(run / f"scene_{scene}.npz", pair=pairs, shares=shares, is_right=is_right)
         return {"num_pairs": len(found), "num_motions": len(pairs)}
 
+    scenes = [(*scene.split(), thinned) for thinned, some in SCENES.items() for scene in some.split(", ")]
     cases = [
         {"scene": number, "kind": kind, "sensor": sensor, "thinned": thinned}
         for number, (kind, sensor, thinned) in enumerate(scenes)
@@ -254,18 +198,13 @@ def fit_evidence(options: CalibrateOptions, run: cli.Run, model: dpm.Model) -> c
     done = cli.fill_table(run, cases, work)
     if len(done) < len(cases):
         return {"verdict": f"stopped after {len(done)} of {len(cases)} scenes: nothing is fitted"}
-    evidence = [np.load(run / f"scene_{case['scene']}.npz") for case in cases]
+    evidence = [np.load(run / f"scene_{number}.npz") for number in range(len(cases))]
     shares, is_right = (np.concatenate([one[name] for one in evidence]) for name in ("shares", "is_right"))
-    number = np.concatenate([np.full(len(one["pair"]), row) for row, one in enumerate(evidence)])
-    present, table = np.array(astuple(dpm.EvidenceWeights())[1:]), []
-    for row, (case, one) in enumerate(zip(cases, evidence, strict=True)):
-        without, _ = dpm.fit_weights(shares[number != row], is_right[number != row])
-        chosen = {"by_the_present_weights": present, "by_a_fit_on_the_others": without}
-        rights = {name: share_right(one, weights) for name, weights in chosen.items()}
-        table.append(case | rights | {"any_right": share_right(one, None)})
     weights, bias = dpm.fit_weights(shares, is_right)
     fitted = dpm.EvidenceWeights(round(bias, 2), *np.round(weights, 2).tolist())
-    return {"evidence": asdict(fitted), **cli.write_summary(run, table), "verdict": str(fitted)}
+    compared = {"present": dpm.EvidenceWeights(), "fitted": fitted}
+    rights = {f"right_by_{name}": share_right(evidence, np.array(astuple(one)[1:])) for name, one in compared.items()}
+    return {"evidence": asdict(fitted), **rights, "verdict": str(fitted)}
 
 
 def draw_scene_pairs(drive: LidarSequence, kind: str, seed: int) -> list[np.ndarray]:
@@ -303,13 +242,11 @@ def measure_motions(
     return dpm.evidence_shares(*prepared, T, config), metrics.registration_recall(T, T_true).is_right
 
 
-def share_right(scene: Mapping[str, np.ndarray], weights: np.ndarray | None) -> float:
-    """Returns the share of pairs whose motion of the highest score is right; without weights, where any motion is."""
-    pairs = [scene["pair"] == pair for pair in np.unique(scene["pair"])]
-    if weights is None:
-        return float(np.mean([scene["is_right"][pair].any() for pair in pairs]))
-    scores = scene["shares"] @ weights
-    return float(np.mean([scene["is_right"][pair][np.argmax(scores[pair])] for pair in pairs]))
+def share_right(scenes: Sequence[Mapping[str, np.ndarray]], weights: np.ndarray) -> float:
+    """Returns the share of pairs whose motion of the highest score is right."""
+    pairs = [(scene, scene["pair"] == pair) for scene in scenes for pair in np.unique(scene["pair"])]
+    chosen = [scene["is_right"][rows][np.argmax(scene["shares"][rows] @ weights)] for scene, rows in pairs]
+    return float(np.mean(chosen))
 
 
 if __name__ == "__main__":

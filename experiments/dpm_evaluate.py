@@ -13,8 +13,7 @@ a scan. The scans themselves are not used again.
 
 The file rows.csv has every pair, overlap.csv the overlap probability of each drive. The file table.md has the shares of
 right registrations (95 % intervals) and the median errors of right ones. The file pooled.md has all recorded drives
-together, and names the methods that differ. The pictures reliability.png and failures.png are those of `dpmjax
-evaluate`.
+together, and names the methods that differ. The picture reliability.png is that of `dpmjax evaluate`.
 """
 
 from __future__ import annotations
@@ -33,8 +32,6 @@ from dpmjax import deeppointmap as dpm
 from dpmjax.metrics import mcnemar_p_value
 from dpmjax.scans import measure_scan
 
-# Overlap is cheap: more pairs, of each kind.
-OVERLAP_FACTOR = 4
 # KISS-Matcher's voxels, metres; indoors is where half of the points are nearer than INDOORS_M.
 VOXEL_M, INDOOR_VOXEL_M, INDOORS_M = 0.3, 0.2, 5.0
 # Real drives whose recall was watched during the training of `dpm_small`: they are no unseen data.
@@ -51,8 +48,6 @@ class PairOptions(cli.EvaluateOptions):
     """Also register descriptor clouds, refined by N surface elements a scan."""
     num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
     """Number of towns, where town is among the data."""
-    town_length_m: Annotated[float, arg(metavar="M"), cli.Bound(100)] = 400.0
-    """Length of the route of a town."""
 
 
 def main(options: PairOptions, run: cli.Run) -> cli.Row:
@@ -61,29 +56,23 @@ def main(options: PairOptions, run: cli.Run) -> cli.Row:
     low, high = model.config.num_descriptors, model.config.pyramid.stages[0].num_points
     if not all(low <= num <= high for num in options.clouds):
         raise ValueError(f"--clouds: expected from {low} to {high} elements a scan, got {options.clouds}")
-    towns = cli.evaluation_towns(options.num_towns, options.town_length_m)
-    drives = cli.open_evaluation_drives(options.data, towns)
-    pairs = cli.PairReader(drives, options.pairs, options.seed)
+    drives = cli.open_evaluation_drives(options.data, cli.evaluation_towns(options.num_towns))
     no_kiss = cli.why_not_importable("kiss_matcher")
     matchers: dict[str, cli.Matcher] = {"search": partial(search_alone, config=model.config.verification)}
     matchers |= {} if no_kiss else {"kiss": kiss_matcher}
     matchers |= {f"clouds_{num}": partial(match_clouds, model=model, num_elements=num) for num in options.clouds}
     run.open()
-    rows = cli.fill_pairs(run, model, pairs, matchers)
-    overlap = cli.fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
-    methods = (*cli.STAGES, *matchers)
-    shares = tuple(f"{name}_right" for name in methods)
-    others = (*(f"{name}_m" for name in methods), "pair_s", *(f"{name}_s" for name in matchers))
+    rows = cli.register_pairs(run, model, drives, options, matchers)
+    summary = cli.summarize_pairs(rows, cli.fill_overlap(run, model, drives, options), tuple(matchers))
     notes = () if no_kiss is None else (f"KISS-Matcher was not run: {no_kiss}.",)
-    summary = cli.summarize_pairs(rows, overlap, methods, (*shares, *others))
+    numbers = {"weights": options.weights, "kiss_matcher": no_kiss or "run"}
+    numbers |= cli.rate_confidence(run, model, rows, Path(options.weights).stem)
+    numbers |= cli.write_summary(run, summary, *notes)
     recorded = [drive.name for drive in drives if Path(drive.sources[0]).exists()]
     pooled = pool_drives(rows, recorded or [drive.name for drive in drives])
-    numbers = {"weights": options.weights, "kiss_matcher": no_kiss or "run", **cli.rate_confidence(model, rows)}
-    numbers |= cli.write_summary(run, summary, *notes)
+    shares = tuple(f"{name}_right" for name in (*cli.STAGES, *matchers))
     table = cli.summarize(pooled, ("drives", "band"), shares)
-    numbers |= cli.write_summary(run, table, *compare_methods(pooled, shares), name="pooled")
-    cli.draw_evaluation(run, model, pairs, rows, Path(options.weights).stem)
-    return numbers
+    return numbers | cli.write_summary(run, table, *compare_methods(pooled, shares), name="pooled")
 
 
 def kiss_matcher(source: np.ndarray, target: np.ndarray) -> np.ndarray:

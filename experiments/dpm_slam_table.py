@@ -26,8 +26,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -39,9 +39,13 @@ from dpmjax import Model, cli, io, load_map, load_model, metrics, save_map, simu
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from experiments._slam_peers import PEERS, FoundLoop
-from experiments._slam_settings import NETWORK, SETTINGS, WHOLE, make_setting
 
-AGENTS = "agents"
+WHOLE, NETWORK, PAPER, AGENTS = "whole", "network proposes every pose", "paper", "agents"
+PAPER_WIDE, WIDE_M = "paper, errors up to 2.5 m", 2.5
+NEAREST, NO_OFFSETS = "features of the nearest keyframe alone", ", without the offset head"
+# Our settings; "paper" is section 4 by its own method, with the published limits; "errors up to 2.5 m" suits the
+# shipped weights.
+SETTINGS = (WHOLE, NEAREST, PAPER, NETWORK, NETWORK + NO_OFFSETS, PAPER_WIDE, PAPER_WIDE + NO_OFFSETS)
 # Parts of a drive that is cut, and the share of its length by which a part is longer at each end.
 NUM_AGENTS, OVERLAP = 3, 0.05
 PRECISIONS = ("float32", "int8")
@@ -65,6 +69,7 @@ PLACE_COLUMNS = (
     "num_scans", "num_inside", "num_right", "num_wrong", "num_outside_right", "num_outside_wrong", "median_error_m",
     "map_mb", "scan_s",
 )  # fmt: skip
+Stop = Callable[[], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,39 +110,50 @@ def main(options: SlamTableOptions, run: cli.Run) -> cli.Row:
     run.open()
 
     def work(drive: str, method: str) -> cli.Row | None:
-        part, sequence = run.part("drives", drive.replace("/", "-"), method.replace(",", "")), drives[drive]
-        if method in PEERS:
-            row = map_by_peer(part, sequence, method)
-        elif method == AGENTS:
-            row = map_by_agents(part, sequence, slam.make_methods(model))
+        folder, sequence, stop = folder_of(run, drive, method), drives[drive], lambda: run.is_stopped
+        row: cli.Row | None
+        if method == AGENTS:
+            row = map_by_agents(folder, sequence, slam.make_methods(model))
+        elif method in PEERS:
+            row = map_by_peer(folder, sequence, stop, method)
         else:
-            row = map_by_setting(part, sequence, make_setting(model, method))
+            row = map_by_setting(folder, sequence, stop, make_setting(model, method))
         return None if row is None else dict.fromkeys((*COLUMNS, "version")) | row
 
-    rows = cli.fill_table(
-        run, [{"drive": name, "method": method} for name in drives for method in options.methods], work
-    )
+    cases = [{"drive": name, "method": method} for name in drives for method in options.methods]
+    rows = cli.fill_table(run, cases, work)
     numbers = {"weights": options.weights} | cli.write_summary(run, cli.summarize(rows, ("drive", "method"), COLUMNS))
-    if options.localize and not run.is_stopped:
-        numbers |= localize_all(options, run, drives, model)
-    return numbers
+    if not options.localize or run.is_stopped:
+        return numbers
+
+    def localize(drive: str, precision: Any) -> cli.Row:
+        return localize_scans(folder_of(run, drive, WHOLE), drives[drive], model, precision, options)
+
+    mapped = [row["drive"] for row in rows if row["method"] == WHOLE and row["map_mb"] and row["ate_m"] is not None]
+    places = [{"drive": name, "precision": precision} for name in mapped for precision in PRECISIONS]
+    found = cli.summarize(cli.fill_table(run, places, localize, "places.csv"), ("drive", "precision"), PLACE_COLUMNS)
+    return numbers | cli.write_summary(run, found, name="places")
 
 
-def localize_all(
-    options: SlamTableOptions, run: cli.Run, drives: dict[str, LidarSequence], model: Model
-) -> dict[str, Any]:
-    """Fills places.csv: scans of each drive with a reference that are looked for in the map of its first half."""
+def folder_of(run: cli.Run, drive: str, method: str) -> Path:
+    """Returns the folder of a method on a drive."""
+    return run / "drives" / drive.replace("/", "-") / method.replace(",", "")
 
-    def work(drive: str, precision: Any) -> cli.Row:
-        return localize_scans(
-            run / "drives" / drive.replace("/", "-") / WHOLE, drives[drive], model, precision, options
-        )
 
-    with_map = {row["drive"] for row in run.read_table("rows.csv") if row["method"] == WHOLE and row["map_mb"]}
-    known = [name for name, drive in drives.items() if name in with_map and drive.T_world_lidar is not None]
-    places = [{"drive": name, "precision": precision} for name in known for precision in PRECISIONS]
-    rows = cli.fill_table(run, places, work, "places.csv")
-    return cli.write_summary(run, cli.summarize(rows, ("drive", "precision"), PLACE_COLUMNS), name="places")
+def make_setting(model: Model, setting: str) -> slam.SlamMethods:
+    """Returns the methods of one of `SETTINGS`."""
+    if setting.endswith(NO_OFFSETS):
+        decoder = replace(model.config.decoder, predicts_offsets=False)
+        model = replace(model, config=replace(model.config, decoder=decoder))
+    config, setting = slam.SlamConfig(), setting.removesuffix(NO_OFFSETS)
+    if setting == NETWORK:
+        config = replace(config, odometry=replace(config.odometry, proposer="network"))
+    if setting == NEAREST:
+        config = replace(config, front_end=replace(config.front_end, num_submap=1))
+    if setting in (PAPER, PAPER_WIDE):
+        limits = slam.DescriptorConfig() if setting == PAPER else slam.DescriptorConfig(max_rmse_m=WIDE_M)
+        config = replace(slam.slam_preset("paper"), descriptors=limits)
+    return slam.make_methods(model, config)
 
 
 def open_drives(options: SlamTableOptions) -> list[LidarSequence]:
@@ -164,46 +180,36 @@ def simulate_town(number: int, length_m: float) -> LidarSequence:
     return simulation.simulate_scene(simulation.Scene(cli.FIRST_TOWN + number, town, driving, sensor))
 
 
-def map_by_setting(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods) -> cli.Row | None:
+def map_by_setting(folder: Path, drive: LidarSequence, stop: Stop, methods: slam.SlamMethods) -> cli.Row | None:
     """Maps a drive, or goes on from the state in the folder; None where a signal stops it."""
-    mapped, result = cli.map_drive(run, drive, methods)
+    mapped, result = cli.map_drive(folder, cli.ScanReader(drive), methods, stop)
     if len(mapped.reports) < len(drive):
         return None
-    files = [save_map(run / f"map_{one}.npz", result.map, one) for one in PRECISIONS] if len(result.map) else []
-    map_mb, map_int8_mb = [path.stat().st_size / 1e6 for path in files] or (None, None)
+    row = measure_trajectory(folder, drive, result.T_world_scan, found_loops(result.loops, result.keyframes))
     before = metrics.trajectory_errors(result.T_odometry_scan, drive.T_world_lidar)
-    return measure_trajectory(run, drive, result.T_world_scan, found_loops(result.loops, result.keyframes)) | {
-        "ate_before_loops_m": before.get("ate_m"),
-        "num_keyframes": len(result.keyframes),
-        "map_mb": map_mb,
-        "map_int8_mb": map_int8_mb,
-        **mean_seconds(mapped.scan_s),
-    }
+    row |= {"ate_before_loops_m": before.get("ate_m"), "num_keyframes": len(result.keyframes)}
+    for name, precision in (("map_mb", "float32"), ("map_int8_mb", "int8")) if len(result.map) else ():
+        row[name] = save_map(folder / f"map_{precision}.npz", result.map, precision).stat().st_size / 1e6
+    return row | mean_seconds(mapped.scan_s)
 
 
-def map_by_agents(run: cli.Run, drive: LidarSequence, methods: slam.SlamMethods) -> cli.Row | None:
+def map_by_agents(folder: Path, drive: LidarSequence, methods: slam.SlamMethods) -> cli.Row:
     """Lets agents map the parts of a drive, and joins their maps; the ATE is that in their one frame, if they met."""
-    parts, agents, scan_s = cut_drive(drive, NUM_AGENTS, OVERLAP), list[slam.SlamResult](), list[float]()
-    for number, part in enumerate(parts, start=1):
-        mapped, result = cli.map_drive(run.part(f"agent_{number}"), part, methods)
-        if len(mapped.reports) < len(part):
-            return None
-        agents.append(result)
-        scan_s += mapped.scan_s
-    found, starts = slam.join_agents(methods, agents), np.cumsum([0, *map(len, parts)])
+    parts = cut_drive(drive, NUM_AGENTS, OVERLAP)
+    found, starts = slam.run_agents(methods, parts), np.cumsum([0, *map(len, parts)])
     T_world_scan, num_maps = np.concatenate(found.T_world_scan), max(found.component) + 1
+    folder.mkdir(parents=True, exist_ok=True)
     for component in range(num_maps):
-        save_map(run / f"map_{component + 1}.npz", slam.take_component(found.joined, component))
-    cli.write_poses(run.path, T_world_scan, frame="T_world_lidar")
-    scans = np.concatenate([start + agent.keyframes for start, agent in zip(starts, agents, strict=False)])
+        save_map(folder / f"map_{component + 1}.npz", slam.take_component(found.joined, component))
+    cli.write_poses(folder, T_world_scan, frame="T_world_lidar")
+    scans = np.concatenate([start + agent.keyframes for start, agent in zip(starts, found.agents, strict=False)])
     loops = found_loops(found.joined.loops, scans)
     row: cli.Row = {"num_scans": len(T_world_scan), "num_loops": len(loops), "num_keyframes": len(scans)}
     if drive.T_world_lidar is not None:
         reference = np.concatenate([part.T_world_lidar for part in parts])
         errors = metrics.trajectory_errors(T_world_scan, reference) if num_maps == 1 else {}
         row |= {"ate_m": errors.get("ate_m"), "num_wrong_loops": int((~are_right(loops, reference)).sum())}
-    sent_mb = sum(traffic.keyframe_bytes for traffic in found.traffic) / 1e6
-    return row | {"num_maps": num_maps, "sent_mb": sent_mb, **mean_seconds(scan_s)}
+    return row | {"num_maps": num_maps, "sent_mb": sum(sent.keyframe_bytes for sent in found.traffic) / 1e6}
 
 
 def cut_drive(drive: LidarSequence, num_agents: int, overlap: float) -> list[LidarSequence]:
@@ -220,12 +226,12 @@ def cut_drive(drive: LidarSequence, num_agents: int, overlap: float) -> list[Lid
     return [drive.take(slice(start, end)) for start, end in zip(starts, ends, strict=True)]
 
 
-def map_by_peer(run: cli.Run, drive: LidarSequence, name: str) -> cli.Row | None:
+def map_by_peer(folder: Path, drive: LidarSequence, stop: Stop, name: str) -> cli.Row | None:
     """Runs another program; reading is not timed. A scan without points stays where the last one was."""
     peer = PEERS[name][1](is_indoors=is_indoors(drive))
     taken, scan_s = list[int](), list[float]()
     for number in tqdm(range(len(drive)), desc=f"{drive.name}, {name}", unit=" scans", dynamic_ncols=True):
-        if run.is_stopped:
+        if stop():
             return None
         points, begun = drive.read_points(number).astype(np.float64), time.perf_counter()
         if len(points):
@@ -240,11 +246,10 @@ def map_by_peer(run: cli.Run, drive: LidarSequence, name: str) -> cli.Row | None
     loops = [
         FoundLoop(tuple(numbers[list(one.newer)]), tuple(numbers[list(one.older)]), one.T_older_newer) for one in found
     ]
-    return measure_trajectory(run, drive, T_taken[rows], loops) | {
-        "map_mb": peer.map_bytes(drive.read_points(number).astype(np.float64) for number in taken) / 1e6,
-        **mean_seconds(scan_s),
-        "version": importlib.metadata.version(name),
-    }
+    map_bytes = peer.map_bytes(drive.read_points(number).astype(np.float64) for number in taken)
+    row = measure_trajectory(folder, drive, T_taken[rows], loops) | mean_seconds(scan_s)
+    map_mb = None if map_bytes is None else map_bytes / 1e6
+    return row | {"map_mb": map_mb, "version": importlib.metadata.version(name)}
 
 
 def is_indoors(drive: LidarSequence) -> bool:
@@ -262,18 +267,18 @@ def found_loops(loops: Sequence[slam.Loop], scans: np.ndarray) -> list[FoundLoop
     ]
 
 
-def measure_trajectory(run: cli.Run, drive: LidarSequence, T_world_scan: np.ndarray, loops: list[FoundLoop]) -> cli.Row:
+def measure_trajectory(folder: Path, drive: LidarSequence, T_world_scan: np.ndarray, loops: list[FoundLoop]) -> cli.Row:
     """Writes a trajectory; returns its errors, how many loops are wrong, and the recall of the right ones."""
-    cli.write_poses(run.path, T_world_scan, times=drive.times, frame="T_world_lidar")
+    folder.mkdir(parents=True, exist_ok=True)
+    cli.write_poses(folder, T_world_scan, times=drive.times, frame="T_world_lidar")
     reference, row = drive.T_world_lidar, {"num_scans": len(T_world_scan), "num_loops": len(loops)}
     if reference is None:
         return row | {"path_m": float(metrics.path_lengths(T_world_scan)[-1])}
     distance_m, min_path_m, reach_m = (2.0, 15.0, 3.0) if is_indoors(drive) else (5.0, 50.0, 10.0)
-    is_right = are_right(loops, reference)
+    is_right, errors = are_right(loops, reference), metrics.trajectory_errors(T_world_scan, reference)
     newer = np.reshape([loop.newer for loop in loops], (-1, 2)).astype(int)
     revisits = metrics.find_revisits(reference, distance_m=distance_m, min_path_m=min_path_m)
     recall = metrics.loop_recall(reference, newer[is_right], revisits, reach_m=reach_m)
-    errors = metrics.trajectory_errors(T_world_scan, reference)
     return row | {
         "path_m": float(metrics.path_lengths(reference)[-1]),
         "ate_m": errors.get("ate_m"),
@@ -294,9 +299,9 @@ def are_right(loops: Sequence[FoundLoop], T_world_scan: np.ndarray) -> np.ndarra
 
 def mean_seconds(scan_s: Sequence[float]) -> cli.Row:
     """Returns the mean seconds of a scan: of all, of the first tenth and of the last; none without scans."""
-    tenths = [float(part.mean()) for part in np.array_split(np.asarray(scan_s), 10) if len(part)]
-    if not tenths:
+    if not scan_s:
         return {}
+    tenths = [float(part.mean()) for part in np.array_split(np.asarray(scan_s), 10) if len(part)]
     return {"scan_s": float(np.mean(scan_s)), "scan_s_first_tenth": tenths[0], "scan_s_last_tenth": tenths[-1]}
 
 
@@ -308,7 +313,7 @@ def localize_scans(
     No scan is one of its keyframes. A scan is in the map where a keyframe of the first half is near; elsewhere the
     right answer is that it is not.
     """
-    whole, methods = load_map(folder / "map_float32.npz"), slam.make_methods(model)
+    whole = load_map(folder / "map_float32.npz")
     num_early = sum(keyframe.scan < len(drive) / 2 for keyframe in whole.keyframes)
     half = slam.take_keyframes(whole, range(max(num_early, 1)))
     path = save_map(folder / f"first_half_{precision}.npz", half, precision)
@@ -317,22 +322,36 @@ def localize_scans(
     rng = np.random.default_rng(options.seed)
     chosen = np.sort(rng.choice(others, min(options.localize, len(others)), replace=False))
     bar, begun = tqdm(chosen, desc=f"{drive.name}, {precision}", unit=" scans"), time.perf_counter()
-    found = list(slam.localize_each(methods, slam_map, (drive.read_points(int(number)) for number in bar)))
-    seconds, reference = time.perf_counter() - begun, drive.T_world_lidar
-    errors = cli.localization_errors(found, slam_map, reference[taken], reference[chosen])
-    is_wrong = errors.is_found & ~errors.is_right
-    is_inside = errors.keyframe_distance_m <= (3.0 if is_indoors(drive) else 10.0)
-    return {
-        "num_scans": len(found),
-        "num_inside": int(is_inside.sum()),
-        "num_right": int((is_inside & errors.is_right).sum()),
-        "num_wrong": int((is_inside & is_wrong).sum()),
-        "num_outside_right": int((~is_inside & errors.is_right).sum()),
-        "num_outside_wrong": int((~is_inside & is_wrong).sum()),
-        "median_error_m": float(np.median(errors.translation_m[errors.is_right])) if errors.is_right.any() else None,
-        "map_mb": path.stat().st_size / 1e6,
-        "scan_s": seconds / max(len(found), 1),
-    }
+    found = list(slam.localize_each(slam.make_methods(model), slam_map, (drive.read_points(int(row)) for row in bar)))
+    scan_s = (time.perf_counter() - begun) / max(len(found), 1)
+    T, row = drive.T_world_lidar, dict.fromkeys(PLACE_COLUMNS, 0) | {"num_scans": len(found)}
+    errors_m: list[float] = []
+    for one, T_scan in zip(found, T[chosen], strict=True):
+        apart_m = np.linalg.norm(T[taken, :3, 3] - T_scan[:3, 3], axis=1).min()
+        is_inside = apart_m <= (3.0 if is_indoors(drive) else 10.0)
+        row["num_inside"] += int(is_inside)
+        if one.is_in_map:
+            error_m = localization_error(one, slam_map, T[taken], T_scan)
+            errors_m += [] if error_m is None else [error_m]
+            row[f"num_{'' if is_inside else 'outside_'}{'wrong' if error_m is None else 'right'}"] += 1
+    median_m = float(np.median(errors_m)) if errors_m else None
+    return row | {"median_error_m": median_m, "map_mb": path.stat().st_size / 1e6, "scan_s": scan_s}
+
+
+def localization_error(
+    found: slam.Localization, slam_map: slam.KeyframeMap, T_keyframe: np.ndarray, T_scan: np.ndarray
+) -> float | None:
+    """Returns the error of a found scan in the frame of its keyframe, metres; None beyond 2 m and 5 degrees.
+
+    Args:
+        found: the result.
+        slam_map: the map.
+        T_keyframe: (k, 4, 4) reference poses of all keyframes.
+        T_scan: (4, 4) reference pose of the scan, in the same world.
+    """
+    T = rigid.inverse(slam_map.T_world_keyframe[found.keyframe]) @ found.T_world_scan
+    recall = metrics.registration_recall(T[None], (rigid.inverse(T_keyframe[found.keyframe]) @ T_scan)[None])
+    return float(recall.translation_errors_m[0]) if recall.is_right[0] else None
 
 
 if __name__ == "__main__":

@@ -122,9 +122,8 @@ def register_pair(model: deeppointmap.Model, pair: Pair) -> Answer:
     is_sure, T_true = float(found.confidence) >= SURE, pair.T_target_source
     if T_true is None:
         return Answer(None, False, is_sure)
-    T = np.asarray(found.T_target_source, np.float64)
-    recall = metrics.registration_recall(T[None], T_true[None])
-    return Answer(float(np.linalg.norm((T - T_true)[:3, 3])), bool(recall.is_right[0]), is_sure)
+    recall = metrics.registration_recall(np.asarray(found.T_target_source, np.float64)[None], T_true[None])
+    return Answer(float(recall.translation_errors_m[0]), bool(recall.is_right[0]), is_sure)
 
 
 def draw_pair(rng: np.random.Generator, kind: str, most_apart: int) -> Pair:
@@ -141,22 +140,23 @@ def draw_pair(rng: np.random.Generator, kind: str, most_apart: int) -> Pair:
 
 def with_shell(rng: np.random.Generator) -> Pair:
     """Draws a pair with 0.5 to 10 % of beams without an echo, at the largest range."""
-    source, target, T = draw_pair(rng, "suburb", 6)
+    pair = draw_pair(rng, "suburb", 6)
     share, range_m, noise_m = rng.uniform(0.005, 0.1), rng.uniform(25, 50), rng.choice([0.0, 0.1])
-    shelled = []
-    for points in (source, target):
+
+    def shelled(points: np.ndarray) -> np.ndarray:
         near = points[np.linalg.norm(points, axis=1) < range_m - 0.5]
         rays = rng.normal(size=(int(share * len(near)), 3)) * [1, 1, 0.2]
         rays *= (range_m + noise_m * rng.normal(size=(len(rays), 1))) / np.linalg.norm(rays, axis=1, keepdims=True)
-        shelled.append(np.concatenate([near, rays]).astype(np.float32))
-    return Pair(shelled[0], shelled[1], T)
+        return np.concatenate([near, rays]).astype(np.float32)
+
+    return pair._replace(source=shelled(pair.source), target=shelled(pair.target))
 
 
 def with_scale(rng: np.random.Generator) -> Pair:
     """Draws a pair whose source is enlarged by 0.9 to 1.1, not by less than 1 %: no motion of it is right."""
     pair = draw_pair(rng, "suburb", 6)
     scale = 1 + rng.uniform(0.01, 0.1) * rng.choice([-1, 1])
-    return Pair((scale * pair.source).astype(np.float32), pair.target, None)
+    return pair._replace(source=(scale * pair.source).astype(np.float32), T_target_source=None)
 
 
 KINDS: dict[str, Callable[[deeppointmap.Model, np.random.Generator], Answer]] = {

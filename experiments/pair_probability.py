@@ -20,7 +20,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 import dpmjax
-from dpmjax import cli, io, simulation
+from dpmjax import cli, io, metrics, simulation
 from dpmjax import deeppointmap as dpm
 from dpmjax.geometry import rigid, se2, se3
 from dpmjax.scans import PairEvidence
@@ -48,29 +48,24 @@ class PairOptions(cli.RunOptions):
 def main(options: PairOptions, run: cli.Run) -> cli.Row:
     """Registers the pairs, and fits or checks."""
     run.open()
-    cases = [
-        {"walk": walk, "pair": pair}
-        for walk in range(len(options.logs) or options.walks)
-        for pair in range(options.pairs)
-    ]
-    rows = cli.fill_table(
-        run, cases, partial(register_pair, options, lru_cache(maxsize=2)(partial(read_walk, options)))
-    )
+    walks = range(len(options.logs) or options.walks)
+    cases = [{"walk": walk, "pair": pair} for walk in walks for pair in range(options.pairs)]
+    read = lru_cache(maxsize=2)(partial(read_walk, options))
+    rows = cli.fill_table(run, cases, partial(register_pair, options, read))
     if not rows:
         return {"num_pairs": 0}
-    is_right = np.array([row["is_right"] for row in rows], bool)
-    confidence = np.array([row["confidence"] for row in rows], float)
+    is_right, confidence = (np.array([row[name] for row in rows], float) for name in ("is_right", "confidence"))
     is_sure = confidence >= SURE
     numbers: cli.Row = {
         "num_pairs": len(rows),
         "num_right": int(is_right.sum()),
         "num_sure": int(is_sure.sum()),
-        "num_sure_and_wrong": int((is_sure & ~is_right).sum()),
-        "brier": float(np.mean((confidence - is_right) ** 2)),
+        "num_sure_and_wrong": int((is_sure & (is_right == 0)).sum()),
+        "brier": metrics.brier_score(confidence, is_right),
     }
     if not options.logs and 0 < is_right.sum() < len(rows):
         features = [PairEvidence(*(float(row[name]) for name in PairEvidence._fields)).features() for row in rows]
-        weights, bias = dpm.fit_weights(np.array(features), is_right)
+        weights, bias = dpm.fit_weights(np.array(features), is_right.astype(bool))
         share = is_right.mean()
         numbers |= {"weights": weights.tolist(), "bias": float(bias - np.log(share / (1 - share)))}
     return numbers
@@ -89,29 +84,26 @@ def read_walk(options: PairOptions, walk: int) -> Any:
     world = ("office", "yard", "clinic", "grove")[walk // 3 % 4] if walk % 3 == 0 else seed
     sequence = simulation.simulate_sequence(world, NUM_SCANS, num_beams=2 * beams, range_noise_px=noise, seed=seed)
     ranges = np.linalg.norm(sequence.points, axis=-1)
-    mask = sequence.mask & (
-        np.abs(np.arctan2(*np.moveaxis(sequence.points, -1, 0)[::-1])) < rng.choice([0.5, 0.75, 1.0]) * np.pi
-    )
+    bearings = np.arctan2(sequence.points[..., 1], sequence.points[..., 0])
+    mask = sequence.mask & (np.abs(bearings) < rng.choice([0.5, 0.75, 1.0]) * np.pi)
     mask &= ranges < np.quantile(ranges[mask], rng.choice([0.6, 0.8, 0.95, 1.0]))
     return io.ScanSequence(sequence.name, sequence.points, mask, "px", sequence.reference_poses)
 
 
 def register_pair(options: PairOptions, read: Any, walk: int, pair: int) -> cli.Row:
     """Registers a pair; every fourth pair of a simulated planar walk joins two worlds, so that no motion is right."""
-    rng, steps = np.random.default_rng((walk, pair)), PLANAR_STEPS if options.sensor == "planar" else DEPTH_STEPS
-    sequence = read(walk)
-    is_apart = options.sensor == "planar" and not options.logs and pair % 4 == 3 and walk > 0
+    is_planar, rng, sequence = options.sensor == "planar", np.random.default_rng((walk, pair)), read(walk)
+    is_apart = is_planar and not options.logs and pair % 4 == 3 and walk > 0
     other = read(walk - 1) if is_apart else sequence
     ends = rng.integers(len(sequence)), rng.integers(len(other))
     if not is_apart:
-        step = min(int(rng.choice(steps)), len(sequence) - 1)
+        step = min(int(rng.choice(PLANAR_STEPS if is_planar else DEPTH_STEPS)), len(sequence) - 1)
         first = int(rng.integers(len(sequence) - step))
         ends = (first, first + step) if rng.random() < 0.5 else (first + step, first)
-    source, target = sequence.points[ends[0]], other.points[ends[1]]
-    masks = sequence.mask[ends[0]], other.mask[ends[1]]
-    if options.sensor == "planar":
-        source, target = source[masks[0]], target[masks[1]]
-    found = dpmjax.register(None, source, target)
+    scans = [each.points[end] for each, end in zip((sequence, other), ends, strict=True)]
+    if is_planar:
+        scans = [each.points[end][each.mask[end]] for each, end in zip((sequence, other), ends, strict=True)]
+    found = dpmjax.register(None, *scans)
     numbers = {"confidence": found.confidence, **found.evidence._asdict()}
     return {**numbers, "is_right": not is_apart and is_right(options, sequence, ends, found.T_target_source)}
 

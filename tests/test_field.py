@@ -14,8 +14,7 @@ import pytest
 
 import dpmjax
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 
 pytestmark = [pytest.mark.field, pytest.mark.timeout(3600), pytest.mark.filterwarnings("default")]
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from dpmjax.cli import localize, map2d, program
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from tests.cli.test_slam import run, table
 from tests.cli.test_slam_fuzz import leave_networks_out
 from tests.data_sets import write_pcd

@@ -8,12 +8,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
-from dpmjax.cli import program
-from dpmjax.cli.run import EXIT_BAD_INPUT, STOPPING
+from dpmjax.cli.run import STOPPING
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -118,19 +116,6 @@ def test_a_folder_that_is_taken_is_refused_before_the_input_is_read(toy, tmp_pat
     code, output, errors = finish(toy("missing.pcd", "-o", "."))
     assert (code, output) == (2, "")
     assert errors == "dpmjax: error: . is not empty and holds no earlier run: name another folder with -o\n"
-
-
-@pytest.mark.parametrize("error", [RuntimeError("no backend"), AssertionError()])
-def test_a_device_that_is_not_there_is_one_line_with_exit_code_2(tmp_path, monkeypatch, capsys, error):
-    # JAX raises the second where its plugin is not installed. The setting is put back for the tests that follow.
-    monkeypatch.setattr("jax.config.update", lambda *_: None)
-    monkeypatch.setattr("jax.devices", Mock(side_effect=error))
-    arguments = ["a.npy", "b.npy", "--device", "gpu", "-o", str(tmp_path / "out")]
-    assert program.main(["register", *arguments]) == EXIT_BAD_INPUT
-    assert capsys.readouterr().err.splitlines() == [
-        "dpmjax: error: --device gpu: JAX finds no such device here; leave the option out or install its plugin"
-    ]
-    assert not (tmp_path / "out").exists()
 
 
 def test_failure_on_the_way_exits_with_one_and_names_the_partial_results(toy, tmp_path):

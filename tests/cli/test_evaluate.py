@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
-import signal
-
 import jax
 import numpy as np
 import pytest
@@ -14,8 +10,7 @@ import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli import drives
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_OK, load_json
 from dpmjax.deeppointmap import SamplingConfig
 from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
@@ -55,27 +50,6 @@ def test_a_town_is_evaluated_and_nothing_is_registered_twice(weights, tmp_path, 
     assert run(["--resume", "-o", str(out)]) == EXIT_OK
     assert read_rows(out) == rows
     assert load_json(out / "metrics.json")["table"] == metrics["table"]
-
-
-@pytest.mark.slow
-def test_ctrl_c_keeps_the_pairs_before_it(weights, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(simulation, "simulate_drive", lambda seed, **_: toy.drive(seed))
-    out, register, count = tmp_path / "out", deeppointmap.register_in_stages, itertools.count(1)
-
-    def interrupting(*arguments):
-        if next(count) == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-        return register(*arguments)
-
-    monkeypatch.setattr(deeppointmap, "register_in_stages", interrupting)
-    assert run(["--weights", str(weights), "--pairs", "2", "-o", str(out)]) == 130
-    stopped = read_rows(out)
-    assert load_json(out / "metrics.json")["status"] == "interrupted"
-    assert [row["band"] for row in stopped] == ["near", "near", "middle"]
-    assert run(["--resume", "-o", str(out)]) == EXIT_OK
-    assert load_json(out / "metrics.json")["status"] == "done"
-    assert read_rows(out)[:3] == stopped
-    assert len(read_rows(out)) == 6
 
 
 def test_a_folder_of_scans_with_poses_is_evaluated(weights, tmp_path, capsys) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.cli.run import EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_OK, load_json
 from dpmjax.io import write_tum
 from tests.cli.test_slam import run
 from tests.deeppointmap import toy

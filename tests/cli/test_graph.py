@@ -9,8 +9,7 @@ import pytest
 
 import dpmjax
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_FAILED, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_FAILED, EXIT_OK, load_json
 from tests.io.test_g2o import EDGES, PLANAR, spatial_text
 
 LOOP = "".join(f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 1.57 4 0 0 4 0 9\n" for i in range(4))

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpmjax.cli.run import EXIT_FAILED, EXIT_OK
-from dpmjax.cli.run_folder import load_json
-from dpmjax.cli.slam_results import status_of, why_failed
+from dpmjax.cli.run import EXIT_FAILED, EXIT_OK, load_json
+from dpmjax.cli.slam_run import judge
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from tests.cli.test_slam import run
@@ -49,35 +48,27 @@ def test_a_drive_of_empty_scans_fails(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("statuses", "found"),
+    ("statuses", "status", "reason"),
     [
-        ({"first": 1, "predicted": 5, "restarted": 1}, "none of 7 scans could be aligned"),
-        ({"empty": 16}, "16 of 16 scans without enough points"),
-        ({"first": 1}, None),
-        ({"first": 1, "tracked": 1, "predicted": 9}, None),
-        ({}, None),
+        ({"first": 1, "tracked": 9}, "done", ""),
+        ({"first": 1, "tracked": 8, "coasting": 1}, "done", "uncertain"),
+        ({"first": 1, "tracked": 66, "coasting": 53}, "uncertain", "53 scans"),
+        ({"first": 1, "tracked": 7, "predicted": 2}, "uncertain", "2 scans placed by the predicted motion"),
+        ({"first": 1, "tracked": 1, "predicted": 9}, "uncertain", "9 scans"),
+        ({"first": 1, "network": 108, "predicted": 12}, "done", "12 scans"),
+        ({"first": 1, "predicted": 5, "restarted": 1}, "failed", "none of 7 scans could be aligned"),
+        ({"empty": 16}, "failed", "16 of 16 scans without enough points"),
+        ({"first": 1}, "done", "1 scan, "),
+        ({}, "done", "0 scans"),
     ],
 )
-def test_a_run_without_a_single_step_has_failed(statuses: dict[str, int], found: str | None) -> None:
-    reason = why_failed(statuses)
-    assert reason is None if found is None else found in str(reason)
-
-
-@pytest.mark.parametrize(
-    ("statuses", "status"),
-    [
-        ({"first": 1, "tracked": 9}, "done"),
-        ({"first": 1, "tracked": 8, "coasting": 1}, "done"),
-        ({"first": 1, "tracked": 66, "coasting": 53}, "uncertain"),
-        ({"first": 1, "tracked": 7, "predicted": 2}, "uncertain"),
-        ({"first": 1, "network": 108, "predicted": 12}, "done"),
-        ({"empty": 3}, "failed"),
-    ],
-)
-def test_the_status_follows_from_the_scans(statuses: dict[str, int], status: str) -> None:
-    numbers = {"scan_statuses": statuses}
-    assert status_of({**numbers, "num_parts": 1}) == status
-    assert status_of({**numbers, "num_parts": 2}) == ("uncertain" if status == "done" else status)
+def test_the_status_follows_from_the_scans(statuses: dict[str, int], status: str, reason: str) -> None:
+    numbers = dict.fromkeys(("path_m", "num_keyframes", "num_new_keyframes", "num_loops"), 0)
+    numbers |= {"scan_statuses": statuses, "reference_doubt": None}
+    found = judge({**numbers, "num_parts": 1})
+    assert found["status"] == status
+    assert reason in found["verdict"]
+    assert judge({**numbers, "num_parts": 2})["status"] == ("uncertain" if status == "done" else status)
 
 
 def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(

@@ -54,9 +54,9 @@ def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProces
     command = ["-m", "dpmjax", "map2d"]
     if interrupt:
         code = (
-            "import os, signal; from dpmjax.cli import recorded_fit as fit, map2d as m;"
-            "from dpmjax.cli.run import run_command;"
-            "fit.FitRecorder._show = lambda *_: os.kill(os.getpid(), signal.SIGINT);"
+            "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, run_command\n"
+            "append = Run.append_row\n"
+            "Run.append_row = lambda *a, **k: (append(*a, **k), os.kill(os.getpid(), signal.SIGINT))\n"
             "raise SystemExit(run_command(m.main, name='map2d', description=None))"
         )
         command = ["-c", code]

@@ -11,8 +11,7 @@ import pytest
 
 import dpmjax
 from dpmjax.cli.program import main
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.slam import JoinedMaps, MergedMaps
 from dpmjax.slam.keyframe_map import MapEdge
 from dpmjax.slam.loops import Loop

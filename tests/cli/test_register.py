@@ -11,8 +11,7 @@ import pytest
 import dpmjax
 from dpmjax.cli.program import main
 from dpmjax.cli.register import verdict_numbers
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json
 from dpmjax.io import read_lidar_file
 from dpmjax.types import Registration
 from tests.data_sets import read_ply, write_pcd

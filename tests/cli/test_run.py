@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -16,8 +14,7 @@ from tyro.conf import Positional, arg
 
 from dpmjax.cli import run as run_module
 from dpmjax.cli.options import OutputOptions, RunOptions, parse_options
-from dpmjax.cli.run import Run
-from dpmjax.cli.run_folder import load_options, write_json
+from dpmjax.cli.run import Run, load_options, write_json
 
 
 @dataclass(frozen=True)
@@ -84,31 +81,6 @@ def test_earlier_run_is_refused_resumed_or_replaced(start, tmp_path):
     start(output=run.path, force=True)
     assert {path.name for path in run.path.iterdir()} == {"config.json", "log.txt"}
     assert not Path("results").exists()
-
-
-def test_a_run_that_has_ended_meanwhile_is_not_replaced(start, tmp_path):
-    late = Run("toy", ToyOptions(output=tmp_path / "out"))  # reads its input
-    first = start(output=tmp_path / "out")
-    write_json(first / "metrics.json", {"ate_px": 1.0})
-    first.close()
-    with pytest.raises(ValueError, match="holds an earlier run"):
-        late.open()
-    late.close()
-    assert (first / "metrics.json").exists()
-
-
-def test_no_second_process_may_write_a_run_before_the_first_one_ends(start, tmp_path):
-    run = start(output=tmp_path / "out")
-    program = (
-        "import sys; from pathlib import Path; from dpmjax import cli\n"
-        "try: cli.Run('toy', cli.RunOptions(output=Path(sys.argv[1]), resume=True)).open()\n"
-        "except ValueError as error: print(error)"
-    )
-    other = [sys.executable, "-c", program, str(run.path)]
-    said = subprocess.run(other, capture_output=True, text=True, check=True).stdout
-    assert said == f"{run.path}: another process is writing this run; let it end, or stop it\n"
-    run.close()
-    assert subprocess.run(other, capture_output=True, text=True, check=True).stdout == ""
 
 
 @pytest.mark.parametrize("options", [{"output": "."}, {"output": ".", "force": True}, {"resume": True}])
@@ -215,7 +187,7 @@ def test_a_check_of_the_options_says_what_it_expects():
     ("words", "message"),
     [
         ("a -n x", "--steps: .*'x'"),
-        ("a --device tpu", "'tpu' for argument '--device'. Expected one of .*'cpu'"),
+        ("a --world 7", "'7' for argument '--world'. Expected one of .*'grove'"),
         ("a --seconds", "Missing value for argument '--seconds'"),
         ("a --second 3", "Unrecognized options: --second, 3"),
         ("a b", "Unrecognized options: b"),

@@ -20,8 +20,7 @@ import pytest
 
 from dpmjax import viz
 from dpmjax.cli import slam, slam_run
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, run_command
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json, run_command
 from dpmjax.io import LidarSequence, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
 from tests.optional import import_or_skip

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dpmjax import model_preset
-from dpmjax.cli import slam, slam_results
+from dpmjax.cli import slam, slam_run
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
 from dpmjax.io import write_kitti, write_ply, write_tum
 from dpmjax.slam import Match, Proposal, SlamConfig, SlamMethods, SurfaceGeometry
@@ -50,7 +50,7 @@ def leave_networks_out(patch: pytest.MonkeyPatch) -> None:
     """Alignment alone; no pictures."""
     methods = SlamMethods(NoMatcher(), SurfaceGeometry(model_preset("tiny")), SlamConfig())
     patch.setattr(slam, "slam_methods", lambda config: methods)
-    patch.setattr(slam_results, "draw_pictures", lambda *_: None)
+    patch.setattr(slam_run, "draw_pictures", lambda *_: None)
 
 
 @pytest.fixture

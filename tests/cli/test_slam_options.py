@@ -13,8 +13,7 @@ import dpmjax
 from dpmjax.cli import slam
 from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive, with_raised_beams
 from dpmjax.cli.info import why_not_importable
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
 from dpmjax.io import write_tum
 from dpmjax.scans import offsets_by_azimuth
 from dpmjax.slam import SlamConfig, slam_preset

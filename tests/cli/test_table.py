@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from dpmjax import cli
-from dpmjax.cli.run_folder import load_json
+from dpmjax.cli.run import load_json
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,7 +51,7 @@ def stop():
     return signal.SIGINT if number == 0 and len(calls) == 3 else 0
 
 assert is_first() == (number == 0)
-sets = Selection(draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL, kinds=KINDS), "a toy")
+sets = Selection(draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL, kinds=tuple(KINDS)), "a toy")
 records = Records(run_in(Path(folder)), TRAINING, sets, seed=0) if is_first() else None
 done = run_training(records, toy.store(), TRAINING, TrainingHooks(evaluate_every=1, stop=stop), seed=0)
 assert done.stopped_by == signal.SIGINT
@@ -94,9 +94,7 @@ def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
 
     state, step = init_training(jax.random.key(0), TRAINING), make_step(TRAINING)
     maker = SampleMaker(toy.store(), TRAINING, seed=0, numbers=(0, 1), num_in_step=2)
-    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(
-        replace(begin_training(TRAINING), best_params={}), fallback=None
-    )
+    progress = Checkpoints(tmp_path / CHECKPOINTS).restore_latest(begin_training(TRAINING), fallback=None)
     for number in range(2):
         state, _ = step(state, maker(number))
     assert progress.state.step == progress.best_step == 2

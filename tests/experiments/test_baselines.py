@@ -15,10 +15,8 @@ from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.simulation import simulate_depth_sequence, simulate_sequence
 from dpmjax.types import ScanSet
-from experiments._baselines import Swarms, align, chain_icp, multiway, multiway_images, swarm_poses
+from experiments._baselines import align, chain_icp, multiway, multiway_images, swarm_poses
 from tests.optional import import_or_skip
-
-QUICK = Swarms(num_particles=24, num_iterations=30, num_beams=64)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +46,7 @@ def with_open3d() -> None:
 @pytest.mark.usefixtures("with_swarms")
 def test_swarms_over_all_poses_improve_with_time(walk) -> None:
     config, scans = preset("fast"), scans_of(walk.take(np.arange(3)))
-    poses = [swarm_poses(scans, config, QUICK, cpu_s=seconds, key=jax.random.key(0)) for seconds in (0.0, 2.0)]
+    poses = [swarm_poses(scans, config, cpu_s=seconds, key=jax.random.key(0)) for seconds in (0.0, 2.0)]
     chain = [se2.transform_points(found, np.asarray(scans.points)) for found in poses]
     misfits = [np.mean([float(chamfer_distance(a, b)) for a, b in itertools.pairwise(points)]) for points in chain]
     assert misfits[1] <= misfits[0]

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, io, metrics, registration_rgbd, simulation, viz
@@ -30,8 +31,6 @@ from dpmjax.sequences import DepthSequence
 _NUM_SIMULATED = 8
 # Names of the sets of poses, in the order of the picture.
 METHODS = {"start": "tracking and search", "fit": "DeepMapping"}
-# Typical ranges that a radian equals in the alignment of poses, for positions on a line.
-_LEVER = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +54,11 @@ def main(options: DepthOptions, run: cli.Run) -> cli.Numbers:
     recorder = cli.FitRecorder(run, "m")
     settings = deepmapping.preset(options.preset, "depth", motion="planar" if sequence.is_planar else "full")
     key = jax.random.key(options.seed)
-    with cli.counting_bar("poses from image to image", " images") as on_image:
+    with tqdm(total=len(sequence), desc="poses from image to image", unit=" images", dynamic_ncols=True) as bar:
+
+        def on_image(num_placed: int, _: int) -> None:
+            bar.update(num_placed - bar.n)
+
         start = registration_rgbd.initialize_depth(images, settings.motion, key=key, on_image=on_image)
     found = deepmapping.register_depth(images, settings, key=key, start=start, engine=recorder)
     numbers = {**depth_numbers(sequence, found), **recorder.numbers}
@@ -84,8 +87,8 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     """Returns the numbers of a registration under the names of `metrics.json`."""
     assert found.start is not None
     assert found.start_misfit is not None
-    before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     assert found.placed is not None
+    before, after = (metrics.depth_errors(sequence, T) for T in (found.start, found.T_world_scan))
     consistency = 1 - (found.misfit if found.kept == "fit" else found.start_misfit)
     is_trusted, uncertain = found.placed.is_trusted, list(found.placed.uncertain_images)
     verdict = f"{'can be trusted' if is_trusted else 'DO NOT TRUST this map'}: the images agree to {consistency:.0%}"
@@ -94,8 +97,7 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     elif not is_trusted:
         verdict += "; other poses explain the images as well"
     if after:
-        verdict += f"; ATE {after['ate_m']:.3f} m, map points {after['point_distance_m']:.3f} m, largest error of a "
-        verdict += f"turn {after['largest_turn_error_deg']:.2f} degrees"
+        verdict += f"; {error_text(after)}, largest error of a turn {after['largest_turn_error_deg']:.2f} degrees"
     return {
         "status": "done" if is_trusted else "uncertain",
         "verdict": verdict,
@@ -111,15 +113,18 @@ def depth_numbers(sequence: DepthSequence, found: deepmapping.Registered) -> cli
     }
 
 
+def error_text(errors: cli.Numbers) -> str:
+    """Returns the errors of poses as a text."""
+    return f"ATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m"
+
+
 def draw(run: cli.Run, sequence: DepthSequence, found: deepmapping.Registered) -> None:
     """Draws map.png: the search, DeepMapping, the reference; and loss.png."""
-    assert found.start is not None
     panels = []
-    for name, T_world_camera in {"start": found.start, "fit": found.fit}.items():
-        errors = metrics.depth_errors(sequence, T_world_camera)
-        ate = f"\nATE {errors['ate_m']:.3f} m, map points {errors['point_distance_m']:.3f} m" if errors else ""
-        panels.append((METHODS[name] + " (kept)" * (found.kept == name) + ate, T_world_camera))
-    if sequence.T_world_camera is not None:
-        panels.append(("reference", sequence.T_world_camera))
+    for name, T in (("start", found.start), ("fit", found.fit), ("reference", sequence.T_world_camera)):
+        if T is not None:
+            errors = metrics.depth_errors(sequence, T) if name in METHODS else None
+            title = METHODS.get(name, name) + " (kept)" * (found.kept == name)
+            panels.append((title + (f"\n{error_text(errors)}" if errors else ""), T))
     viz.save_figure(viz.from_above_figure(panels, sequence.points, sequence.mask), run / "map.png", dpi=110)
     cli.draw_loss(run, "m")

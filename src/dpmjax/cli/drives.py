@@ -18,16 +18,13 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from dpmjax import deeppointmap, io, scans, simulation, slam
 from dpmjax.cli.options import Bound, ModelOptions, RunOptions, ScanOptions
-from dpmjax.cli.run_folder import RESULTS
+from dpmjax.cli.run import RESULTS
 from dpmjax.sequences import InputError, LidarSequence, Note
 
 LOGGER = logging.getLogger("dpmjax.drives")
 TOWN = "town"
-TOWN_ROUTE_M, TOWN_DRIVE_M, TOWN_RATE_HZ, TOWN_AZIMUTHS = 400.0, 480.0, 3.0, 900
-# A car of 10 m/s and a lidar of 10 turns a second, as in KITTI: one scan each metre, with up to 3 degrees of turn.
-ROUTE_SPEED_M_S, ROUTE_RATE_HZ, ROUTE_TURN_DEG_S = 10.0, 10.0, 30.0
+# Unit of the integer coordinates of kept scans: 16 bits reach 128 m.
 STEP_M = 2.0**-8
-"""Unit of the integer coordinates of kept scans: 16 bits reach 128 m."""
 # Time of a turn of a lidar whose scans have no times of points.
 TURN_S = 0.1
 
@@ -45,17 +42,9 @@ class DriveOptions(ScanOptions, ModelOptions, RunOptions):
 
     def check_data(self, data: object, sequence: str | None) -> None:
         """Raises a ValueError for options of files if no folder is given."""
-        if data or self.resume:  # a resumed run has its own
-            return
-        uses = {
-            "--sequence chooses a drive of DATA": sequence is not None,
-            "--topic chooses clouds of a bag": self.topic is not None,
-            "--columns describes .bin files": self.columns is not None,
-            "--kitti-angle-correction is for the scans of KITTI's car": self.kitti_angle_correction,
-        }
-        for use, is_given in uses.items():
-            if is_given:
-                raise ValueError(f"{use}: give DATA too")
+        given = sequence, self.topic, self.columns, self.kitti_angle_correction or None
+        if not (data or self.resume) and any(one is not None for one in given):
+            raise ValueError("--sequence, --topic, --columns and --kitti-angle-correction describe DATA: give DATA too")
 
 
 def open_drive(data: Path | None, options: DriveOptions, sequence: str | None = None) -> LidarSequence:
@@ -106,10 +95,9 @@ def with_raised_beams(drive: LidarSequence) -> LidarSequence:
 
 def demo_drive(seed: int) -> LidarSequence:
     """Simulates a drive once round a town and on over the first streets, with an HDL-64 of half the columns."""
-    town = simulation.TownConfig("suburb", "loop", TOWN_ROUTE_M, 90.0)
-    driving = simulation.DriveConfig(rate_hz=TOWN_RATE_HZ, length_m=TOWN_DRIVE_M)
-    sensor = simulation.HDL64E.with_azimuths(TOWN_AZIMUTHS)
-    return simulation.simulate_scene(simulation.Scene(seed, town, driving, sensor))
+    town = simulation.TownConfig("suburb", "loop", route_length_m=400.0, block_m=90.0)
+    driving = simulation.DriveConfig(rate_hz=3.0, length_m=480.0)
+    return simulation.simulate_scene(simulation.Scene(seed, town, driving, simulation.HDL64E.with_azimuths(900)))
 
 
 def route_drive(path: Path, seed: int) -> LidarSequence:
@@ -130,7 +118,8 @@ def route_drive(path: Path, seed: int) -> LidarSequence:
     """
     T_world_lidar = io.read_lidar_trajectory(path)
     T_world_lidar[:, :3, 3] -= T_world_lidar[0, :3, 3]  # float32 holds no centimetres at the coordinates of a country
-    driving = simulation.DriveConfig(ROUTE_SPEED_M_S, ROUTE_RATE_HZ, max_turn_deg_s=ROUTE_TURN_DEG_S)
+    # As in KITTI: 10 m/s and 10 turns a second, so one scan each metre, with up to 3 degrees of turn.
+    driving = simulation.DriveConfig(10.0, 10.0, max_turn_deg_s=30.0)
     try:
         scene = simulation.Scene(seed, simulation.TownConfig(), driving, simulation.HDL64E)
         drive = simulation.simulate_scene(scene, trajectory=T_world_lidar)
@@ -205,20 +194,26 @@ def find_sources(
         ValueError: if a path cannot be read or holds no useful drive.
     """
     sources: list[Source] = []
-    sampling = sampling or deeppointmap.SamplingConfig()
     for entry in data:
         if entry == TOWN and not Path(entry).exists():
             sources += towns
             continue
+        reasons: dict[str, str] = {}
+        useful: list[Source] = []
         names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
-        found = {source: source() for source in (partial(open_with_poses, Path(entry), name) for name in names)}
-        checked = ((source, deeppointmap.why_useless(drive, sampling)) for source, drive in found.items())
-        reasons = {source: reason for source, reason in checked if reason is not None}
-        if len(reasons) == len(found):
+        for name in names:
+            source = partial(open_with_poses, Path(entry), name)
+            drive = source()
+            reason = deeppointmap.why_useless(drive, sampling or deeppointmap.SamplingConfig())
+            if reason is None:
+                useful.append(source)
+            else:
+                reasons[drive.name] = reason
+        if not useful:
             raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
-        for source, reason in reasons.items():
-            LOGGER.warning("%s is left out: %s", found[source].name, reason)
-        sources += [source for source in found if source not in reasons]
+        for left_out, reason in reasons.items():
+            LOGGER.warning("%s is left out: %s", left_out, reason)
+        sources += useful
     return sources
 
 
@@ -240,7 +235,7 @@ class ScanReader:
 
     def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
         self.sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
-        self._warned: list[int] = []  # the first scan without usable times
+        self._has_warned = False
 
     def __call__(self, index: int) -> slam.TimedScan | np.ndarray:
         """Reads a scan."""
@@ -250,16 +245,15 @@ class ScanReader:
         interval_s = self._interval_s(index)
         times = None if self.sequence.read_times is None else self.sequence.read_times(index)
         offsets = None if times is None else scans.offsets_by_times(times, interval_s)
-        if times is not None and offsets is None and not self._warned:
-            self._warned.append(index)
+        if offsets is not None:
+            return slam.TimedScan(points, offsets if interval_s is not None else offsets / self._jump)
+        if times is not None and not self._has_warned:
+            self._has_warned = True
             text = "its times of points span no turn of a lidar: the azimuth of the points gives them, in such scans"
             LOGGER.warning("%s: %s", self.sequence.sources[index], text)
-        if offsets is None:  # by the time of a turn, as a share of the time between scans
-            turn_share = 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
-            offsets = scans.offsets_by_azimuth(points, turn_share)
-        elif interval_s is None:
-            offsets = offsets / self._jump
-        return slam.TimedScan(points, offsets)
+        # By the time of a turn, as a share of the time between scans.
+        turn_share = 1.0 / self._jump if interval_s is None else min(TURN_S / interval_s, 1.0)
+        return slam.TimedScan(points, scans.offsets_by_azimuth(points, turn_share))
 
     def _interval_s(self, index: int) -> float | None:
         """Returns the time of the motion by which a scan is deskewed; None if it is unknown."""

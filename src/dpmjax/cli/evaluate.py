@@ -10,9 +10,8 @@ registration within 2 m and 5 degrees is right. Results go to results/evaluate/<
 The file table.md has the shares of right registrations, with 95 % intervals, and the median errors of right ones. It
 has them for the network alone, after the verification by the scans, and after the final alignment. The file rows.csv
 has every pair. The picture reliability.png shows the share of right registrations for each confidence, also for pairs
-more than 60 m apart (far). The picture failures.png shows wrong registrations from above. The AUC of overlap compares
-pairs less than 20 m apart (revisits, if the drive has any) with pairs more than 40 m apart. The file overlap.csv has
-the AUC of the overlap head on the same pairs.
+more than 60 m apart (far). The AUC of overlap compares pairs less than 20 m apart (revisits, if the drive has any) with
+pairs more than 40 m apart. The file overlap.csv has the AUC of the overlap head on the same pairs.
 """
 
 from __future__ import annotations
@@ -32,15 +31,13 @@ from dpmjax import cli, deeppointmap, metrics, simulation, viz, weights
 from dpmjax.sequences import LidarSequence
 
 # Overlap is cheap: more pairs, of each kind.
-OVERLAP_FACTOR = 2
+OVERLAP_FACTOR = 4
+# Seed of the first town; no training, selection or calibration uses these towns.
 FIRST_TOWN = 5_000_000
-"""Seed of the first town; no training, selection or calibration uses these towns."""
-
-NUM_SHOWN, TOWN_LENGTH_M = 4, 400.0
+TOWN_LENGTH_M = 400.0
 BANDS = ("near", "middle", "far")
 STAGES = ("network", "verified", "refined")
 Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]
-COLUMNS = (*(f"{stage}_right" for stage in STAGES), "network_m", "refined_m", "pair_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,21 +62,17 @@ def main(options: EvaluateOptions, run: cli.Run) -> cli.Row:
     """Computes the missing rows, and writes table, numbers and pictures."""
     model = weights.load_model(options.weights)
     kinds = [kind for kind, _ in simulation.SceneMixture().kinds]
-    drives = open_evaluation_drives(options.data, evaluation_towns(options.num_towns, TOWN_LENGTH_M, kinds))
-    pairs = PairReader(drives, options.pairs, options.seed)
+    drives = open_evaluation_drives(options.data, evaluation_towns(options.num_towns, kinds))
     run.open()
-    rows = fill_pairs(run, model, pairs)
-    overlap = fill_overlap(run, model, drives, OVERLAP_FACTOR * options.pairs, options.seed)
-    summary = summarize_pairs(rows, overlap, STAGES, COLUMNS)
-    numbers = {"weights": options.weights, **rate_confidence(model, rows), **cli.write_summary(run, summary)}
-    run.write_numbers(numbers)  # also where a picture fails
-    draw_evaluation(run, model, pairs, rows, Path(options.weights).stem)
-    return numbers
+    rows = register_pairs(run, model, drives, options)
+    summary = summarize_pairs(rows, fill_overlap(run, model, drives, options))
+    numbers = cli.write_summary(run, summary)
+    return {"weights": options.weights, **numbers, **rate_confidence(run, model, rows, Path(options.weights).stem)}
 
 
-def evaluation_towns(num_towns: int, length_m: float, kinds: Sequence[str | None] = (None,)) -> list[cli.Source]:
+def evaluation_towns(num_towns: int, kinds: Sequence[str | None] = (None,)) -> list[cli.Source]:
     """Returns towns that no training uses, with the kinds of place in turn; None draws one."""
-    town = partial(simulation.simulate_drive, length_m=length_m)
+    town = partial(simulation.simulate_drive, length_m=TOWN_LENGTH_M)
     return [partial(town, FIRST_TOWN + number, kind=kinds[number % len(kinds)]) for number in range(num_towns)]
 
 
@@ -105,53 +98,40 @@ def open_evaluation_drives(data: Sequence[str], towns: Sequence[cli.Source]) -> 
     return drives
 
 
-class PairReader:
-    """Random pairs of scans of several drives. The keys are the drive's name, the band of distances and a number.
-
-    Attributes:
-        drawn: numbers of the two scans of each pair, by drive and band.
-        cases: drive, band and number of all pairs.
-    """
-
-    def __init__(self, drives: Sequence[LidarSequence], num_pairs: int, seed: int) -> None:
-        """Draws up to `num_pairs` pairs of each drive and band."""
-        draw = partial(deeppointmap.draw_scan_pairs, num_pairs=num_pairs, seed=seed)
-        self.drawn = {(drive.name, band): draw(drive, band) for drive in drives for band in BANDS}
-        self.cases = [
-            {"drive": drive, "band": band, "pair": number}
-            for (drive, band), rows in self.drawn.items()
-            for number in range(len(rows))
-        ]
-        by_name = {drive.name: drive for drive in drives}
-
-        def read_band(drive: str, band: str) -> list[deeppointmap.ScanPair]:
-            return list(deeppointmap.read_scan_pairs(by_name[drive], self.drawn[drive, band], seed=seed))
-
-        # The yaws of the pairs of a band come from one stream.
-        self._read_band = lru_cache(maxsize=1)(read_band)
-
-    def read(self, drive: str, band: str, pair: int) -> deeppointmap.ScanPair:
-        """Reads a pair, each scan turned by a random yaw."""
-        return self._read_band(drive, band)[pair]
-
-
-def fill_pairs(
-    run: cli.Run, model: deeppointmap.Model, pairs: PairReader, matchers: Mapping[str, Matcher] = MappingProxyType({})
+def register_pairs(
+    run: cli.Run,
+    model: deeppointmap.Model,
+    drives: Sequence[LidarSequence],
+    options: EvaluateOptions,
+    matchers: Mapping[str, Matcher] = MappingProxyType({}),
 ) -> list[cli.Row]:
     """Fills rows.csv with errors of each pair after each stage, confidence and seconds, also of further methods.
 
     Args:
         run: the open run.
         model: a trained model.
-        pairs: pairs of all drives and bands.
+        drives: drives with poses.
+        options: number and seed of the pairs of each drive and band of distances.
         matchers: further methods by name, for pairs that overlap: each makes `T_target_source` of source and target.
 
     Returns:
         The rows.
     """
+    by_name = {drive.name: drive for drive in drives}
+    draw = partial(deeppointmap.draw_scan_pairs, num_pairs=options.pairs, seed=options.seed)
+    drawn = {(drive.name, band): draw(drive, band) for drive in drives for band in BANDS}
+    cases = [
+        {"drive": drive, "band": band, "pair": number}
+        for (drive, band), pairs in drawn.items()
+        for number in range(len(pairs))
+    ]
+
+    @lru_cache(maxsize=1)  # the yaws of the pairs of a band come from one stream
+    def read(drive: str, band: str) -> list[deeppointmap.ScanPair]:
+        return list(deeppointmap.read_scan_pairs(by_name[drive], drawn[drive, band], seed=options.seed))
 
     def work(drive: str, band: str, pair: int) -> cli.Row:
-        scans = pairs.read(drive, band, pair)
+        scans = read(drive, band)[pair]
         found = deeppointmap.register_in_stages(model, scans)
         row: cli.Row = {"confidence": found.confidence}
         for stage, T in zip(STAGES, (found.descriptors, found.verified, found.refined), strict=True):
@@ -163,7 +143,7 @@ def fill_pairs(
             row |= {f"{name}_s": time.perf_counter() - begun, **motion_errors(name, T, scans)}
         return row
 
-    return cli.fill_table(run, pairs.cases, work)
+    return cli.fill_table(run, cases, work)
 
 
 def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.ScanPair) -> cli.Row:
@@ -177,70 +157,46 @@ def motion_errors(name: str, T_target_source: np.ndarray, pair: deeppointmap.Sca
 
 
 def fill_overlap(
-    run: cli.Run, model: deeppointmap.Model, drives: Sequence[LidarSequence], num_pairs: int, seed: int
+    run: cli.Run, model: deeppointmap.Model, drives: Sequence[LidarSequence], options: EvaluateOptions
 ) -> list[cli.Row]:
     """Fills overlap.csv with AUC and Brier score of the overlap probability of each drive; None without pairs."""
     by_name = {drive.name: drive for drive in drives}
 
     def work(drive: str) -> cli.Row:
-        found = deeppointmap.evaluate_overlap(model, by_name[drive], num_pairs, seed=seed)
+        num_pairs = OVERLAP_FACTOR * options.pairs
+        found = deeppointmap.evaluate_overlap(model, by_name[drive], num_pairs, seed=options.seed)
+        row: cli.Row = {"num_pairs": len(found.is_overlap), "has_revisits": found.has_revisits}
         head = None if found.by_head is None else found._replace(probability=found.by_head)
-        return {
-            "num_pairs": len(found.is_overlap),
-            "has_revisits": found.has_revisits,
-            "auc": found.area_under_curve,
-            "brier": found.brier_score,
-            "auc_head": None if head is None else head.area_under_curve,
-            "brier_head": None if head is None else head.brier_score,
-        }
+        for suffix, one in (("", found), ("_head", head)):
+            row[f"auc{suffix}"] = None if one is None else one.area_under_curve
+            row[f"brier{suffix}"] = None if one is None else one.brier_score
+        return row
 
     return cli.fill_table(run, [{"drive": name} for name in by_name], work, "overlap.csv")
 
 
-def summarize_pairs(
-    rows: Sequence[cli.Row], overlap: Sequence[cli.Row], methods: Sequence[str], columns: Sequence[str]
-) -> list[cli.Row]:
+def summarize_pairs(rows: Sequence[cli.Row], overlap: Sequence[cli.Row], matchers: Sequence[str] = ()) -> list[cli.Row]:
     """Returns the shares of right motions and their median errors, by drive and band, and the AUC."""
-    auc = {row["drive"]: row["auc"] for row in overlap}
-    errors = {f"{name}_m": f"{name}_right" for name in methods}
-    of_right = [
-        row | {name: row.get(name) if row.get(right) else None for name, right in errors.items()} for row in rows
+    methods, auc = (*STAGES, *matchers), {row["drive"]: row["auc"] for row in overlap}
+    rights, errors = ([f"{name}_{kind}" for name in methods] for kind in ("right", "m"))
+    near = [
+        row | {error: row.get(error) if row.get(right) else None for right, error in zip(rights, errors, strict=True)}
+        for row in rows
+        if row["band"] != "far"
     ]
-    near = [row for row in of_right if row["band"] != "far"]
-    return [row | {"overlap_auc": auc.get(row["drive"])} for row in cli.summarize(near, ("drive", "band"), columns)]
+    summary = cli.summarize(near, ("drive", "band"), (*rights, *errors, "pair_s", *(f"{name}_s" for name in matchers)))
+    return [row | {"overlap_auc": auc.get(row["drive"])} for row in summary]
 
 
-def rate_confidence(model: deeppointmap.Model, rows: Sequence[cli.Row]) -> cli.Row:
-    """Returns the Brier scores of the confidence for all pairs and for each band, and a verdict."""
-
-    def brier(some: Sequence[cli.Row]) -> float:
-        confidence, is_right = (np.array([row[name] for row in some]) for name in ("confidence", "refined_right"))
-        return metrics.brier_score(confidence, is_right)
-
+def rate_confidence(run: cli.Run, model: deeppointmap.Model, rows: Sequence[cli.Row], title: str) -> cli.Row:
+    """Returns the Brier score of the confidence and a verdict, and draws reliability.png, for all pairs."""
     if not rows:
         return {"verdict": "no pair is registered"}
-    near, is_calibrated = [row for row in rows if row["band"] != "far"], model.config.calibration is not None
-    bands = {f"brier_{band}": brier(some) for band in BANDS if (some := [row for row in rows if row["band"] == band])}
-    right = sum(row["refined_right"] for row in near)
-    verdict = f"{right} of {len(near)} pairs are registered right; Brier score of the confidence {brier(rows):.3f}"
-    verdict += " (0 is best)" if is_calibrated else " (0 is best; these weights are not calibrated)"
-    return {"brier": brier(rows), **bands, "is_calibrated": is_calibrated, "verdict": verdict}
-
-
-def draw_evaluation(
-    run: cli.Run, model: deeppointmap.Model, pairs: PairReader, rows: Sequence[cli.Row], title: str
-) -> None:
-    """Draws reliability.png and failures.png: wrong registrations of overlapping pairs, with the highest confidence."""
     confidence, is_right = (np.array([row[name] for row in rows]) for name in ("confidence", "refined_right"))
+    is_near, is_calibrated = np.array([row["band"] != "far" for row in rows]), model.config.calibration is not None
+    brier = metrics.brier_score(confidence, is_right)
+    verdict = f"{is_right[is_near].sum()} of {is_near.sum()} pairs are registered right; "
+    verdict += f"Brier score of the confidence {brier:.3f} (0 is best"
+    verdict += ")" if is_calibrated else "; these weights are not calibrated)"
     viz.save_figure(viz.reliability_figure(confidence, is_right, title=f"{title}, all pairs"), run / "reliability.png")
-    wrong = [row for row in rows if row["band"] != "far" and not row["refined_right"]]
-    shown = []
-    for row in sorted(wrong, key=lambda row: -row["confidence"])[:NUM_SHOWN]:
-        pair = pairs.read(row["drive"], row["band"], row["pair"])
-        a, b = pairs.drawn[row["drive"], row["band"]][row["pair"]]
-        title = f"{row['drive']}: scan {a} onto {b}, confidence {row['confidence']:.2f}"
-        refined = deeppointmap.register_in_stages(model, pair).refined
-        motions = {"estimated motion": refined, "true motion": pair.T_target_source}
-        shown.append(viz.RegisteredPair(title, pair.source, pair.target, motions, (f"scan {a}", f"scan {b}")))
-    if shown:
-        viz.save_figure(viz.registered_pairs_figure(shown), run / "failures.png")
+    return {"brier": brier, "is_calibrated": is_calibrated, "verdict": verdict}

@@ -8,33 +8,20 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from dpmjax import saved_maps, slam, weights
-from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive
-from dpmjax.cli.run import Numbers, Run
-from dpmjax.cli.run_folder import write_poses
-from dpmjax.cli.slam_run import DriveFolder, find_beginning, run_scans
+from dpmjax.cli.drives import ScanReader, open_drive
+from dpmjax.cli.run import Numbers, Run, write_poses
+from dpmjax.cli.slam_run import map_drive
 from dpmjax.sequences import counted
 
-
-class DrivePlan(NamedTuple):
-    """Settings that all workers share.
-
-    Attributes:
-        options: selection of the scans of a drive, and the weights.
-        settings: settings of SLAM.
-        is_deskewed: True for points with times.
-    """
-
-    options: DriveOptions
-    settings: slam.SlamConfig
-    is_deskewed: bool
+if TYPE_CHECKING:
+    from dpmjax.cli.slam import SlamOptions
 
 
 class MappedAway(NamedTuple):
@@ -51,13 +38,13 @@ class MappedAway(NamedTuple):
     seconds: float
 
 
-def map_drives(client: Any, drives: Sequence[Path], plan: DrivePlan, run: Run) -> Numbers:
+def map_drives(client: Any, options: SlamOptions, settings: slam.SlamConfig, run: Run) -> Numbers:
     """Maps drives, each on a worker, and merges their maps as a tree.
 
     Args:
         client: client of `distributed`.
-        drives: folders that every worker sees.
-        plan: work on each.
+        options: the drives, in folders that every worker sees, the selection of their scans, and the weights.
+        settings: settings of SLAM.
         run: folder of the results, which every worker sees, too.
 
     Returns:
@@ -65,29 +52,26 @@ def map_drives(client: Any, drives: Sequence[Path], plan: DrivePlan, run: Run) -
     """
     from distributed import as_completed
 
-    began = time.perf_counter()
-    folders = [run / f"drive_{number}" for number in range(1, len(drives) + 1)]
-    begun = [client.submit(map_away, each, plan, pure=False) for each in zip(drives, folders, strict=True)]
-    with tqdm(total=len(begun), unit=" drives", dynamic_ncols=True) as bar:
-        for _ in as_completed(begun):
-            run.check_stop()
-            bar.update()
+    began, num = time.perf_counter(), len(options.data)
+    folders = [run / f"drive_{number}" for number in range(1, num + 1)]
+    places = zip(options.data, folders, strict=True)
+    begun = [client.submit(map_away, *place, options, settings, pure=False) for place in places]
+    for _ in tqdm(as_completed(begun), total=num, unit=" drives", dynamic_ncols=True):
+        run.check_stop()
     mapped: list[MappedAway] = client.gather(begun)
     for folder, drive in zip(folders, mapped, strict=True):
         write_poses(folder, drive.T_world_scan, frame="T_world_lidar")
     level = [client.submit(list, [drive.content]) for drive in mapped]
     while len(level) > 1:
         pairs = [level[first : first + 2] for first in range(0, len(level), 2)]
-        level = [client.submit(merge_away, *pair, plan.options.weights) if len(pair) > 1 else pair[0] for pair in pairs]
+        level = [client.submit(merge_away, *pair, options.weights) if len(pair) > 1 else pair[0] for pair in pairs]
     merged: list[bytes] = level[0].result()
-    names = ["map.npz"] if len(merged) == 1 else [f"map_{part}.npz" for part in range(1, len(merged) + 1)]
-    for name, content in zip(names, merged, strict=True):
-        (run / name).write_bytes(content)
+    for part, content in enumerate(merged, start=1):
+        (run / ("map.npz" if len(merged) == 1 else f"map_{part}.npz")).write_bytes(content)
     return {
-        "verdict": f"{counted(len(drives), 'drive')} in {counted(len(merged), 'map')}",
-        "status": "done",
-        "weights": plan.options.weights,
-        "num_drives": len(drives),
+        "verdict": f"{counted(num, 'drive')} in {counted(len(merged), 'map')}",
+        "weights": options.weights,
+        "num_drives": num,
         "num_maps": len(merged),
         "num_scans": sum(len(drive.T_world_scan) for drive in mapped),
         "sent_bytes": sum(len(drive.content) for drive in mapped),
@@ -97,15 +81,12 @@ def map_drives(client: Any, drives: Sequence[Path], plan: DrivePlan, run: Run) -
     }
 
 
-def map_away(place: tuple[Path, Path], plan: DrivePlan) -> MappedAway:
+def map_away(data: Path, folder: Path, options: SlamOptions, settings: slam.SlamConfig) -> MappedAway:
     """Maps a drive in its folder, and continues from the state of an earlier worker if there is one."""
-    began, (data, folder) = time.perf_counter(), place
-    folder.mkdir(parents=True, exist_ok=True)
-    name = plan.options.weights
-    methods = slam.make_methods(weights.load_model(name), plan.settings, weights=name)
-    reader = ScanReader(open_drive(data, plan.options), is_deskewed=plan.is_deskewed, jump=plan.options.jump)
-    mapped = run_scans(DriveFolder(folder), reader, methods, find_beginning(folder, methods, slam.init_slam()))
-    result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
+    began = time.perf_counter()
+    methods = slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
+    reader = ScanReader(open_drive(data, options), is_deskewed=options.deskew, jump=options.jump)
+    _, result = map_drive(folder, reader, methods)
     return MappedAway(result.T_world_scan, saved_maps.map_bytes(result.map, "int8"), time.perf_counter() - began)
 
 

@@ -50,38 +50,29 @@ def main(options: GraphOptions, run: cli.Run) -> cli.Numbers:
     poses, stamps = found.graph.poses, found.graph.ids.astype(np.float64)
     io.write_g2o(run / "graph.g2o", found.graph)
     io.write_tum(run / "trajectory_tum.txt", poses, times=stamps, frame="T_world_node")
-    numbers = graph_numbers(options, found)
-    run.write_numbers(numbers)  # also where a picture fails
-    title = f"{options.graph.stem}: {len(graph.poses)} nodes, {len(graph.edges.source)} edges"
-    tracks = [
-        viz.Track(positions(graph.poses), viz.ODOMETRY, f"before, chi2 {found.chi2_initial:.4g}"),
-        viz.Track(positions(poses), viz.PATH, f"optimised, chi2 {found.chi2:.4g}"),
-    ]
-    viz.save_figure(viz.trajectory_figure(title, tracks), run / "trajectory.png")
-    return numbers
-
-
-def graph_numbers(options: GraphOptions, found: pose_graph.OptimizedPoseGraph) -> cli.Numbers:
-    """Returns the numbers of an optimisation, with its status and verdict."""
     num_let_go = int((found.weights < LET_GO).sum())
     verdict = f"chi2 {found.chi2_initial:.6g} -> {found.chi2:.6g} in {found.iterations} iterations"
     verdict += f", {num_let_go} edges let go" if num_let_go else ""
     if not found.is_converged:
         verdict = f"no minimum after {found.iterations} iterations: give more --iterations, or a kernel: --outlier-chi2"
-    return {
+    numbers = {
         "graph": options.graph.name,
         "status": "done" if found.is_converged else "failed",
         "verdict": verdict,
-        "num_nodes": len(found.graph.poses),
-        "num_edges": len(found.graph.edges.source),
+        "num_nodes": len(poses),
+        "num_edges": len(graph.edges.source),
         "num_held": int(found.graph.held_nodes().sum()),
         "num_edges_let_go": num_let_go,
         "chi2_initial": found.chi2_initial,
         "chi2": found.chi2,
         "iterations": found.iterations,
     }
-
-
-def positions(poses: np.ndarray) -> np.ndarray:
-    """Returns (n, 3) positions of poses in the plane or in space."""
-    return np.column_stack([poses[:, :2], 0 * poses[:, 0]]) if poses.ndim == 2 else poses[:, :3, 3]
+    run.write_numbers(numbers)  # also where a picture fails
+    tracks = []
+    shown = (("before", graph, viz.ODOMETRY, found.chi2_initial), ("optimised", found.graph, viz.PATH, found.chi2))
+    for name, one, color, chi2 in shown:
+        positions = np.pad(one.poses[:, :2], [(0, 0), (0, 1)]) if one.poses.ndim == 2 else one.poses[:, :3, 3]
+        tracks.append(viz.Track(positions, color, f"{name}, chi2 {chi2:.4g}"))
+    title = f"{options.graph.stem}: {len(poses)} nodes, {len(graph.edges.source)} edges"
+    viz.save_figure(viz.trajectory_figure(title, tracks), run / "trajectory.png")
+    return numbers

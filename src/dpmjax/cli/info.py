@@ -18,7 +18,7 @@ import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from dpmjax import cli
 from dpmjax.compile_cache import cpu_model, enable_compile_cache
@@ -60,26 +60,6 @@ def main(options: InfoOptions, run: cli.Run) -> cli.Numbers:
         reasons = filter(None, map(why_not_importable, packages))
         print(f"extra      {extra}: {'; '.join(reasons) or 'installed'}")
     return {}
-
-
-def select_device(device: Literal["cpu", "gpu"] | None) -> None:
-    """Selects the device of JAX; None leaves the choice to JAX.
-
-    Raises:
-        ValueError: there is no such device here.
-    """
-    if device is None:
-        return
-    # JAX reads this with its first array, so the device can be selected after the options are parsed.
-    import jax
-
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError) as error:  # the second where the plugin of the device is not installed
-        raise ValueError(
-            f"--device {device}: JAX finds no such device here; leave the option out or install its plugin"
-        ) from error
 
 
 def environment() -> dict[str, Any]:
@@ -124,7 +104,7 @@ def peak_rss_gb() -> float:
     """Returns the largest resident memory of this process so far, in units of 10^9 bytes."""
     # On Linux, ru_maxrss starts from the parent's size at the fork; VmHWM belongs to this program alone.
     status = Path("/proc/self/status")
-    if status.exists() and (own := re.search(r"^VmHWM:\s*(\d+)", status.read_text(errors="replace"), re.MULTILINE)):
+    if status.exists() and (own := re.search(r"VmHWM:\s*(\d+)", status.read_text(errors="replace"))):
         return int(own[1]) * 1024 / 1e9
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
 

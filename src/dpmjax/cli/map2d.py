@@ -27,22 +27,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation, viz
-from dpmjax.cli.run import Run
 from dpmjax.sequences import FloatArray, ScanSequence
 
 if TYPE_CHECKING:
     from dpmjax.types import ScanSet
 
 # Scans of a recording in metres that lie this far apart are registered.
-_MIN_DISTANCE_M, _MIN_TURN_RAD = 0.5, 0.35
-
-
+MIN_DISTANCE_M, MIN_TURN_RAD = 0.5, 0.35
 # Largest number of printed spans of uncertain scans.
-_NUM_SPANS = 8
+NUM_SPANS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +54,8 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     preset: Literal["fast", "paper"] = "fast"
     """fast: minutes on two cores; paper: architecture, losses and sampling of the paper."""
     init: Annotated[str, arg(metavar="auto|odometry|icp-plane|icp-point|global|zero|FILE")] = "auto"
-    """Initial poses. auto: odometry if there is any, else icp-plane. If the map from odometry cannot be trusted,
-    icp-plane is tried, too. global: exhaustive search of scan pairs, without a first guess. FILE: poses (TUM, KITTI, or
-    x y theta)."""
+    """Initial poses. auto: odometry if there is any, else icp-plane, also if the map from odometry cannot be trusted.
+    global: exhaustive search of scan pairs, without a first guess. FILE: poses (TUM, KITTI, or x y theta)."""
     ordered: bool = True
     """Scans are in time order. --no-ordered ignores the order, and needs --init global."""
     refine: bool = True
@@ -70,8 +65,7 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
     """Stop the fit after S seconds of run time, without compile time."""
     world: Literal[0, 1, 2, "grove"] = 0
-    """Built-in world, if no DATA is given. The numbered worlds have walls. grove: trees, bushes and rocks, no straight
-    wall."""
+    """Built-in world without DATA: numbered ones have walls, grove has trees and rocks."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 
@@ -106,64 +100,84 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
     if recorder.has_map:
         draw_occupancy(run, registered, result, limits)
     cli.draw_loss(run, sequence.unit)
-    run.say(report(sequence.unit, numbers))
+    shown = (f"ate_{sequence.unit}", "code_length", "misfit")
+    candidates = [
+        {"candidate": name, **{column: found.get(column) for column in shown}}
+        for name, found in numbers["candidates"].items()
+    ]
+    run.say(f"{cli.format_table(candidates)}\nkept: {numbers['kept']} (docs/guides/scans_2d.md explains the scores)")
     return numbers
 
 
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
-    """Registers the scans with the recorder as engine of the fit, and prints each stage and one bar."""
+    """Registers the scans with the recorder as engine of the fit, and prints each stage."""
     import jax
 
-    bar = tqdm(total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}]", desc="registration")
+    fit = fit_settings(options, sequence)
+    config = registration2d.RegistrationConfig(
+        is_ordered=options.ordered,
+        refine=options.refine,
+        fit=fit,
+        min_distance=MIN_DISTANCE_M if sequence.unit == "m" else None,
+        min_turn=MIN_TURN_RAD,
+    )
 
     def show(stage: str, share: float) -> None:
         if share == 0.0:
-            bar.write(f"{stage} ...")
+            print(f"{stage} ...", flush=True)
 
     def engine(rows: np.ndarray) -> Callable[..., deepmapping.Fit]:
         if len(rows) < len(sequence):
-            bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
+            print(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
-        unit = fit_settings(options, sequence).unit or geometry.typical_range(fitted.points, fitted.mask)
+        unit = fit.unit or geometry.typical_range(fitted.points, fitted.mask)
         return partial(recorder, measure=ate_of(fitted, unit))
 
-    def advance(share: float) -> None:
-        bar.update(share - bar.n)
-
-    hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine, advance)
-    with bar:
-        return registration2d.register_scans(
-            scan_set_of(sequence),
-            registration_settings(options, sequence),
-            key=jax.random.key(options.seed),
-            start=start,
-            odometry=sequence.odometry_poses if options.ordered else None,
-            hooks=hooks,
-        )
+    return registration2d.register_scans(
+        scan_set_of(sequence),
+        config,
+        key=jax.random.key(options.seed),
+        start=start,
+        odometry=sequence.odometry_poses if options.ordered else None,
+        hooks=registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine),
+    )
 
 
 def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> cli.Numbers:
     """Returns the numbers of a registration under the names of `metrics.json`; given poses are named by their file."""
-    registered = sequence.take(result.recording.chosen)
-    start, kept = (result.candidates[name].poses for name in (result.start, result.kept))
+    registered, unit = sequence.take(result.recording.chosen), sequence.unit
+    numbers: cli.Numbers = {
+        "status": "done" if result.assessment.is_trusted else "uncertain",
+        "verdict": trust_verdict(result.assessment._asdict()),
+        "num_scans": len(sequence),
+        "num_registered": len(registered),
+        "success": None,
+    }
+    candidates = {
+        name: metrics.planar_errors(registered, candidate.poses) | candidate.score._asdict()
+        for name, candidate in result.candidates.items()
+    }
+    if registered.reference_poses is not None:
+        before, after = (
+            metrics.planar_errors(registered, result.candidates[name].poses) for name in (result.start, result.kept)
+        )
+        # The paper's threshold is 20 pixels, 2 % of its world. The threshold of a real place is 2 % of the span of its
+        # trajectory.
+        span = float(np.linalg.norm(np.ptp(registered.reference_poses[:, :2], axis=0)))
+        threshold = 20.0 if unit == "px" else 0.02 * span
+        numbers |= {**after, **named_initial(before), f"success_threshold_{unit}": threshold}
+        numbers["success"] = after[f"ate_{unit}"] < threshold
 
     def title(name: str) -> str:
         return name.replace(registration2d.GIVEN_POSES, f"poses of {Path(options.init).name}")
 
     return {
-        "status": "done" if result.assessment.is_trusted else "uncertain",
-        "verdict": trust_verdict(result.assessment._asdict()),
-        "num_scans": len(sequence),
-        "num_registered": len(registered),
-        **before_and_after(registered, start, kept),
+        **numbers,
         "start": title(result.start),
         "kept": title(result.kept),
-        "candidates": {
-            title(name): metrics.planar_errors(registered, candidate.poses) | candidate.score._asdict()
-            for name, candidate in result.candidates.items()
-        },
+        "candidates": {title(name): found for name, found in candidates.items()},
         "assessment": result.assessment._asdict(),
     }
 
@@ -171,42 +185,26 @@ def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, 
 def read_scans(options: Map2dOptions) -> ScanSequence:
     """Returns the chosen scans of DATA or of the built-in world."""
     chosen = options.selection
-    if options.data is not None:
-        sequence = io.read_sequence(options.data, selection=chosen, topic=options.topic)
-        if not registration2d.find_originals(scan_set_of(sequence)).any():
-            raise ValueError(f"{options.data}: all scans are equal beam by beam; give scans of a robot that moves")
-        return sequence
-    sequence = simulation.simulate_sequence(
-        options.world, chosen.stop or 256, range_noise_px=options.range_noise_px, seed=options.seed, with_odometry=True
-    )
-    return sequence.take(chosen)
+    if options.data is None:
+        num, noise_px = chosen.stop or 256, options.range_noise_px
+        return simulation.simulate_sequence(
+            options.world, num, range_noise_px=noise_px, seed=options.seed, with_odometry=True
+        ).take(chosen)
+    sequence = io.read_sequence(options.data, selection=chosen, topic=options.topic)
+    if not registration2d.find_originals(scan_set_of(sequence)).any():
+        raise ValueError(f"{options.data}: all scans are equal beam by beam; give scans of a robot that moves")
+    return sequence
 
 
 def starting_poses(options: Map2dOptions, sequence: ScanSequence) -> str | FloatArray:
     """Returns the name of the initial poses, or the poses of the file of `--init` for all scans."""
-    init = options.init
+    init, words = options.init, ("auto", *registration2d.START_NAMES)
     if init == "odometry" and sequence.odometry_poses is None:
-        raise ValueError(
-            f"{sequence.name}: has no odometry of its own (its odometry column repeats the corrected pose, or is "
-            "missing); use --init icp-plane"
-        )
-    words = ("auto", *registration2d.START_NAMES)
-    if init in words:
-        return init
-    if not Path(init).exists():
+        reason = "has no odometry of its own (its odometry column repeats the corrected pose, or is missing)"
+        raise ValueError(f"{sequence.name}: {reason}; use --init icp-plane")
+    if init not in words and not Path(init).exists():
         raise ValueError(f"--init {init}: no such file, and none of {', '.join(words)}")
-    return io.read_planar_poses(init, len(sequence), sequence.unit)
-
-
-def registration_settings(options: Map2dOptions, sequence: ScanSequence) -> registration2d.RegistrationConfig:
-    """Returns the settings of the registration; scans in metres are chosen by their motion."""
-    return registration2d.RegistrationConfig(
-        is_ordered=options.ordered,
-        refine=options.refine,
-        fit=fit_settings(options, sequence),
-        min_distance=_MIN_DISTANCE_M if sequence.unit == "m" else None,
-        min_turn=_MIN_TURN_RAD,
-    )
+    return init if init in words else io.read_planar_poses(init, len(sequence), sequence.unit)
 
 
 def fit_settings(options: Map2dOptions, sequence: ScanSequence) -> deepmapping.DeepMappingConfig:
@@ -225,23 +223,6 @@ def ate_of(sequence: ScanSequence, unit: float) -> Callable[[FloatArray], float]
     return lambda poses: float(metrics.absolute_trajectory_error(unit * poses[:, :2], reference[:, :2]))
 
 
-def before_and_after(sequence: ScanSequence, start: FloatArray, poses: FloatArray) -> dict[str, Any]:
-    """Returns errors of the kept and of the initial poses; `success` is None without a reference."""
-    reference, unit = sequence.reference_poses, sequence.unit
-    if reference is None:
-        return {"success": None}
-    after, before = metrics.planar_errors(sequence, poses), metrics.planar_errors(sequence, start)
-    # The paper's threshold is 20 pixels, 2 % of its world. The threshold of a real place is 2 % of the span of its
-    # trajectory.
-    threshold = 20.0 if unit == "px" else 0.02 * float(np.linalg.norm(np.ptp(reference[:, :2], axis=0)))
-    return {
-        **after,
-        **named_initial(before),
-        f"success_threshold_{unit}": threshold,
-        "success": after[f"ate_{unit}"] < threshold,
-    }
-
-
 def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
     """Renames errors for the initial poses, such as ate_m to ate_initial_m, and leaves out counts."""
     errors = {name: value for name, value in numbers.items() if not name.startswith("num_")}
@@ -251,15 +232,15 @@ def named_initial(numbers: Mapping[str, float]) -> dict[str, float]:
 def trust_verdict(assessment: Mapping[str, Any]) -> str:
     """Returns the verdict on trust with its reason, the fault of the odometry, and the uncertain scans."""
     trust = "can be trusted" if assessment["is_trusted"] else "DO NOT TRUST this map"
-    weakest, contradiction = assessment["weakest_connection"], assessment["contradiction"]
     # Near zero the difference of two shares has either sign.
-    more = f"{max(contradiction, 0.0):.1%} more beams than between the best pairs"
-    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {more} end in the free space of another scan"
+    contradiction, weakest = max(assessment["contradiction"], 0.0), assessment["weakest_connection"]
+    text = f"{trust}: the weakest connection scores {weakest:.2f} of 1; {contradiction:.1%} more beams than between "
+    text += "the best pairs end in the free space of another scan"
     if assessment["fault"] is not None:
         text += f"; {assessment['fault']}"
     if count := len(assessment["uncertain_scans"]):
         spans = spans_of(assessment["uncertain_scans"])
-        shown = ", ".join(spans[:_NUM_SPANS]) + (" ..." if len(spans) > _NUM_SPANS else "")
+        shown = ", ".join(spans[:NUM_SPANS]) + (" ..." if len(spans) > NUM_SPANS else "")
         text += f"; uncertain where {count} scans are, which slide along a corridor or fit no other: {shown}"
     return text
 
@@ -268,21 +249,6 @@ def spans_of(rows: Sequence[int]) -> list[str]:
     """Returns increasing numbers as spans, such as 3-5 and 9."""
     parts = np.split(np.asarray(rows), np.flatnonzero(np.diff(rows) > 1) + 1)
     return [f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts if len(part)]
-
-
-def report(unit: str, numbers: Mapping[str, Any]) -> str:
-    """Returns errors and scores of each candidate, the kept candidate, and errors against further references."""
-    candidates = numbers["candidates"]
-    width = max(map(len, candidates))
-    has_ate = all(f"ate_{unit}" in found for found in candidates.values())
-    head = f"  {'ATE, ' + unit:>10}" if has_ate else ""
-    lines = [f"  {'candidate':{width}}{head}  nats a beam  beams off a surface"]
-    for name, found in candidates.items():
-        mark, ate = "*" if name == numbers["kept"] else " ", f"  {found[f'ate_{unit}']:10.3g}" if has_ate else ""
-        lines.append(f"{mark} {name:{width}}{ate}  {found['code_length']:11.3f}  {found['misfit']:19.1%}")
-    why = "chosen without the reference" if has_ate else "no reference was given"
-    lines.append(f"kept: {numbers['kept']} ({why}; docs/guides/scans_2d.md explains both scores)")
-    return "\n".join(lines)
 
 
 def scan_set_of(sequence: ScanSequence) -> ScanSet:
@@ -295,29 +261,27 @@ def scan_set_of(sequence: ScanSequence) -> ScanSet:
 
 
 def draw_map(
-    run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
+    run: cli.Run, registered: ScanSequence, result: registration2d.RegisteredScans, numbers: Mapping[str, Any]
 ) -> viz.Limits:
     """Draws map.png: the start, DeepMapping if it was trained, the kept map, the reference. Returns its limits."""
-    scans, unit, reference = scan_set_of(registered), registered.unit, registered.reference_poses
+    unit, reference = registered.unit, registered.reference_poses
     poses, anchor = {}, None
-    titles = dict(zip(result.candidates, numbers["candidates"], strict=True))
-    shown = dict.fromkeys((result.start, registration2d.DEEPMAPPING, result.kept))
-    for name in [name for name in shown if name in result.candidates]:
-        title, found, is_kept = titles[name], numbers["candidates"][titles[name]], name == result.kept
-        ate, distance = found.get(f"ate_{unit}"), found.get(f"point_distance_{unit}")
-        title = title[0].upper() + title[1:] + (" (kept)" if is_kept else "") + "\n"
-        errors = {"ATE": ate, "points": distance}.items()
-        title += "   ".join(f"{name} {viz.format_length(e, unit)}" for name, e in errors if e is not None)
-        poses[title], anchor = result.candidates[name].poses, title if is_kept else anchor
+    for name, (title, found) in zip(result.candidates, numbers["candidates"].items(), strict=True):
+        if name not in (result.start, registration2d.DEEPMAPPING, result.kept):
+            continue
+        title = title[0].upper() + title[1:] + (" (kept)" if name == result.kept else "") + "\n"
+        errors = {"ATE": found.get(f"ate_{unit}"), "points": found.get(f"point_distance_{unit}")}.items()
+        title += "   ".join(f"{label} {viz.format_length(e, unit)}" for label, e in errors if e is not None)
+        poses[title], anchor = result.candidates[name].poses, title if name == result.kept else anchor
     if reference is not None:
         poses["Reference\n"], anchor = reference, None
-    figure = viz.registered_scans_figure(scans, poses, unit, anchor=anchor)
+    figure = viz.registered_scans_figure(scan_set_of(registered), poses, unit, anchor=anchor)
     viz.save_figure(figure, run / "map.png")
     return viz.Limits(*figure.axes[0].get_xlim(), *figure.axes[0].get_ylim())
 
 
 def draw_occupancy(
-    run: Run, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
+    run: cli.Run, registered: ScanSequence, result: registration2d.RegisteredScans, limits: viz.Limits
 ) -> None:
     """Draws occupancy.png: the occupancy that M-Net predicts, in the frame and within the limits of map.png."""
     picture = deepmapping.map_picture(result.fitted, registered.points, registered.mask)

@@ -22,10 +22,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, io, saved_maps, slam, viz, weights
-from dpmjax.cli import slam_results
+from dpmjax.cli import slam_run
 from dpmjax.sequences import counted
 
 # Points below this height above the lidar are the ground.
@@ -53,106 +54,79 @@ def main(options: MergeOptions, run: cli.Run) -> cli.Numbers:
     methods = slam.make_methods(weights.load_model(options.weights), weights=options.weights)
     maps = [cli.open_map(path, methods) for path in options.maps]
     run.open()
-    with cli.counting_bar("loops between maps", " keyframes") as on_keyframe:
+    with tqdm(desc="loops between maps", unit=" keyframes", dynamic_ncols=True) as bar:
+
+        def on_keyframe(num_done: int, _: int) -> None:
+            bar.update(num_done - bar.n)
+
         merged = slam.merge_maps(methods, *maps, on_keyframe=on_keyframe)
-    write_maps(run, maps, merged)
-    numbers = {"weights": options.weights, **merge_numbers(options.maps, maps, merged)}
+    num_parts = len(merged.maps)
+    files = ["map.npz"] if num_parts == 1 else [f"map_{part}.npz" for part in range(1, num_parts + 1)]
+    for file, slam_map in zip(files, merged.maps, strict=True):
+        saved_maps.save_map(run / file, slam_map)
+    io.write_g2o(run / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
+    ends = [
+        {"map": row, "scan": keyframe.scan} for row, each in enumerate(maps, start=1) for keyframe in each.keyframes
+    ]
+    cli.write_loops(run / "loops.csv", merged.loops, ends)
+    # Most maps are called map.npz, so their folders are named, too.
+    names = [str(Path(*path.parts[-2:])) for path in options.maps]
+    numbers = {"weights": options.weights, **merge_numbers(names, files, maps, merged)}
     run.write_numbers(numbers)  # also where a picture fails
-    parts = len(merged.maps)
-    title = f"{len(maps)} maps" + (f", {parts} after merging" if parts > 1 else " in one")
-    panels = [panel_of(options.maps, merged, part) for part in range(parts)]
+    title = f"{len(maps)} maps" + (f", {num_parts} after merging" if num_parts > 1 else " in one")
+    panels = [panel_of(names, merged, part) for part in range(num_parts)]
     viz.save_figure(viz.figure(panels, title=title), run / "map.png")
     return numbers
 
 
-def write_maps(run: cli.Run, maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> None:
-    """Writes the maps, the graph and the table of loops."""
-    for part, slam_map in enumerate(merged.maps, start=1):
-        saved_maps.save_map(run / map_name(part, len(merged.maps)), slam_map)
-    io.write_g2o(run / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
-    ends = [
-        {"map": number, "scan": keyframe.scan}
-        for number, each in enumerate(maps, start=1)
-        for keyframe in each.keyframes
-    ]
-    cli.write_loops(run / "loops.csv", merged.loops, ends)
-
-
-def map_name(part: int, num_parts: int) -> str:
-    """Returns the name of the file of a part, counted from 1."""
-    return "map.npz" if num_parts == 1 else f"map_{part}.npz"
-
-
-def short_name(path: Path) -> str:
-    """Returns the name of a map with its folder, because most maps are called map.npz."""
-    return str(Path(*path.parts[-2:]))
-
-
-def merge_numbers(paths: Sequence[Path], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps) -> cli.Numbers:
-    """Returns the content of `metrics.json`: connected maps, and the numbers of loops and keyframes."""
-    parts: list[cli.Numbers] = [
-        {
-            "file": map_name(part, len(merged.maps)),
-            "maps": [number for number, component in enumerate(merged.component, start=1) if component == part - 1],
-            "num_keyframes": len(slam_map),
-            "num_measured_parts": slam_results.count_parts(slam_map),
-        }
-        for part, slam_map in enumerate(merged.maps, start=1)
-    ]
-    is_measured = all(part["num_measured_parts"] < 2 for part in parts)
+def merge_numbers(
+    names: Sequence[str], files: Sequence[str], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps
+) -> cli.Numbers:
+    """Returns status, verdict, connected maps, and the numbers of loops and keyframes."""
     ends = cli.accepted_ends(merged.loops)
+    parts: list[cli.Numbers] = []
+    texts = [f"{counted(len(ends), 'loop')} between maps, of {counted(len(merged.loops), 'candidate')}"]
+    for part, (file, slam_map) in enumerate(zip(files, merged.maps, strict=True)):
+        members = [number for number, component in enumerate(merged.component, start=1) if component == part]
+        num_measured, num_keyframes = slam_run.count_parts(slam_map), len(slam_map)
+        parts.append(
+            {"file": file, "maps": members, "num_keyframes": num_keyframes, "num_measured_parts": num_measured}
+        )
+        text = "one map now" if len(members) > 1 else "no common place with another map"
+        text += f", in {num_measured} parts whose relative poses are guesses" if num_measured > 1 else ""
+        shown = ", ".join(names[number - 1] for number in members)
+        texts.append(f"{shown}: {text}, {counted(num_keyframes, 'keyframe')}, {file}")
     meetings = Counter(map(tuple, np.sort(merged.joined.map_of_keyframe[ends] + 1, axis=1).tolist()))
-    numbers = {
-        "status": "done" if is_measured else "uncertain",
+    return {
+        "status": "done" if all(part["num_measured_parts"] < 2 for part in parts) else "uncertain",
+        "verdict": "; ".join(texts),
         "num_maps": len(maps),
         "num_parts": len(parts),
         "num_loops": len(ends),
         "num_candidates": len(merged.loops),
         "num_keyframes": len(merged.joined.slam_map),
         "parts": parts,
-        "maps": [
-            {"map": number, "file": short_name(path), "num_keyframes": len(each)}
-            for number, (path, each) in enumerate(zip(paths, maps, strict=True), start=1)
-        ],
+        "maps": names,
         "loops_between": [{"maps": list(pair), "num_loops": number} for pair, number in sorted(meetings.items())],
     }
-    return {"verdict": merge_text(numbers), **numbers}
 
 
-def panel_of(paths: Sequence[Path], merged: slam.MergedMaps, part: int) -> viz.Panel:
-    """Returns the panel of a part: its maps with their surfaces and keyframes, and the loops between them."""
+def panel_of(names: Sequence[str], merged: slam.MergedMaps, part: int) -> viz.Panel:
+    """Returns the panel of a part: its maps, each with its surface and keyframes, and the loops between them."""
+    slam_map, map_of_keyframe = merged.joined.slam_map, merged.joined.map_of_keyframe
     members = [number for number, component in enumerate(merged.component) if component == part]
+    layers: list[viz.Layer] = []
+    for number in members:
+        rows, color = np.flatnonzero(map_of_keyframe == number), viz.AGENTS[number % len(viz.AGENTS)]
+        T = slam_map.T_world_keyframe[rows]
+        points = [slam.keyframe_points(slam_map, int(row)) for row in rows]
+        cloud = cli.gather_map(T, points.__getitem__)
+        label = f"{names[number]}, {counted(len(rows), 'keyframe')}"
+        surface = viz.Points(cloud.points[cloud.heights_m > GROUND_M], color)
+        layers += [surface, viz.Track(T[:, :3, 3], color, label)]
     ends = cli.accepted_ends(merged.loops)
-    ends = ends[np.isin(merged.joined.map_of_keyframe[ends[:, 0]], members)]
+    ends = ends[np.isin(map_of_keyframe[ends[:, 0]], members)]
+    loops = viz.Edges(slam_map.T_world_keyframe[ends, :3, 3], viz.INK, "loops between them")
     is_joined = len(members) > 1
-    text = f"in the frame of {short_name(paths[members[0]])}" if is_joined else "no common place with another map"
-    layers = [layer for number in members for layer in layers_of(paths[number], merged, number)]
-    loops = merged.joined.slam_map.T_world_keyframe[ends, :3, 3]
-    return viz.Panel(text, [*layers, viz.Edges(loops, viz.INK, "loops between them")])
-
-
-def layers_of(path: Path, merged: slam.MergedMaps, number: int) -> list[viz.Layer]:
-    """Returns the keyframes of a map and the points of their surfaces, in its colour."""
-    slam_map = merged.joined.slam_map
-    rows = np.flatnonzero(merged.joined.map_of_keyframe == number)
-    T_world_keyframe = slam_map.T_world_keyframe[rows]
-    cloud = cli.gather_map(T_world_keyframe, lambda row: slam.keyframe_points(slam_map, int(rows[row])))
-    color = viz.AGENTS[number % len(viz.AGENTS)]
-    label = f"{short_name(path)}, {counted(len(rows), 'keyframe')}"
-    surface = viz.Points(cloud.points[cloud.heights_m > GROUND_M], color)
-    return [surface, viz.Track(T_world_keyframe[:, :3, 3], color, label)]
-
-
-def merge_text(metrics: cli.Numbers) -> str:
-    """Returns the verdict: one phrase for each part, with the maps in it."""
-    names = {entry["map"]: entry["file"] for entry in metrics["maps"]}
-    texts = [
-        f"{counted(metrics['num_loops'], 'loop')} between maps, of {counted(metrics['num_candidates'], 'candidate')}"
-    ]
-    for part in metrics["parts"]:
-        members = ", ".join(names[number] for number in part["maps"])
-        text = "one map now" if len(part["maps"]) > 1 else "no common place with another map"
-        if (num_parts := part["num_measured_parts"]) > 1:
-            text += f", in {num_parts} parts whose relative poses are guesses"
-        texts.append(f"{members}: {text}, {counted(part['num_keyframes'], 'keyframe')}, {part['file']}")
-    return "; ".join(texts)
+    text = f"in the frame of {names[members[0]]}" if is_joined else "no common place with another map"
+    return viz.Panel(text, [*layers, loops])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import re
@@ -11,7 +10,7 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, arg
@@ -44,8 +43,6 @@ class OutputOptions:
     """Folder for the results, instead of results/<command>/<time>."""
     force: FlagCreatePairsOff[bool] = False
     """Replace OUT and everything in it, if it holds an earlier run."""
-    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="cpu|gpu")] = None
-    """Device for the computation. Without it, JAX chooses."""
 
     def __post_init__(self) -> None:
         """Checks the bounds of all options."""
@@ -68,8 +65,7 @@ class RunOptions(OutputOptions):
     seed: Annotated[int, Bound(0)] = 0
     """Seed of all random numbers."""
     resume: FlagCreatePairsOff[bool] = False
-    """Continue an interrupted run: the latest one, or the one in OUT. Options that you do not give keep
-    their earlier values."""
+    """Continue the latest run, or the one in OUT. Options that you do not give keep their earlier values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,9 +118,8 @@ def parse_options(options_type: Any, arguments: Sequence[str], **details: Any) -
     finally:
         os.environ.pop("COLUMNS", None) if width is None else os.environ.update(COLUMNS=width)
     # tyro draws a box: a line with the title, the message, a line across, and help.
-    rows = (row[2:].strip("│ ") for row in re.sub("\x1b[^m]*m", "", box.getvalue()).splitlines()[1:])
-    is_text = lambda row: bool(row.strip(" ─-"))  # noqa: E731
-    message = " ".join(itertools.takewhile(is_text, itertools.dropwhile(lambda row: not is_text(row), rows)))
+    rows = re.sub("\x1b[^m]*m|│", "", box.getvalue()).partition("\n")[2]
+    message = " ".join(re.split(r"\n[ ─-]*\n", rows.strip())[0].split())
     own = f"Error parsing {options_type.__name__}: "
     if message.startswith(own):  # a check of the options themselves
         raise ValueError(message.removeprefix(own))

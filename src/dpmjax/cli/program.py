@@ -32,9 +32,8 @@ EXAMPLES = """examples:
   dpmjax localize out/map.npz scans     find scans in the map of an earlier run
   dpmjax COMMAND --help                 the options of a subcommand"""
 
-EXIT_OK, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 2, 130
-EXIT_BY_SIGNAL = 128
-"""Added to the number of the signal."""
+# The last is added to the number of the signal.
+EXIT_OK, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_BY_SIGNAL = 0, 2, 130, 128
 
 
 def run() -> NoReturn:

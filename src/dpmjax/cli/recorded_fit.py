@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from dpmjax.deepmapping import Fit, Problem, Progress
 
 # Seconds between checkpoints; Ctrl-C and the end write one too.
-_SAVE_EVERY_S = 20.0
+SAVE_EVERY_S = 20.0
 
 
 class FitRecorder:
@@ -30,9 +29,7 @@ class FitRecorder:
     `functools.partial(recorder, measure=...)` is the same engine with a column for the error.
 
     Attributes:
-        steps: number of steps of all runs.
-        run_s: seconds of stepping of all runs, without compilation.
-        compile_s: seconds of compiling.
+        numbers: seconds and steps of all runs, under the names of `metrics.json`.
         has_map: True where M-Net has been trained.
     """
 
@@ -45,7 +42,8 @@ class FitRecorder:
             max_s: seconds of stepping after which the fit ends.
         """
         self._run, self._length, self._max_s = run, length, max_s
-        self.steps, self.run_s, self.compile_s, self.has_map = 0, 0.0, 0.0, False
+        self.numbers: Numbers = {"fit_s": 0.0, "compile_s": 0.0, "steps": 0}
+        self.has_map = False
 
     def __call__(
         self,
@@ -59,61 +57,42 @@ class FitRecorder:
         from dpmjax.checkpoints import Checkpoints
         from dpmjax.deepmapping import init, resume
 
-        state = init(problem, data, key=key)
-        checkpoints = Checkpoints(Path(self._run / CHECKPOINTS))
+        state, checkpoints = init(problem, data, key=key), Checkpoints(self._run / CHECKPOINTS)
         state = checkpoints.restore_latest(state, fallback=state)
         earlier = self._run.continue_table(HISTORY, until=int(state.step))
-        earlier_s = self.run_s = max((float(row["run_s"]) for row in earlier), default=0.0)
-        bar = tqdm(
-            total=1.0, bar_format="{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}{postfix}]", desc="fit"
-        )
+        run_s = earlier_s = max((float(row["run_s"]) for row in earlier), default=0.0)
         saved_at = time.perf_counter()
 
         def record(progress: Progress) -> None:
-            nonlocal saved_at
-            self.run_s = earlier_s + progress.run_s
-            ate = measure(np.asarray(progress.report.poses, np.float64))
-            self._append(progress, ate)
-            self._show(progress, ate, bar)
-            if time.perf_counter() - saved_at > _SAVE_EVERY_S:
-                checkpoints.save(int(progress.state.step), progress.state)
+            nonlocal saved_at, run_s
+            report, phase, step = progress.report, progress.phase.name, int(progress.state.step)
+            run_s, ate = earlier_s + progress.run_s, measure(np.asarray(report.poses, np.float64))
+            terms = {name: float(np.mean(term)) for name, term in report.terms._asdict().items()}
+            row = {"step": step, "phase": phase, "run_s": round(run_s, 4), "loss": report.loss, **terms}
+            self._run.append_row(HISTORY, **row, **{f"ate_{self._length}": ate})
+            ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
+            bar.set_postfix_str(f"{phase}, loss {report.loss:.4f}{ate_text}", refresh=False)
+            bar.update(progress.share - bar.n)
+            if time.perf_counter() - saved_at > SAVE_EVERY_S:
+                checkpoints.save(step, progress.state)
                 saved_at = time.perf_counter()
 
-        with bar:
-            done = resume(problem, state, data, on_report=record, stop=self._is_over)
-        checkpoints.save(int(done.state.step), done.state)
-        self.steps, self.compile_s = int(done.state.step), done.compile_s
-        self.has_map = self.steps > 0 and problem.phases[int(done.state.phase)].occupancy_weight > 0.0
+        bar_format = "{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}{postfix}]"
+        with tqdm(total=1.0, bar_format=bar_format, desc="fit") as bar:
+            stop = lambda: self._run.is_stopped or run_s >= self._max_s  # noqa: E731
+            done = resume(problem, state, data, on_report=record, stop=stop)
+        steps = int(done.state.step)
+        checkpoints.save(steps, done.state)
+        self.numbers = {"fit_s": run_s, "compile_s": done.compile_s, "steps": steps}
+        self.has_map = steps > 0 and problem.phases[int(done.state.phase)].occupancy_weight > 0.0
         return done
-
-    @property
-    def numbers(self) -> Numbers:
-        """Returns seconds and steps under the names of `metrics.json`."""
-        return {"fit_s": self.run_s, "compile_s": self.compile_s, "steps": self.steps}
-
-    def _is_over(self) -> bool:
-        return self._run.is_stopped or self.run_s >= self._max_s
-
-    def _append(self, progress: Progress, ate: float) -> None:
-        """Adds one call of the step to the table."""
-        report = progress.report
-        row = {"step": int(progress.state.step), "phase": progress.phase.name, "run_s": round(self.run_s, 4)}
-        row |= {"loss": report.loss, **{name: float(np.mean(term)) for name, term in report.terms._asdict().items()}}
-        self._run.append_row(HISTORY, **row, **{f"ate_{self._length}": ate})
-
-    def _show(self, progress: Progress, ate: float, bar: tqdm) -> None:
-        """Moves the bar to the share that is done."""
-        ate_text = f", ATE {ate:.3g} {self._length}" if math.isfinite(ate) else ""
-        bar.set_postfix_str(f"{progress.phase.name}, loss {progress.report.loss:.4f}{ate_text}", refresh=False)
-        bar.update(progress.share - bar.n)
 
 
 def draw_loss(run: Run, unit: str) -> None:
     """Draws loss.png: loss and error of the fit over its run time."""
     if rows := run.read_table(HISTORY):
-        seconds, loss, ate = (
-            np.array([float(row[name] or "nan") for row in rows]) for name in ("run_s", "loss", f"ate_{unit}")
-        )
-        curves = {"loss": loss} | ({f"ATE, {unit}": ate} if np.isfinite(ate).any() else {})
-        figure = viz.curves_figure(seconds, curves, x_label="run time, s", phases=[row["phase"] for row in rows])
-        viz.save_figure(figure, run / "loss.png")
+        names = {"run_s": "", "loss": "loss", f"ate_{unit}": f"ATE, {unit}"}
+        curves = {label: np.array([float(row[name] or "nan") for row in rows]) for name, label in names.items()}
+        seconds, phases = curves.pop(""), [row["phase"] for row in rows]
+        curves = {label: curve for label, curve in curves.items() if np.isfinite(curve).any()}
+        viz.save_figure(viz.curves_figure(seconds, curves, x_label="run time, s", phases=phases), run / "loss.png")

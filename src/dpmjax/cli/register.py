@@ -46,8 +46,8 @@ class RegisterOptions(cli.ModelOptions, cli.OutputOptions):
 def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     """Registers two scans and writes the results."""
     paths = (options.source, options.target)
-    source, target = (io.read_lidar_file(path, bin_columns=options.columns) for path in paths)
-    scans = zip(paths, (source, target), strict=True)
+    source, target = clouds = [io.read_lidar_file(path, bin_columns=options.columns) for path in paths]
+    scans = zip(paths, clouds, strict=True)
     notes = [note for path, points in scans for note in io.scan_notes(path, points, bin_columns=options.columns)]
     model = weights.load_model(options.weights)
     run.open(notes)
@@ -61,11 +61,15 @@ def main(options: RegisterOptions, run: cli.Run) -> cli.Numbers:
     # Files of the same name are shown with their folders.
     num_parts = 1 if options.source.name != options.target.name else 2
     files = (str(Path(*options.source.parts[-num_parts:])), str(Path(*options.target.parts[-num_parts:])))
-    is_calibrated = model.config.calibration is not None
-    numbers: cli.Numbers = {"source": files[0], "target": files[1], "weights": options.weights, "T_target_source": T}
-    numbers["translation_m"] = np.linalg.norm(T[:3, 3])
-    numbers["rotation_deg"] = np.degrees(metrics.rotation_angle(T[None, :3, :3]))[0]
-    numbers |= verdict_numbers(found, is_calibrated)
+    numbers = {
+        "source": files[0],
+        "target": files[1],
+        "weights": options.weights,
+        "T_target_source": T,
+        "translation_m": np.linalg.norm(T[:3, 3]),
+        "rotation_deg": np.degrees(metrics.rotation_angle(T[None, :3, :3]))[0],
+        **verdict_numbers(found, model.config.calibration is not None),
+    }
     run.write_numbers(numbers)  # also where a picture fails
     motions = {"before registration": np.eye(4), f"registered, confidence {float(found.confidence):.2f}": T}
     pair = viz.RegisteredPair(f"{files[0]} in the frame of {files[1]}", source, target, motions, files)
@@ -80,25 +84,16 @@ def verdict_numbers(found: Registration, is_calibrated: bool) -> cli.Numbers:
     names = () if found.verification is None else ("visible_share", "matched_share", "contradicted_share")
     shares = {name: float(getattr(found.verification, name)) for name in names}
     confidence, num_inliers = float(found.confidence), int(found.num_inliers)
-    status = "uncertain" if is_calibrated and confidence < SURE else "done"
-    if not is_calibrated:
-        verdict = f"score of the matches {confidence:.2f} (these weights are not calibrated)"
-    else:
-        verdict = f"right within 2 m and 5 degrees with probability {confidence:.2f}"
-        verdict += "" if confidence >= SURE else ": NOT SURE, look at registration.png"
     size = None if found.relative_size is None else float(found.relative_size)
+    status, verdict = "done", f"score of the matches {confidence:.2f} (these weights are not calibrated)"
+    if is_calibrated:
+        verdict = f"right within 2 m and 5 degrees with probability {confidence:.2f}"
+    if is_calibrated and confidence < SURE:
+        status, verdict = "uncertain", f"{verdict}: NOT SURE, look at registration.png"
     if size not in (None, 1.0):
         verdict += f"; the surfaces fit if the source is {size:.3f} times as large as the target: are both in metres?"
     if num_inliers == 0 and not shares.get("matched_share"):
-        status = "failed"
-        verdict = "no motion was found, the identity was written: give scans with walls and other things at 20 places"
-        verdict += " or more, 1 to 60 m from the lidar"
-    return {
-        "status": status,
-        "verdict": verdict,
-        "confidence": confidence,
-        "num_inliers": num_inliers,
-        "relative_size": size,
-        **shares,
-        "is_calibrated": is_calibrated,
-    }
+        status, verdict = "failed", "no motion was found, the identity was written: give scans with walls and other "
+        verdict += "things at 20 places or more, 1 to 60 m from the lidar"
+    numbers = {"confidence": confidence, "num_inliers": num_inliers, "relative_size": size}
+    return {"status": status, "verdict": verdict, **numbers, **shares, "is_calibrated": is_calibrated}

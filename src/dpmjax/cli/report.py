@@ -83,13 +83,14 @@ def _path_and_loops(folder: Path, read_table: ReadTable) -> list[Layer]:
     path, scans = np.load(folder / "trajectory.npy")[:, :3, 3], read_table("scans.csv")
     text = [f"scan {scan['scan']}: {scan['status']}; {scan['reason']}" for scan in scans]
     row_of = {scan["scan"]: row for row, scan in enumerate(scans)}
-    loops = [(row["scan"], row["other_scan"]) for row in read_table("loops.csv") if row["status"] == "accepted"]
-    ends = [[row_of[end] for end in loop] for loop in loops if set(loop) <= row_of.keys()]
-    lines = np.full((len(ends), 3, 3), np.nan)  # a line ends at a point that is no number
-    lines[:, :2] = path[np.array(ends, int).reshape(-1, 2)]
+    lines = np.zeros((0, 3))
+    for loop in read_table("loops.csv"):
+        ends = [row_of.get(loop["scan"]), row_of.get(loop["other_scan"])]
+        if loop["status"] == "accepted" and None not in ends:  # a line ends at a point that is no number
+            lines = np.concatenate([lines, path[np.array(ends, int)], np.full((1, 3), np.nan)])
     drawn = {"line": {"color": "blue", "width": 5}, "marker": {"size": 2}}
     joined = {"mode": "lines", "line": {"color": "green", "width": 5}}
-    return [(path, {"name": "path", "text": text, **drawn}), (lines.reshape(-1, 3), {"name": "loops", **joined})]
+    return [(path, {"name": "path", "text": text, **drawn}), (lines, {"name": "loops", **joined})]
 
 
 def _flat(numbers: dict[str, Any], above: str = "") -> list[Sequence[object]]:

@@ -16,6 +16,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import inspect
+import itertools
+import json
 import logging
 import math
 import os
@@ -26,34 +28,26 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
+from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
+import numpy as np
+
+from dpmjax import io
 from dpmjax.cli import program
-from dpmjax.cli.info import environment, select_device
+from dpmjax.cli.info import environment
 from dpmjax.cli.options import parse_options
 from dpmjax.cli.report import write_report
-from dpmjax.cli.run_folder import (
-    CONFIG,
-    RESULTS,
-    cannot_write,
-    check_replaceable,
-    check_same_options,
-    find_run,
-    load_options,
-    lock_folder,
-    make_latest,
-    write_json,
-    write_table,
-)
 from dpmjax.compile_cache import enable_compile_cache
 from dpmjax.sequences import InputError, Note
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT = program.EXIT_OK, 1, program.EXIT_BAD_INPUT
-METRICS, HISTORY, LOG, CHECKPOINTS = "metrics.json", "metrics.csv", "log.txt", "checkpoints"
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+CONFIG, METRICS, HISTORY, LOG, CHECKPOINTS = "config.json", "metrics.json", "metrics.csv", "log.txt", "checkpoints"
 STOPPING = "\nstopping after the present step, results are kept; a second Ctrl-C ends at once\n"
-LOGGER = logging.getLogger("dpmjax")
+RESULTS, LOGGER = Path("results"), logging.getLogger("dpmjax")
+# Options that do not change the result.
+FREE_OPTIONS = frozenset({"output", "resume", "force", "coordinator", "num_processes", "process_id", "visualize"})
 
 Numbers = dict[str, Any]
 
@@ -87,7 +81,6 @@ class Run:
         """
         self._options, self._started = options, time.perf_counter()
         self._handler: logging.Handler | None = None
-        self._lock: int | None = None
         self._stops: list[BaseException] = []
         self._notes: list[str] = []
         self.is_resumed = getattr(options, "resume", False)
@@ -128,22 +121,20 @@ class Run:
             notes: doubts and decisions on the input.
 
         Raises:
-            ValueError: the folder cannot be written, or another process is writing in it.
+            ValueError: the folder cannot be written.
         """
-        output = self._options.output
+        options = self._options
         try:
-            if output is None and not self.is_resumed:
+            if options.output is None and not self.is_resumed:
                 self.path = make_latest(self.path)
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = lock_folder(self.path)
-            if output is not None and not self.is_resumed:
-                check_replaceable(self.path, self._options)  # another run may have ended here meanwhile
-                for entry in self.path.iterdir():
-                    shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-            write_json(self / CONFIG, self._options)
+            for entry in self.path.iterdir() if options.force else ():
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            write_json(self / CONFIG, options)
             self._handler = logging.FileHandler(self / LOG, encoding="utf-8")
         except OSError as error:
-            raise ValueError(cannot_write(self.path, error.strerror or str(error))) from error
+            reason = error.strerror or str(error)
+            raise ValueError(f"cannot write to {self.path}: {reason}; name another folder with -o") from error
         self._handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         LOGGER.addHandler(self._handler)
         LOGGER.setLevel(logging.INFO)
@@ -158,21 +149,11 @@ class Run:
                 print(note.text, flush=True)
 
     def close(self) -> None:
-        """Ends the log, and lets other processes into the folder."""
+        """Ends the log."""
         if self._handler is not None:
             LOGGER.removeHandler(self._handler)
             self._handler.close()
-        if self._lock is not None:
-            os.close(self._lock)
-        self._handler = self._lock = None
-
-    def part(self, *names: str) -> Run:
-        """Makes or continues a folder inside, such as one for a drive; a signal stops both runs."""
-        part = object.__new__(Run)
-        part.__dict__ |= self.__dict__
-        part.path, part.is_resumed = self.path.joinpath(*names), True
-        part.path.mkdir(parents=True, exist_ok=True)
-        return part
+            self._handler = None
 
     def say(self, text: str) -> None:
         """Prints a text, and writes it to the log."""
@@ -248,14 +229,12 @@ def run_command(
     console.setLevel(logging.WARNING)
     logging.basicConfig(format="dpmjax: %(levelname)s: %(message)s", handlers=[console])
     run: Run | None = None
-    previous = {number: signal.signal(number, _end_at_once) for number in SIGNALS}
+    previous = {number: signal.signal(number, _end_at_once) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         enable_compile_cache()
         options = _read_options(main, name, description, list(sys.argv[1:] if args is None else args))
         run = Run(name, options)
-        if getattr(options, "coordinator", None) is None:  # several processes find each other first
-            select_device(getattr(options, "device", None))
-        for number in SIGNALS:
+        for number in previous:
             signal.signal(number, run.on_signal)
         return _finish(run, main(options, run))
     except SystemExit as done:  # after --help
@@ -293,20 +272,18 @@ def _finish(run: Run, numbers: Numbers) -> int:
 
 def _explain(error: Exception, run: Run | None) -> int:
     """Prints the error in one line, after the traceback if the program is at fault."""
-    text, code = f"{type(error).__name__}: {error}", EXIT_FAILED
-    if run is not None and run.is_open:
+    is_open, text = run is not None and run.is_open, str(error).removesuffix(".")
+    is_usual = isinstance(error, InputError | OSError if is_open else ValueError | PermissionError)
+    if not isinstance(error, InputError) and (is_open or not is_usual):
+        text = f"{type(error).__name__}: {error}"
+    elif isinstance(error, PermissionError):
+        text = f"{error.filename}: {error.strerror}"
+    if run is not None and is_open:
         LOGGER.info("failed", exc_info=error)
-        is_usual = isinstance(error, InputError | OSError)
-        text = str(error).removesuffix(".") if isinstance(error, InputError) else text
         text += f"; what was finished is in {run.path}"
-    elif is_usual := isinstance(error, ValueError | PermissionError):
-        text, code = (
-            str(error) if isinstance(error, ValueError) else f"{error.filename}: {error.strerror}",
-            EXIT_BAD_INPUT,
-        )
     if not is_usual:
         traceback.print_exception(error)
-    return _say(f"error: {text}", code)
+    return _say(f"error: {text}", EXIT_BAD_INPUT if is_usual and not is_open else EXIT_FAILED)
 
 
 def _end_at_once(number: int, _frame: object) -> NoReturn:
@@ -329,13 +306,150 @@ def _read_options(main: Callable[..., Numbers], name: str, description: str | No
         on = {f"--{field.name}" for field in dataclasses.fields(earlier) if getattr(earlier, field.name) is True}
         again = [word for word in arguments if word.replace("-", "_").replace("__", "--", 1) not in on]
         options = parse_options(options_type, again, prog=prog, default=earlier)
-    # The next run moves the link `latest`, and a resumed one must find the same file.
     paths = {field.name: _without_latest(getattr(options, field.name)) for field in dataclasses.fields(options)}
     return dataclasses.replace(options, **{name: value for name, value in paths.items() if name != "output"})
 
 
 def _without_latest(value: Any) -> Any:
+    # The next run moves the link `latest`, and a resumed one must find the same file.
     if isinstance(value, tuple):
         return tuple(map(_without_latest, value))
     is_link = isinstance(value, str | Path) and "latest" in Path(value).parts and Path(value).exists()
     return type(value)(Path(value).resolve()) if is_link else value
+
+
+def load_options(path: Path, options_type: Any) -> Any:
+    """Reads the options of an earlier run; missing options, and those such as `output`, get their defaults.
+
+    Args:
+        path: folder of the run.
+        options_type: dataclass of the options.
+
+    Returns:
+        The options.
+
+    Raises:
+        ValueError: its `config.json` is no JSON, or has an option that `options_type` lacks.
+    """
+    from dpmjax.weights.config_json import config_from_json
+
+    stored = {name: value for name, value in load_json(path / CONFIG).items() if name not in FREE_OPTIONS}
+    try:
+        return config_from_json(stored, options_type)
+    except ValueError as error:
+        raise ValueError(f"{path / CONFIG} holds options of another command or version: {error}") from error
+
+
+def find_run(name: str, output: Path | None) -> Path:
+    """Finds the folder of an earlier run.
+
+    Args:
+        name: name of the command.
+        output: the folder, or None for the latest run of this command.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: there is none.
+    """
+    path = output or RESULTS / name / "latest"
+    if not (path / CONFIG).is_file():
+        raise ValueError(f"{path} holds no {CONFIG}: it is no run of {name}; name one (--resume -o OUT)")
+    return path if output else path.resolve()
+
+
+def check_same_options(path: Path, options: Any) -> None:
+    """Raises a ValueError if a resumed run would have other options than the earlier one."""
+    if options.force:
+        raise ValueError("--resume continues a run and --force starts it over: give one of them")
+    stored, now = load_json(path / CONFIG), as_json(options)
+    for name in sorted(stored.keys() & now.keys() - FREE_OPTIONS - options.may_change):
+        if stored[name] != now[name]:
+            was, is_now = ("not given" if value is None else value for value in (stored[name], now[name]))
+            raise ValueError(
+                f"--{name.replace('_', '-')} was {was} in {path} and is {is_now} now: a resumed run keeps its options; "
+                "start a new run for others"
+            )
+
+
+def check_replaceable(path: Path, options: Any) -> None:
+    """Raises a ValueError for a folder that is not writable or not empty, or that --force must not remove."""
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        reason = "permission denied" if existing.is_dir() else f"{existing} is a file"
+        raise ValueError(f"cannot write to {path}: {reason}; name another folder with -o")
+    if existing != path or not any(path.iterdir()):
+        return
+    if not (path / CONFIG).is_file() or "output" not in load_json(path / CONFIG):
+        raise ValueError(f"{path} is not empty and holds no earlier run: name another folder with -o")
+    if not options.force:
+        resume = "--resume continues it, " if hasattr(options, "resume") else ""
+        raise ValueError(f"{path} holds an earlier run: {resume}--force replaces it, -o names another")
+    values = [
+        value if isinstance(value, tuple) else (value,) for name, value in vars(options).items() if name != "output"
+    ]
+    for value in itertools.chain(*values):
+        is_inside = isinstance(value, str | Path) and Path(value).resolve().is_relative_to(path.resolve())
+        if is_inside and str(value) and Path(value).exists():
+            raise ValueError(f"--force would remove {value}, an input: name another folder with -o")
+
+
+def make_latest(path: Path) -> Path:
+    """Makes a new folder, and points the link `latest` beside it there."""
+    while path.exists():  # a second run of the same second
+        path = path.with_name(f"{path.name}_2")
+    path.mkdir(parents=True)
+    link = path.parent / f".latest_{path.name}"
+    link.symlink_to(path.name, target_is_directory=True)
+    link.replace(path.parent / "latest")
+    return path
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes dataclasses, paths and NumPy values as JSON, atomically; NaN and infinity become null."""
+    io.write_atomically(path, json.dumps(as_json(value), indent=2) + "\n")
+
+
+def as_json(value: Any) -> Any:
+    """Returns the same value made of JSON's types; NaN and infinity become None."""
+
+    def plain(one: Any) -> Any:
+        if dataclasses.is_dataclass(one) and not isinstance(one, type):
+            return dataclasses.asdict(one)
+        return np.asarray(one).tolist() if hasattr(one, "__array__") else str(one)
+
+    return json.loads(json.dumps(value, default=plain), parse_constant=lambda _: None)
+
+
+def load_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object; a file that holds something else is a ValueError."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected a JSON object: {error}") from error
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes these columns as CSV, atomically: numbers with six digits, truth values as 0 and 1, None as empty."""
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        cells = (row[column] for column in columns)
+        writer.writerow([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in cells])
+    io.write_atomically(path, text.getvalue())
+
+
+def write_poses(folder: Path, poses: np.ndarray, name: str = "trajectory", **tum: Any) -> None:
+    """Writes poses in the plane or in space as NAME.npy, NAME_tum.txt and NAME_kitti.txt.
+
+    Args:
+        folder: folder of the files.
+        poses: poses of all scans.
+        name: beginning of the names of the files.
+        **tum: options of `io.write_tum`, such as the times.
+    """
+    io.write_poses_npy(folder / f"{name}.npy", poses)
+    io.write_tum(folder / f"{name}_tum.txt", poses, **tum)
+    io.write_kitti(folder / f"{name}_kitti.txt", poses)

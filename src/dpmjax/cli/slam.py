@@ -17,16 +17,16 @@ localize`. Ctrl-C ends the run and writes all files too.
 
 from __future__ import annotations
 
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from dpmjax import cli, geometry, io, saved_maps, slam, viz, weights
-from dpmjax.cli import slam_results as results
+from dpmjax.cli import slam_run
 from dpmjax.sequences import LidarSequence, Note, counted, homogeneous, require
 
 PROPOSERS = ("prediction", "network")
@@ -39,8 +39,7 @@ class SlamOptions(cli.DriveOptions):
     may_change: ClassVar[frozenset[str]] = frozenset({"n_scans"})
 
     data: Annotated[Positional[tuple[Path, ...]], arg(metavar="[DATA ...]")] = ()
-    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Default: a simulated town. Give
-    several with --cluster."""
+    """Folder of scans, a bag of ROS, or a file of poses: a town is simulated along it. Several with --cluster."""
     sequence: Annotated[str | None, arg(aliases=["-s"], metavar="NAME")] = None
     """Name of the drive, if DATA holds several."""
     map: Annotated[Path | None, arg(metavar="IN")] = None
@@ -48,22 +47,18 @@ class SlamOptions(cli.DriveOptions):
     preset: Literal["default", "paper"] = "default"
     """Settings of SLAM: the default, or the method of the paper, by the decoder alone."""
     odometry: Annotated[str | None, arg(metavar="prediction|network|FILE")] = None
-    """Source of the first guess of a pose: the previous motion, the network for every scan, or a file of odometry. The
-    file has poses by time (TUM), or one pose for each scan. Poses of the robot's frame need --base-from-lidar. Without
-    it, the preset decides."""
+    """First guess of a pose: the previous motion, the network, or a file of odometry, by time (TUM) or one pose a scan.
+    Poses of the robot's frame need --base-from-lidar."""
     max_rmse: float | None = None
-    """With --preset paper: largest error of an accepted registration, metres. The published 0.5 needs a decoder with
-    exact offsets; 2.5 suits dpm_small."""
+    """With --preset paper: largest error of an accepted registration, m; the published 0.5, or 2.5 for dpm_small."""
     no_loop: FlagCreatePairsOff[bool] = False
     """No loop closure: odometry alone."""
     deskew: FlagCreatePairsOff[bool] = False
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     base_from_lidar: Annotated[tuple[float, ...], arg(metavar="X Y Z QX QY QZ QW")] = ()
-    """Pose of the lidar in the frame of the robot, metres and a quaternion, as of ROS. The run then also writes the
-    trajectory of the robot, as trajectory_base."""
+    """Pose of the lidar in the robot's frame, metres and quaternion; the run writes the robot's trajectory, too."""
     cluster: Annotated[str | None, arg(metavar="local|HOST:PORT")] = None
-    """Map each of several drives on a worker of this Dask cluster (extra cluster), and merge their maps. local: one
-    process here for each drive, at most one a core."""
+    """Map several drives on workers of this Dask cluster, and merge their maps. local: processes here, one a drive."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
     """Show the run in the live viewer (extra viewer). Without a screen, OUT gets a recording, slam.rrd."""
 
@@ -78,14 +73,11 @@ class SlamOptions(cli.DriveOptions):
             raise ValueError("--cluster: leave --map, --sequence, --base-from-lidar, -v and --odometry FILE out")
         if self.preset == "paper" and self.odometry in PROPOSERS:
             raise ValueError("--odometry: --preset paper has no first guess, give one of the two")
-        if self.base_from_lidar and (
-            len(self.base_from_lidar) != 7 or abs(np.linalg.norm(self.base_from_lidar[3:]) - 1.0) > 0.01
-        ):
-            raise ValueError(
-                f"--base-from-lidar: expected 3 + 4 numbers, a unit quaternion, got {self.base_from_lidar}"
-            )
         if self.preset != "paper" and self.max_rmse is not None:
             raise ValueError("--max-rmse: give it with --preset paper")
+        given, norm = self.base_from_lidar, np.linalg.norm(self.base_from_lidar[3:])
+        if given and (len(given) != 7 or abs(norm - 1.0) > 0.01):
+            raise ValueError(f"--base-from-lidar: expected 3 + 4 numbers, a unit quaternion, got {given}")
 
     @property
     def T_base_lidar(self) -> np.ndarray | None:
@@ -100,19 +92,17 @@ class SlamOptions(cli.DriveOptions):
 
 def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     """Maps a drive and writes the results."""
-    from dpmjax.cli.slam_run import find_beginning, run_scans
-
     if options.cluster is not None:
         return map_on_cluster(options, run)
     if options.visualize:
         cli.require_importable("rerun", "-v")
     methods = slam_methods(options)
     # A map of other weights is refused here, before the scans are opened.
-    start = slam.init_slam(None if options.map is None else results.open_map(options.map, methods))
+    start = slam.init_slam(None if options.map is None else slam_run.open_map(options.map, methods))
     sequence = cli.open_drive(next(iter(options.data), None), options, options.sequence)
     odometry, notes = odometry_of(options, sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
-    beginning = find_beginning(cli.find_run("slam", options.output) if options.resume else None, methods, start)
+    beginning = slam_run.find_beginning(run.path if run.is_resumed else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{counted(num_done, 'scan')} done, {len(sequence)} wanted"
     require(num_done <= len(sequence), sequence.name, found, f"give -n {num_done} or more, or another folder with -o")
@@ -120,29 +110,38 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     run.say(f"{sequence.name}: {counted(len(sequence), 'scan')}" + (f", {num_done} done before" if num_done else ""))
     viewer = viz.LiveViewer(sequence.name, run / "slam.rrd") if options.visualize else None
     with nullcontext() if viewer is None else closing(viewer):
-        mapped = run_scans(run, reader, methods, beginning, viewer=viewer, odometry=odometry)
+        mapped = slam_run.run_scans(
+            run.path, reader, methods, beginning, stop=lambda: run.is_stopped, viewer=viewer, odometry=odometry
+        )
+    if mapped.error is not None:
+        run.fail(mapped.error)
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)
     placed = sequence.take(slice(0, len(result.reports)))
-    num_new = len(mapped.scan_s)
-    numbers = {
-        "weights": options.weights,
-        **results.run_numbers(result, placed),
-        "scans_per_s": num_new / mapped.run_s if num_new else None,
-        "run_s": mapped.run_s,
-        "compile_s": mapped.compile_s,
-    }
+    scans_per_s = len(mapped.scan_s) / mapped.run_s if mapped.scan_s else None
+    numbers = {"weights": options.weights, **slam_run.run_numbers(result, placed), "scans_per_s": scans_per_s}
+    numbers |= {"run_s": mapped.run_s, "compile_s": mapped.compile_s}
+    if odometry is not None and len(result.reports) > 2:
+        errors = slam.compare_odometry(odometry[: len(result.reports)], result.T_world_scan)
+        numbers |= {"odometry_step_m": errors.step_m, "odometry_delay_scans": errors.delay_scans}
+        run.say(odometry_text(errors, placed))
     if result.reports:
         if options.T_base_lidar is not None:
             poses = options.T_base_lidar @ result.T_world_scan @ geometry.rigid.inverse(options.T_base_lidar)
             cli.write_poses(run.path, poses, "trajectory_base", times=placed.times, frame="T_world_base")
-        numbers |= write_map_results(run, placed, start, result, numbers)
-    if errors := results.error_text(numbers):
-        run.say(errors)
-    if odometry is not None and len(result.reports) > 2:
-        numbers |= results.odometry_numbers(odometry[: len(result.reports)], placed, result, run)
-    if num_new:
-        run.say(f"{numbers['scans_per_s']:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
+        numbers = write_map_results(run, placed, start, result, numbers)
+    if scans_per_s is not None:
+        run.say(f"{scans_per_s:.1f} scans/s; compilation took {mapped.compile_s:.0f} s more")
     return numbers
+
+
+def odometry_text(found: slam.OdometryErrors, sequence: LidarSequence) -> str:
+    """Returns the error of the given odometry against the trajectory, and the delay of its stamps."""
+    text = f"odometry: {found.step_m:.2g} m off a step in the median"
+    if found.delay_scans:
+        step, unit = (1.0, "scans") if sequence.times is None else (float(np.median(np.diff(sequence.times))), "s")
+        late = f"{abs(found.delay_scans) * step:.2g} {unit} {'late' if found.delay_scans > 0 else 'early'}"
+        text += f"; its stamps are {late} ({found.undelayed_step_m:.2g} m off)"
+    return text
 
 
 def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
@@ -150,21 +149,19 @@ def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     cli.require_importable("distributed", "--cluster")
     from distributed import Client, LocalCluster
 
-    from dpmjax.cli.fleet import DrivePlan, map_drives
+    from dpmjax.cli.fleet import map_drives
 
     for data in options.data:  # bad input is refused here, before any work
         cli.open_drive(data, options)
-    plan = DrivePlan(options, slam_methods(options).config, options.deskew)
+    settings = slam_methods(options).config
     run.open()
-    if options.cluster != "local":
-        with Client(options.cluster) as client:
-            return map_drives(client, options.data, plan, run)
-    num_workers = min(len(options.data), cli.environment()["num_cores"])
-    with (
-        LocalCluster(n_workers=num_workers, threads_per_worker=1, memory_limit=None, dashboard_address=None) as cluster,
-        Client(cluster) as client,
-    ):
-        return map_drives(client, options.data, plan, run)
+    with ExitStack() as stack:
+        place: Any = options.cluster
+        if options.cluster == "local":
+            num = min(len(options.data), cli.environment()["num_cores"])
+            alone = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
+            place = stack.enter_context(LocalCluster(n_workers=num, **alone))
+        return map_drives(stack.enter_context(Client(place)), options, settings, run)
 
 
 def slam_methods(options: SlamOptions) -> slam.SlamMethods:
@@ -201,16 +198,17 @@ def write_map_results(
 
     for name, poses in (("trajectory", result.T_world_scan), ("odometry", result.T_odometry_scan)):
         cli.write_poses(run.path, poses, name, times=sequence.times, frame="T_world_lidar")
-    results.write_graph(run.path, result)
-    results.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
-    results.write_scans(run / "scans.csv", result.reports, result.keyframes, sequence.sources)
-    sizes: cli.Numbers = {}
+    if result.graph is not None:
+        io.write_g2o(run / "graph.g2o", result.graph)
+        np.save(run / "covariances.npy", result.covariances)
+    frame = "T_map_keyframe; stamps are numbers of scans"
+    io.write_tum(run / "keyframes.txt", slam_map.T_world_keyframe, times=result.keyframes, frame=frame)
+    slam_run.write_loops(run / "loops.csv", result.loops, [{"scan": int(scan)} for scan in result.keyframes])
+    slam_run.write_scans(run / "scans.csv", result, sequence.sources)
     if len(slam_map):
-        whole = saved_maps.save_map(run / "map.npz", slam_map)
-        small = saved_maps.map_bytes(slam_map, "int8")
-        sizes = {"map_bytes": whole.stat().st_size, "map_bytes_int8": len(small)}
-    run.write_numbers({**numbers, **sizes})  # also where a picture fails
-    cloud = results.gather_map(slam_map.T_world_keyframe, read_keyframe)
+        numbers = {**numbers, "map_bytes": saved_maps.save_map(run / "map.npz", slam_map).stat().st_size}
+    run.write_numbers(numbers)  # also where a picture fails
+    cloud = slam_run.gather_map(slam_map.T_world_keyframe, read_keyframe)
     io.write_ply(run / "map.ply", cloud.points, colors=viz.height_colors(cloud.heights_m))
-    results.draw_pictures(run.path, sequence, result, cloud, num_before)
-    return {**sizes, "map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}
+    slam_run.draw_pictures(run, sequence, result, cloud, numbers)
+    return {**numbers, "map_points": len(cloud.points), "map_voxel_m": cloud.voxel_m}

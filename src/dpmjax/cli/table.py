@@ -115,10 +115,9 @@ def _cell(row: Row, column: str) -> str:
     value = row.get(column)
     if value is None:
         return "-"
-    text = f"{value:.4g}" if isinstance(value, float) else str(value)
     if f"{column}_low" in row and row["num_rows"] > 1:
-        text = f"{value:.2f} ({row[f'{column}_low']:.2f} to {row[f'{column}_high']:.2f})"
-    return text
+        return f"{value:.2f} ({row[f'{column}_low']:.2f} to {row[f'{column}_high']:.2f})"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _parse(text: str) -> Any:

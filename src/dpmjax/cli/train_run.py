@@ -1,12 +1,22 @@
-"""A DeepPointMap training: its drives, evaluations, table, progress bar and checkpoints."""
+"""A DeepPointMap training in its folder: prepared drives, evaluations, table, progress bar and checkpoints.
+
+All processors share the preparation of the scans, even of one long drive.
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from multiprocessing import active_children, get_context
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -17,45 +27,39 @@ from dpmjax import cli
 from dpmjax import deeppointmap as dpm
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.run import CHECKPOINTS, HISTORY, Run
-from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.sequences import LidarSequence
+from dpmjax.types import Poses
 
-# Largest number of scans of an evaluation, all drives together.
-MAX_EVALUATED_SCANS = 96
-KINDS = (dpm.PairKind(2.0, 10.0), dpm.PairKind(10.0, 20.0), dpm.PairKind(2.0, 10.0, 4), dpm.PairKind(10.0, 20.0, 4))
-"""Pairs of scans, near and far, which choose the model; pairs of maps of four scans, which the last model registers."""
-
-KIND_NAMES = dict(zip(KINDS, ("recall", "recall_far", "recall_maps", "recall_maps_far"), strict=True))
-OVERLAP_STAGE = "overlap"
-BEST_CHECKPOINTS, OVERLAP_CHECKPOINTS = "checkpoints_best", "checkpoints_overlap"
+# Scans of a drive that a processor prepares at a time; with more the bar stands still, with fewer the drive is opened
+# more often.
+NUM_AT_ONCE = 16
+# Largest number of scans of an evaluation, and number of its pairs of each kind, all drives together.
+MAX_EVALUATED_SCANS, NUM_HELD_OUT_PAIRS = 96, 32
+# Pairs of scans, near and far, which choose the model, and the names of their recalls.
+KINDS = {dpm.PairKind(2.0, 10.0): "recall", dpm.PairKind(10.0, 20.0): "recall_far"}
+OVERLAP_CHECKPOINTS = "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
-SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
-MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
-RECALLS = ("recall", "recall_far")
-OVERLAP_MEASURES = ("overlap_loss", "overlap_accuracy")
+MEASURES = ("loss", "pairing", "offset", "top1_accuracy", "score", "coarse", "gradient_norm", "learning_rate")
 # Coefficients of determination of predicted offsets, on the pairs that choose the model; empty without an offset head.
 OFFSETS = ("offset_r2_normal", "offset_r2_along", "offset_r2_up")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OFFSETS, *OVERLAP_MEASURES)
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *KINDS.values(), *OFFSETS, "overlap_loss", "overlap_accuracy")
 
 
-class Selection(NamedTuple):
-    """Pairs that choose the model.
+class PlannedDrive(NamedTuple):
+    """A drive before its preparation.
 
     Attributes:
-        pairs: pairs of scans and of maps. None if no drive has held-out places; then the last model is kept.
-        chosen_by: a name of the pairs, for `metrics.json`.
+        source: opens the drive.
+        T_world_lidar: true poses of its scans, metres.
+        path: file of its prepared scans.
+        found: the prepared drive if the file exists already; None otherwise.
     """
 
-    pairs: dpm.EvaluationPairs | None
-    chosen_by: str
-
-    @property
-    def of_scans(self) -> dpm.EvaluationPairs | None:
-        """The pairs of scans alone, which are measured during the training."""
-        if self.pairs is None:
-            return None
-        return self.pairs._replace(pairs=tuple(some for some in self.pairs.pairs if some.kind.num_scans == 1))
+    source: cli.Source
+    T_world_lidar: Poses
+    path: Path
+    found: dpm.PreparedDrive | None
 
 
 def part_of_drive(source: cli.Source, part: Literal["training", "held_out"]) -> LidarSequence:
@@ -64,22 +68,122 @@ def part_of_drive(source: cli.Source, part: Literal["training", "held_out"]) -> 
     return drive.take(getattr(dpm.split_places(drive), part))
 
 
-def draw_selection(
-    settings: dpm.TrainingConfig,
-    num_pairs: int,
-    drives: Sequence[cli.Source],
-    chosen_by: str,
-    *,
-    on_wait: Callable[[], object] = lambda: None,
-) -> Selection:
+def prepare_sources(
+    sources: Sequence[cli.Source], settings: dpm.TrainingConfig, folder: Path, *, seed: int
+) -> list[dpm.PreparedDrive]:
+    """Prepares all drives on all processors and keeps them in a folder for later runs.
+
+    Args:
+        sources: the drives.
+        settings: settings of training.
+        folder: folder of prepared scans.
+        seed: seed of the variants.
+
+    Returns:
+        The drives, in order.
+
+    Raises:
+        ValueError: if the prepared scans do not fit on the disk, or if a drive cannot be read.
+    """
+    if settings.num_variants == 0:
+        print("each scan is prepared anew at each use; nothing is kept on disk")
+        return [dpm.prepare_drive(source(), settings) for source in sources]
+    with _workers() as pool:
+        opened = pool.map(partial(_plan, settings=settings, folder=folder, seed=seed), sources)
+        plans = list(tqdm(opened, "open drives", len(sources), unit=" drives", dynamic_ncols=True))
+        # The same drive may be given twice.
+        missing = {plan.path: plan for plan in plans if plan.found is None}
+        num_scans = sum(len(plan.T_world_lidar) for plan in missing.values())
+        check_space(num_scans, settings, folder)
+        work = partial(_prepare, settings=settings, seed=seed)
+        # All parts are begun here; each result is forgotten when it was written.
+        parts = {path: pool.map(work, *_parts(plan)) for path, plan in missing.items()}
+        with tqdm(desc="prepare scans", total=num_scans, unit=" scans", dynamic_ncols=True) as bar:
+
+            def scans_of(path: Path) -> Iterator[dpm.PreparedScan]:
+                for part in parts[path]:
+                    yield from part
+                    bar.update(len(part))
+
+            made = {
+                path: dpm.store_scans(path, plan.T_world_lidar, scans_of(path), settings)
+                for path, plan in missing.items()
+            }
+    return [plan.found or made[plan.path] for plan in plans]
+
+
+def check_space(num_scans: int, settings: dpm.TrainingConfig, folder: Path) -> None:
+    """Prints the size of the prepared scans; raises a ValueError if the disk has less free space."""
+    each = dpm.stored_bytes(settings)
+    needed = num_scans * each
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    scans, free_text = f"{num_scans} scans of {each / 1e6:.2f} MB", f"{free / 1e9:.1f} GB are free"
+    if needed > free:
+        advice = f"--variants 1 needs {needed / settings.num_variants / 1e9:.1f} GB, --variants 0 nothing"
+        raise ValueError(f"--cache {folder}: {scans} need {needed / 1e9:.1f} GB, {free_text}; {advice}")
+    if num_scans > 0:
+        print(f"prepares {scans}: {needed / 1e9:.1f} GB in {folder}, {free_text}")
+
+
+@contextmanager
+def _workers() -> Iterator[ProcessPoolExecutor]:
+    """Yields processes, which are gone after an error."""
+    # A fresh interpreter: a fork of a process that runs JAX may hang.
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn"), initializer=_begin_worker) as pool:
+        try:
+            yield pool
+        except BaseException:
+            processes = active_children()
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.kill()
+            raise
+
+
+def _begin_worker() -> None:
+    # The device belongs to the process that trains, and so does the answer to Ctrl-C.
+    jax.config.update("jax_platforms", "cpu")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _plan(source: cli.Source, settings: dpm.TrainingConfig, folder: Path, seed: int) -> PlannedDrive:
+    drive = source()
+    if drive.T_world_lidar is None:
+        raise ValueError(f"{drive.name}: expected a true pose for each scan, got a drive without poses")
+    path = dpm.prepared_path(drive, settings, folder, seed)
+    return PlannedDrive(source, drive.T_world_lidar, path, dpm.find_prepared(path, drive.T_world_lidar))
+
+
+def _parts(plan: PlannedDrive) -> tuple[list[cli.Source], list[range]]:
+    num = len(plan.T_world_lidar)
+    rows = [range(first, min(first + NUM_AT_ONCE, num)) for first in range(0, num, NUM_AT_ONCE)]
+    return [plan.source] * len(rows), rows
+
+
+def _prepare(source: cli.Source, numbers: range, settings: dpm.TrainingConfig, seed: int) -> list[dpm.PreparedScan]:
+    return list(dpm.prepare_variants(source(), numbers, settings, seed))
+
+
+class Selection(NamedTuple):
+    """Pairs that choose the model.
+
+    Attributes:
+        pairs: pairs of scans. None if no drive has held-out places; then the last model is kept.
+        chosen_by: a name of the pairs, for `metrics.json`.
+    """
+
+    pairs: dpm.EvaluationPairs | None
+    chosen_by: str
+
+
+def draw_selection(settings: dpm.TrainingConfig, drives: Sequence[cli.Source], chosen_by: str) -> Selection:
     """Draws the pairs that choose the model.
 
     Args:
         settings: settings of training.
-        num_pairs: number of pairs of each kind, all drives together.
         drives: held-out places, or drives of `--validate`.
         chosen_by: a name of the pairs, for `metrics.json`.
-        on_wait: called before each drive; an error of it ends the preparation.
 
     Returns:
         The pairs; none if no drive has any.
@@ -87,14 +191,14 @@ def draw_selection(
 
     def opened() -> Iterator[LidarSequence]:
         for source in tqdm(drives, desc="prepare evaluation", unit=" drives", dynamic_ncols=True):
-            on_wait()
             drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
             yield drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
 
-    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model, kinds=KINDS)
-    if not pairs.pairs:
-        return Selection(None, "the last step: no drive has held-out places")
-    return Selection(pairs, chosen_by)
+    num_pairs = max(1, NUM_HELD_OUT_PAIRS // len(drives))
+    pairs = dpm.draw_evaluation_pairs(opened(), num_pairs, settings.model, kinds=tuple(KINDS))
+    return (
+        Selection(pairs, chosen_by) if pairs.pairs else Selection(None, "the last step: no drive has held-out places")
+    )
 
 
 class Records:
@@ -103,11 +207,12 @@ class Records:
     Attributes:
         run: the run; its folder gets the files.
         selection: pairs that choose the model.
+        seed: seed of the training.
+        takes_last: True keeps the last model, as published, instead of the best one.
         untrained: the model before the first step.
         start: progress to start from: the latest checkpoint of a resumed run.
-        earlier_s: run time of the steps of earlier calls of `train`.
         overlap_start: state of the second stage to start from; None for its beginning.
-        takes_last: True keeps the last model, as published, instead of the best one.
+        run_s: run time of the steps, with those of earlier processes.
     """
 
     def __init__(
@@ -121,61 +226,53 @@ class Records:
         takes_last: bool = False,
     ) -> None:
         self.run, self.selection, self._settings = run, selection, settings
-        self._overlap_checkpoints = Checkpoints(run / OVERLAP_CHECKPOINTS)
-        self._checkpoints, self._best = Checkpoints(run / CHECKPOINTS), Checkpoints(run / BEST_CHECKPOINTS)
-        begun = dpm.begin_training(settings, seed=seed, start=weights)
-        self.takes_last = takes_last
-        trained = () if weights is None else weights.config.trained
-        config = replace(settings.model, trained=trained)
+        self.seed, self.takes_last = seed, takes_last
+        self._checkpoints, self._of_overlap = Checkpoints(run / CHECKPOINTS), Checkpoints(run / OVERLAP_CHECKPOINTS)
+        begun, config = dpm.begin_training(settings, seed=seed, start=weights), settings.model
         if weights is not None and "registration" not in settings.stages:
             config = weights.config  # a calibration stays where the head alone is trained
+        elif weights is not None:
+            config = replace(config, trained=weights.config.trained)
         self.untrained = dpm.Model(begun.state.params, config)
-        self.start = self._restored(begun)
-        self.overlap_start = self._overlap_checkpoints.restore_latest(dpm.init_overlap(self.untrained), fallback=None)
-        first = int(self.start.state.step)
-        if self.overlap_start is not None:
-            first += int(self.overlap_start.step)
-        earlier = run.continue_table(HISTORY, until=first)
-        self.earlier_s = max((float(row["run_s"]) for row in earlier), default=0.0)
+        self.start = self._checkpoints.restore_latest(begun, fallback=begun)
+        self.overlap_start = self._of_overlap.restore_latest(dpm.init_overlap(self.untrained), fallback=None)
+        num_done = int(self.start.state.step) + (0 if self.overlap_start is None else int(self.overlap_start.step))
+        earlier = run.continue_table(HISTORY, until=num_done)
+        self.run_s = self._earlier_s = max((float(row["run_s"]) for row in earlier), default=0.0)
         total = int(self.start.state.end) if "registration" in settings.stages else 0
-        self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
-        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
-        self.run_s, self._pace_s = self.earlier_s, math.nan
-        self.seed, self._seen = seed, set[Layout]()
-        if total:
-            self._tell_compilation(self.start.state)
+        self._bar = tqdm(total=total, initial=num_done, desc="train", unit=" steps", dynamic_ncols=True)
+        self._saved_at, self._pace_s, self._recalls = time.perf_counter(), math.nan, dict[str, float]()
 
     def evaluate(self, model: dpm.Model) -> float:
-        """Returns the mean recall of the pairs of scans that choose the model, and measures their offsets."""
-        pairs = self.selection.of_scans
-        if pairs is None:
-            return math.nan
-        found = dpm.evaluate_registration(model, pairs)
-        named = zip(pairs.pairs, found.recalls, strict=True)
-        self._recalls |= {KIND_NAMES[some.kind]: recall.recall for some, recall in named}
+        """Returns the mean recall of the pairs that choose the model, and measures their offsets."""
+        assert self.selection.pairs is not None
+        found = dpm.evaluate_registration(model, self.selection.pairs)
+        named = zip(self.selection.pairs.pairs, found.recalls, strict=True)
+        self._recalls = {KINDS[some.kind]: recall.recall for some, recall in named}
         self._recalls |= dict(zip(OFFSETS, found.offset_r2.tolist(), strict=True))
         return float(np.mean([recall.recall for recall in found.recalls]))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint every few minutes."""
-        values = _values(record)
-        if math.isfinite(record.score):
-            values |= {name: value for name, value in self._recalls.items() if math.isfinite(value)}
-        measured = {name: f"{value:.7g}" for name, value in values.items()}
-        self.run_s = self.earlier_s + record.speed.run_s + record.speed.compile_s
-        self._pace_s = record.speed.run_s / record.speed.num_steps if record.speed.num_steps else math.nan
-        self._append(record.step, _stage_name(record.stage), measured)
-        self._bar.set_postfix_str(_summary(record, self._recalls["recall"]), refresh=False)
+        speed, values = record.speed, {**record.report._asdict(), **record.report.terms._asdict()}
+        values = {name: float(values[name]) for name in MEASURES if name in values} | {"score": record.score}
+        if values["offset"] == 0:  # no offset head is trained
+            del values["offset"]
+        values |= self._recalls if math.isfinite(record.score) else {}
+        self.run_s = self._earlier_s + speed.run_s + speed.compile_s
+        self._pace_s = speed.run_s / speed.num_steps if speed.num_steps else math.nan
         self._bar.total = int(progress.state.end)
-        self._bar.update(1)
-        self._tell_compilation(progress.state)
-        if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
+        shown = f"loss {values['loss']:.3f}, {speed.scans_per_s:.1f} scans/s"
+        self._add_row(self._bar, record.step, f"K={record.stage.max_group}", values, shown)
+        if time.perf_counter() - self._saved_at > SAVE_EVERY_S:
             self.save(progress)
-            self._last_saved = time.perf_counter()
 
-    def _append(self, step: int, stage: str, measured: dict[str, str]) -> None:
+    def _add_row(self, bar: tqdm[Any], step: int, stage: str, values: dict[str, float], shown: str) -> None:
+        measured = {name: f"{value:.7g}" for name, value in values.items() if math.isfinite(value)}
         row = {"step": step, "stage": stage, "run_s": round(self.run_s, 3), **measured}
         self.run.append_row(HISTORY, **dict.fromkeys(COLUMNS, "") | row)
+        bar.set_postfix_str(f"{stage}, {shown}", refresh=False)
+        bar.update(1)
 
     def steps_left(self, step: int, *, total_s: float) -> int:
         """Returns the number of steps in the seconds that remain of `total_s`; 0 does not change the plan.
@@ -189,10 +286,9 @@ class Records:
             return 0
         return max(1, round((total_s - self.run_s) / self._pace_s))
 
-    def train_head(self, trained: dpm.Trained, store: dpm.ScanStore, stop: Callable[[], int], seed: int) -> dpm.Trained:
+    def train_head(self, trained: dpm.Trained, store: dpm.ScanStore, stop: Callable[[], int]) -> dpm.Trained:
         """Trains the overlap head, or continues; with rows after those of the first stage, and its own checkpoints."""
-        before = int(trained.progress.state.step)
-        earlier_s, begun = self.run_s, time.perf_counter()
+        num_before, earlier_s, begun = int(trained.progress.state.step), self.run_s, time.perf_counter()
         first = 0 if self.overlap_start is None else int(self.overlap_start.step)
         total = self._settings.overlap.num_steps(len(store.table))
         with tqdm(total=total, initial=first, desc="train overlap", unit=" steps", dynamic_ncols=True) as bar:
@@ -201,44 +297,23 @@ class Records:
                 self.run_s = earlier_s + time.perf_counter() - begun
                 values = {"overlap_loss": record.loss, "overlap_accuracy": record.accuracy}
                 values |= {"learning_rate": record.learning_rate}
-                measured = {name: f"{value:.7g}" for name, value in values.items()}
-                self._append(before + record.step, OVERLAP_STAGE, measured)
-                bar.set_postfix_str(f"loss {record.loss:.3f}, right {record.accuracy:.2f}", refresh=False)
-                bar.update(1)
-                if time.perf_counter() - self._last_saved > SAVE_EVERY_S:
-                    self._overlap_checkpoints.save(record.step, state)
-                    self._last_saved = time.perf_counter()
+                self._add_row(bar, num_before + record.step, "overlap", values, f"loss {record.loss:.3f}")
+                if time.perf_counter() - self._saved_at > SAVE_EVERY_S:
+                    self._of_overlap.save(record.step, state)
+                    self._saved_at = time.perf_counter()
 
-            hooks = dpm.OverlapHooks(on_report, stop)
-            start = self.overlap_start
-            model, state = dpm.train_overlap(store, trained.model, self._settings, seed=seed, start=start, hooks=hooks)
-        self._overlap_checkpoints.save(int(state.step), state)
+            hooks, start = dpm.OverlapHooks(on_report, stop), self.overlap_start
+            model, state = dpm.train_overlap(
+                store, trained.model, self._settings, seed=self.seed, start=start, hooks=hooks
+            )
+        self._of_overlap.save(int(state.step), state)
         stopped_by = 0 if int(state.step) >= total else stop()
         return trained._replace(model=model, overlap=state, stopped_by=stopped_by)
 
     def save(self, progress: dpm.TrainingProgress) -> None:
-        """Writes a checkpoint, and the best parameters if they have changed since the last one."""
-        if int(progress.best_step):
-            self._best.save(int(progress.best_step), progress.best_params)
-        self._checkpoints.save(int(progress.state.step), replace(progress, best_params={}))
-
-    def _restored(self, start: dpm.TrainingProgress) -> dpm.TrainingProgress:
-        found = self._checkpoints.restore_latest(replace(start, best_params={}), fallback=None)
-        if found is None:
-            return start
-        if int(found.best_step):
-            params = self._best.restore(int(found.best_step), start.best_params)
-            if params is not None:
-                return replace(found, best_params=params)
-        return replace(start, state=found.state, best_params=found.state.params)
-
-    def _tell_compilation(self, state: dpm.TrainingState) -> None:
-        step = int(state.step)
-        capacity = layout_capacity(self._settings.layout_at(step, seed=self.seed), self._settings.sampling)
-        if step < int(state.end) and capacity not in self._seen:
-            self._seen.add(capacity)
-            maps = f"maps of {capacity.num_source} and {capacity.num_target} scans"
-            self._bar.set_postfix_str(f"{_stage_name(self._settings.stage_at(step))}, compiling {maps}")
+        """Writes a checkpoint."""
+        self._checkpoints.save(int(progress.state.step), progress)
+        self._saved_at = time.perf_counter()
 
     def __enter__(self) -> Records:
         return self
@@ -266,37 +341,17 @@ def run_training(
     if records is None:
         return dpm.train(store, settings, seed=seed, hooks=hooks)
     with records:
-        stop = hooks.stop
-        if not trains_first:
-            return records.train_head(dpm.Trained(records.untrained, records.start, 0, dpm.Speed()), store, stop, seed)
-        if records.selection.pairs is not None:
-            hooks = replace(hooks, evaluate=records.evaluate)
-        hooks = replace(hooks, on_report=records.on_report)
-        hooks = replace(hooks, steps_left=partial(records.steps_left, total_s=total_s))
-        trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
-        records.save(trained.progress)
-        if records.takes_last:
-            trained = trained._replace(model=with_params(trained.model, trained.progress.state.params))
-        return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, stop, seed)
-
-
-def with_params(model: dpm.Model, params: Any) -> dpm.Model:
-    """Returns the model with the parameters of another step, on the device."""
-    return model.replace(params=jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), params))
-
-
-def _stage_name(stage: dpm.CurriculumStage) -> str:
-    return f"K={stage.max_group}"
-
-
-def _values(record: dpm.StepRecord) -> dict[str, Any]:
-    values = {**record.report._asdict(), **record.report.terms._asdict(), "score": record.score}
-    if values["offset"] == 0:  # no offset head is trained
-        values["offset"] = math.nan
-    return {name: float(values[name]) for name in MEASURES if math.isfinite(values[name])}
-
-
-def _summary(record: dpm.StepRecord, recall: float) -> str:
-    values = {**_values(record), **({"recall": recall} if math.isfinite(recall) else {})}
-    parts = [f"{name} {values[name]:.3f}" for name in SHOWN if name in values]
-    return ", ".join([_stage_name(record.stage), *parts, f"{record.speed.scans_per_s:.1f} scans/s"])
+        trained = dpm.Trained(records.untrained, records.start, 0, dpm.Speed())
+        if trains_first:
+            hooks = replace(
+                hooks,
+                evaluate=None if records.selection.pairs is None else records.evaluate,
+                on_report=records.on_report,
+                steps_left=partial(records.steps_left, total_s=total_s),
+            )
+            trained = dpm.train(store, settings, seed=seed, start=records.start, hooks=hooks)
+            records.save(trained.progress)
+            if records.takes_last:
+                params = jax.tree.map(lambda leaf: jax.numpy.asarray(np.asarray(leaf)), trained.progress.state.params)
+                trained = trained._replace(model=trained.model.replace(params=params))
+        return trained if trained.stopped_by or not trains_head else records.train_head(trained, store, hooks.stop)
