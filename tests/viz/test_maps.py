@@ -156,20 +156,3 @@ def test_scans_that_meet_are_black_and_apart_have_two_colours():
     assert [line_of(axes, SOURCE, 1)[0, 1] for axes in figure.axes[:2]] == [-5, 0]
     grey = [np.dot(to_rgb(color), (0.299, 0.587, 0.114)) for color in (INK, SOURCE, TARGET, "white")]
     assert np.diff(grey).min() > 0.15
-
-
-def test_matches_join_the_clouds_and_wrong_ones_stand_out():
-    T, matched = np.eye(4), np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]])
-    T[:2, 3] = [2.0, 3.0]
-    pair = viz.RegisteredPair("pair", np.zeros((3, 3)), np.ones((4, 3)), {"laid onto the target": T})
-    figure = viz.matches_figure(pair, matched, matched, [True, False])
-    right, wrong = figure.axes[0].collections
-    assert {"1 right match", "1 wrong match"} <= set(labels(figure))
-    # Style tells them apart where the colour cannot be seen.
-    assert right.get_linestyle() != wrong.get_linestyle()
-    for match, start in ((right, [0.0, 0.0]), (wrong, [0.5, 0.5])):
-        np.testing.assert_allclose(match.get_segments()[0][0], start)
-    np.testing.assert_allclose(line_of(figure.axes[1], SOURCE, 1), [[2.0, 3.0]])
-    many = viz.matches_figure(pair, np.zeros((400, 3)), np.zeros((400, 3)), np.ones(400))
-    assert len(many.axes[0].collections[0].get_segments()) == 30
-    assert "400 right matches, 30 drawn" in labels(many)

@@ -18,7 +18,6 @@ from .poses import relative_pose_error as relative_pose_error
 from .poses import rotation_angle as rotation_angle
 from .sequences import corrected_ate as corrected_ate
 from .sequences import depth_errors as depth_errors
-from .sequences import distances_to_reference as distances_to_reference
 from .sequences import planar_errors as planar_errors
 from .sequences import reference_doubt as reference_doubt
 from .sequences import trajectory_errors as trajectory_errors

@@ -131,15 +131,3 @@ def reference_doubt(T_world_scan: FloatArray, sequence: LidarSequence) -> str | 
         errors = f"RPE {given:.3g} m; with each pose inverted it would be {inverted:.3g} m"
         return f"{errors}: does the reference map the world to the lidar, not the lidar to the world?"
     return None
-
-
-def distances_to_reference(T_world_scan: FloatArray, reference: FloatArray | None) -> FloatArray | None:
-    """Returns the distance of each scan to the reference after the best rigid alignment; NaN for scans without one."""
-    if reference is None:
-        return None
-    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
-    if not has_reference.any():
-        return None
-    T = align_rigid(T_world_scan[has_reference, :3, 3], reference[has_reference, :3, 3])
-    moved = T_world_scan[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
-    return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))
