@@ -53,7 +53,6 @@ def test_a_saved_map_is_extended(room, tmp_path, refused) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     assert run(drive, "--weights", weights, "-n", 8, "-o", first) == EXIT_OK
     before = dpmjax.load_map(first / "map.npz")
-    assert load_json(first / "metrics.json")["map_bytes_int8"] < load_json(first / "metrics.json")["map_bytes"]
     assert run(drive, "--weights", weights, "--map", first / "map.npz", "-o", second) == EXIT_OK
     after = dpmjax.load_map(second / "map.npz")
     assert len(after) > len(before)

@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from dpmjax import saved_maps, slam, weights
-from dpmjax.cli.drives import ScanReader, open_drive
+from dpmjax.cli.drives import DriveOptions, ScanReader, open_drive
 from dpmjax.cli.run import Numbers, Run, write_poses
 from dpmjax.cli.slam_run import map_drive
 from dpmjax.sequences import counted
-
-if TYPE_CHECKING:
-    from dpmjax.cli.slam import SlamOptions
 
 
 class MappedAway(NamedTuple):
@@ -38,24 +36,34 @@ class MappedAway(NamedTuple):
     seconds: float
 
 
-def map_drives(client: Any, options: SlamOptions, settings: slam.SlamConfig, run: Run) -> Numbers:
+def map_drives(
+    client: Any,
+    drives: Sequence[Path],
+    options: DriveOptions,
+    settings: slam.SlamConfig,
+    run: Run,
+    *,
+    is_deskewed: bool,
+) -> Numbers:
     """Maps drives, each on a worker, and merges their maps as a tree.
 
     Args:
         client: client of `distributed`.
-        options: the drives, in folders that every worker sees, the selection of their scans, and the weights.
+        drives: folders that every worker sees.
+        options: selection of their scans, and weights.
         settings: settings of SLAM.
         run: folder of the results, which every worker sees, too.
+        is_deskewed: True undoes the motion of the lidar during its turn.
 
     Returns:
         Numbers of the run.
     """
     from distributed import as_completed
 
-    began, num = time.perf_counter(), len(options.data)
+    began, num = time.perf_counter(), len(drives)
     folders = [run / f"drive_{number}" for number in range(1, num + 1)]
-    places = zip(options.data, folders, strict=True)
-    begun = [client.submit(map_away, *place, options, settings, pure=False) for place in places]
+    places = zip(drives, folders, strict=True)
+    begun = [client.submit(map_away, *place, options, settings, is_deskewed, pure=False) for place in places]
     for _ in tqdm(as_completed(begun), total=num, unit=" drives", dynamic_ncols=True):
         run.check_stop()
     mapped: list[MappedAway] = client.gather(begun)
@@ -81,11 +89,13 @@ def map_drives(client: Any, options: SlamOptions, settings: slam.SlamConfig, run
     }
 
 
-def map_away(data: Path, folder: Path, options: SlamOptions, settings: slam.SlamConfig) -> MappedAway:
+def map_away(
+    data: Path, folder: Path, options: DriveOptions, settings: slam.SlamConfig, is_deskewed: bool
+) -> MappedAway:
     """Maps a drive in its folder, and continues from the state of an earlier worker if there is one."""
     began = time.perf_counter()
     methods = slam.make_methods(weights.load_model(options.weights), settings, weights=options.weights)
-    reader = ScanReader(open_drive(data, options), is_deskewed=options.deskew, jump=options.jump)
+    reader = ScanReader(open_drive(data, options), is_deskewed=is_deskewed, jump=options.jump)
     _, result = map_drive(folder, reader, methods)
     return MappedAway(result.T_world_scan, saved_maps.map_bytes(result.map, "int8"), time.perf_counter() - began)
 

@@ -15,7 +15,6 @@ and so on.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +70,7 @@ def main(options: MergeOptions, run: cli.Run) -> cli.Numbers:
     cli.write_loops(run / "loops.csv", merged.loops, ends)
     # Most maps are called map.npz, so their folders are named, too.
     names = [str(Path(*path.parts[-2:])) for path in options.maps]
-    numbers = {"weights": options.weights, **merge_numbers(names, files, maps, merged)}
+    numbers = {"weights": options.weights, **merge_numbers(names, files, merged)}
     run.write_numbers(numbers)  # also where a picture fails
     title = f"{len(maps)} maps" + (f", {num_parts} after merging" if num_parts > 1 else " in one")
     panels = [panel_of(names, merged, part) for part in range(num_parts)]
@@ -79,35 +78,29 @@ def main(options: MergeOptions, run: cli.Run) -> cli.Numbers:
     return numbers
 
 
-def merge_numbers(
-    names: Sequence[str], files: Sequence[str], maps: Sequence[slam.KeyframeMap], merged: slam.MergedMaps
-) -> cli.Numbers:
+def merge_numbers(names: Sequence[str], files: Sequence[str], merged: slam.MergedMaps) -> cli.Numbers:
     """Returns status, verdict, connected maps, and the numbers of loops and keyframes."""
     ends = cli.accepted_ends(merged.loops)
     parts: list[cli.Numbers] = []
     texts = [f"{counted(len(ends), 'loop')} between maps, of {counted(len(merged.loops), 'candidate')}"]
     for part, (file, slam_map) in enumerate(zip(files, merged.maps, strict=True)):
         members = [number for number, component in enumerate(merged.component, start=1) if component == part]
-        num_measured, num_keyframes = slam_run.count_parts(slam_map), len(slam_map)
-        parts.append(
-            {"file": file, "maps": members, "num_keyframes": num_keyframes, "num_measured_parts": num_measured}
-        )
+        num_measured, counts = slam_run.count_parts(slam_map), {"num_keyframes": len(slam_map)}
+        parts.append({"file": file, "maps": members, **counts, "num_measured_parts": num_measured})
         text = "one map now" if len(members) > 1 else "no common place with another map"
         text += f", in {num_measured} parts whose relative poses are guesses" if num_measured > 1 else ""
         shown = ", ".join(names[number - 1] for number in members)
-        texts.append(f"{shown}: {text}, {counted(num_keyframes, 'keyframe')}, {file}")
-    meetings = Counter(map(tuple, np.sort(merged.joined.map_of_keyframe[ends] + 1, axis=1).tolist()))
+        texts.append(f"{shown}: {text}, {counted(len(slam_map), 'keyframe')}, {file}")
     return {
         "status": "done" if all(part["num_measured_parts"] < 2 for part in parts) else "uncertain",
         "verdict": "; ".join(texts),
-        "num_maps": len(maps),
+        "num_maps": len(names),
         "num_parts": len(parts),
         "num_loops": len(ends),
         "num_candidates": len(merged.loops),
         "num_keyframes": len(merged.joined.slam_map),
         "parts": parts,
         "maps": names,
-        "loops_between": [{"maps": list(pair), "num_loops": number} for pair, number in sorted(meetings.items())],
     }
 
 

@@ -161,7 +161,8 @@ def map_on_cluster(options: SlamOptions, run: cli.Run) -> cli.Numbers:
             num = min(len(options.data), cli.environment()["num_cores"])
             alone = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
             place = stack.enter_context(LocalCluster(n_workers=num, **alone))
-        return map_drives(stack.enter_context(Client(place)), options, settings, run)
+        client = stack.enter_context(Client(place))
+        return map_drives(client, options.data, options, settings, run, is_deskewed=options.deskew)
 
 
 def slam_methods(options: SlamOptions) -> slam.SlamMethods:
