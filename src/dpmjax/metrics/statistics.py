@@ -1,49 +1,14 @@
-"""Statistics: intervals and comparisons of shares, quality of probabilities, the Cramér-Rao bound of positions."""
+"""Statistics: comparisons of shares, quality of probabilities, the Cramér-Rao bound of positions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.types import AnyArray
-
-
-class Proportion(NamedTuple):
-    """A share with its confidence interval.
-
-    Attributes:
-        share: right answers divided by all answers; NaN without any answer.
-        low: lower end of the interval.
-        high: upper end of the interval.
-    """
-
-    share: float
-    low: float
-    high: float
-
-
-def wilson_interval(num_right: int, num_all: int) -> Proportion:
-    """Returns a share with Wilson's score interval of 95 % (Wilson 1927, "Probable Inference", eq. 4).
-
-    The interval stays within 0 and 1, and has a positive width also where none or all of the answers are right.
-
-    Args:
-        num_right: number of right answers.
-        num_all: number of answers; without any, the share is NaN and the interval is 0 to 1.
-
-    Returns:
-        The share and its interval.
-    """
-    from scipy import stats
-
-    if num_all == 0:
-        return Proportion(np.nan, 0.0, 1.0)
-    low, high = stats.binomtest(num_right, num_all).proportion_ci(method="wilson")
-    return Proportion(num_right / num_all, float(low), float(high))
 
 
 def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray, " n"]) -> float:
