@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -267,35 +266,29 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))
 
 
-class _Layout(NamedTuple):
-    """A published layout: what its folder holds, where the scans lie, and the reader of poses and times."""
-
-    marker: str
-    scans: str
-    read: Callable[[Path, list[Path]], SideData]
-
-
-_LAYOUTS = (
-    _Layout("generated/frames", "generated/frames", _read_carla),
-    _Layout("full_poses_lidar.txt", "frames", _read_carla),
-    _Layout("Ouster", "Ouster", _read_mulran),
-    _Layout("sensor_data/Ouster", "sensor_data/Ouster", _read_mulran),
-    _Layout("velodyne_points", "velodyne_points/data", _read_kitti_raw),
-    _Layout("velodyne", "velodyne", _read_kitti),
-)
+_Reader = Callable[[Path, list[Path]], SideData]
+# Published layouts: by what their folder holds, the folder of the scans, and the reader of poses and times.
+_LAYOUTS: dict[str, tuple[str, _Reader]] = {
+    "generated/frames": ("generated/frames", _read_carla),
+    "full_poses_lidar.txt": ("frames", _read_carla),
+    "Ouster": ("Ouster", _read_mulran),
+    "sensor_data/Ouster": ("sensor_data/Ouster", _read_mulran),
+    "velodyne_points": ("velodyne_points/data", _read_kitti_raw),
+    "velodyne": ("velodyne", _read_kitti),
+}
 
 
-def _layout_of(path: Path) -> _Layout:
+def _layout_of(path: Path) -> tuple[str, _Reader]:
     """Returns the layout of a folder: a published one, or scans right in it or in data/."""
     scans = "data" if not scan_files(path) and scan_files(path / "data") else ""
-    plain = _Layout("", scans, read_plain_drive)
-    return next((layout for layout in _LAYOUTS if (path / layout.marker).exists()), plain)
+    found = (layout for marker, layout in _LAYOUTS.items() if (path / marker).exists())
+    return next(found, (scans, read_plain_drive))
 
 
 def is_drive(path: Path) -> bool:
     """Returns True for a folder of a known layout, or with scans in it or in data/."""
-    layout = _layout_of(path)
-    return bool(layout.marker or scan_files(path / layout.scans))
+    is_published = any((path / marker).exists() for marker in _LAYOUTS)
+    return is_published or bool(scan_files(path / _layout_of(path)[0]))
 
 
 def open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
@@ -312,12 +305,11 @@ def open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lida
     Raises:
         InputError: no scans, broken files, or poses that do not match the scans.
     """
-    layout = _layout_of(path)
-    files = scan_files(path / layout.scans)
+    scans, read = _layout_of(path)
+    files = scan_files(path / scans)
     require(len(files) > 0, path, "a folder without scans", f"give {DRIVES}")
-    is_learned = layout.scans == "" and files[0].suffix.lower() == ".npz"
-    read = partial(read_plain_drive, poses=poses) if poses else _read_learned if is_learned else layout.read
-    T, times, notes = read(path, files)
+    read = _read_learned if scans == "" and files[0].suffix.lower() == ".npz" else read
+    T, times, notes = read_plain_drive(path, files, poses) if poses else read(path, files)
     columns, note = columns_of_drive(files, bin_columns)
     notes = tuple(each for each in (folder_note(files[0].parent), *notes, note) if each is not None)
     given, sources = Path(os.path.abspath(path)), tuple(map(str, files))
