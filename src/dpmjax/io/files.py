@@ -15,7 +15,6 @@ import pickle
 import re
 import subprocess
 import sys
-import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +23,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.sequences import FloatArray, InputError, Note, require
@@ -278,20 +276,13 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
     advice = "save it again with numpy.save or numpy.savez"
     with refusing(path, "not a readable NumPy file ({error})", advice, (Exception,)):
-        if content.startswith(npy_format.MAGIC_PREFIX):
-            return {"points": _parse_npy(content)}
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
-            chosen = [key for key in (members if keys is None else keys) if key in members]
-            return {key: _parse_npy(archive.read(members[key])) for key in chosen}
-
-
-def _parse_npy(content: bytes) -> NDArray[np.generic]:
-    """Parses the bytes of an `.npy`; raises a ValueError for Python objects, and for more rows than bytes."""
-    values = npy_format.read_array(io.BytesIO(content), allow_pickle=False)
-    if max(values.shape, default=0) > len(content) + 65536:
-        raise ValueError(f"an array of {values.shape}")
-    return values
+        loaded = np.load(io.BytesIO(content), allow_pickle=False)
+        table = {"points": loaded} if isinstance(loaded, np.ndarray) else loaded
+        arrays = {key: table[key] for key in table if keys is None or key in keys or table is not loaded}
+        for each in arrays.values():
+            if max(each.shape, default=0) > each.nbytes + 65536:
+                raise ValueError(f"an array of {each.shape}")
+    return arrays
 
 
 def load_mat(content: bytes, source: str | Path) -> dict[str, Any]:

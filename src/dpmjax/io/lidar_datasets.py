@@ -94,13 +94,13 @@ def _read_learned(folder: Path, files: list[Path]) -> SideData:
     Returns:
         Poses, times and notes; none where the files are missing.
     """
-    T = np.full((len(files), 4, 4), np.nan)
+    T, keys = np.full((len(files), 4, 4), np.nan), ("ego_rotation", "ego_translation")
     for index, file in enumerate(files):
         try:
-            table = load_arrays(file, ("ego_rotation", "ego_translation"))
+            table = load_arrays(file, keys)
         except InputError:  # The scan is damaged, too, and a warning names it when it is read.
             continue
-        parts = list(table.values())
+        parts = [table.get(key, np.zeros(0)) for key in keys]
         if [part.size for part in parts] != [9, 3] or any(part.dtype.kind not in "fiu" for part in parts):
             return read_plain_drive(folder, files)
         pose = homogeneous(parts[0].astype(np.float64).reshape(3, 3), parts[1].astype(np.float64).ravel())
