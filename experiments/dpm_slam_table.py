@@ -1,7 +1,6 @@
 """Compares SLAM on drives: our settings, several agents, and other programs on the same scans.
 
     python -m experiments.dpm_slam_table path/to/drive another/drive --methods whole KISS-ICP KISS-SLAM small_gicp
-    python -m experiments.dpm_slam_table town --num-towns 5 --town-length-m 1000 4000
     python -m experiments.dpm_slam_table path/to/drive kitti_00.txt kitti_07.txt       towns along real routes
     python -m experiments.dpm_slam_table path/to/drive --methods whole paper "paper, errors up to 2.5 m"
     python -m experiments.dpm_slam_table path/to/drive --methods agents
@@ -35,31 +34,22 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from dpmjax import Model, cli, io, load_map, load_model, metrics, save_map, simulation, slam
+from dpmjax import Model, cli, io, load_map, load_model, metrics, save_map, slam
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from experiments._slam_peers import PEERS, FoundLoop
 
 WHOLE, NETWORK, PAPER, AGENTS = "whole", "network proposes every pose", "paper", "agents"
 PAPER_WIDE, WIDE_M = "paper, errors up to 2.5 m", 2.5
-NEAREST, NO_OFFSETS = "features of the nearest keyframe alone", ", without the offset head"
+NO_OFFSETS = ", without the offset head"
 # Our settings; "paper" is section 4 by its own method, with the published limits; "errors up to 2.5 m" suits the
 # shipped weights.
-SETTINGS = (WHOLE, NEAREST, PAPER, NETWORK, NETWORK + NO_OFFSETS, PAPER_WIDE, PAPER_WIDE + NO_OFFSETS)
+SETTINGS = (WHOLE, PAPER, NETWORK, NETWORK + NO_OFFSETS, PAPER_WIDE, PAPER_WIDE + NO_OFFSETS)
 # Parts of a drive that is cut, and the share of its length by which a part is longer at each end.
 NUM_AGENTS, OVERLAP = 3, 0.05
 PRECISIONS = ("float32", "int8")
 # Where half of the points of the first scan are nearer, the place is indoors.
 INDOORS_M = 5.0
-TOWN = "town"
-# Kind of place, kind of route, lidar: taken in turn. Each route drives some streets in both directions.
-TOWNS = (
-    ("suburb", "there_and_back", simulation.HDL64E),
-    ("canyon", "wander", simulation.OS1_64),
-    ("campus", "there_and_back", simulation.OS1_64),
-    ("suburb", "wander", simulation.HDL64E),
-    ("car_park", "wander", simulation.OS1_64),
-)
 COLUMNS = (
     "num_scans", "path_m", "ate_m", "ate_before_loops_m", "t_rel_percent", "num_loops", "num_wrong_loops",
     "loop_recall", "recall_same_way", "recall_opposite", "num_keyframes", "num_maps", "sent_mb", "map_mb",
@@ -78,14 +68,10 @@ class SlamTableOptions(cli.DriveOptions):
 
     may_change: ClassVar[frozenset[str]] = frozenset({"methods", "localize"})
 
-    paths: Annotated[Positional[tuple[str, ...]], arg(metavar="town|PATH ...")] = (TOWN,)
-    """Folders of scans, files of poses along which a town is simulated, or towns of the seeds."""
+    paths: Annotated[Positional[tuple[str, ...]], arg(metavar="PATH ...")] = ()
+    """Folders of scans, or files of poses along which a town is simulated."""
     methods: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = (WHOLE, NETWORK, "small_gicp")
     """Methods to compare: settings, agents, and KISS-ICP, KISS-SLAM, small_gicp."""
-    num_towns: Annotated[int, arg(metavar="N"), cli.Bound(1)] = 3
-    """Number of towns, where town is among the paths."""
-    town_length_m: Annotated[tuple[float, ...], arg(metavar="M"), cli.Bound(100)] = (400.0,)
-    """Length of the towns' routes; two numbers: from that of the first town to that of the last."""
     localize: Annotated[int, arg(metavar="N"), cli.Bound(0)] = 0
     """Number of scans that are looked for in the map of the first half; needs the method whole."""
 
@@ -93,10 +79,8 @@ class SlamTableOptions(cli.DriveOptions):
         """Checks bounds and names."""
         super().__post_init__()
         cli.check_names("--methods", self.methods, (*SETTINGS, AGENTS, *PEERS))
-        if not self.paths:
-            raise ValueError("give at least one folder of scans, or town")
-        if not 1 <= len(self.town_length_m) <= 2:
-            raise ValueError("--town-length-m: expected one or two lengths")
+        if not self.paths and not self.resume:
+            raise ValueError("give at least one folder of scans, or file of poses")
         if self.localize and WHOLE not in self.methods:
             raise ValueError(f"--localize looks for scans in the map of {WHOLE}: name it among the methods")
 
@@ -148,8 +132,6 @@ def make_setting(model: Model, setting: str) -> slam.SlamMethods:
     config, setting = slam.SlamConfig(), setting.removesuffix(NO_OFFSETS)
     if setting == NETWORK:
         config = replace(config, odometry=replace(config.odometry, proposer="network"))
-    if setting == NEAREST:
-        config = replace(config, front_end=replace(config.front_end, num_submap=1))
     if setting in (PAPER, PAPER_WIDE):
         limits = slam.DescriptorConfig() if setting == PAPER else slam.DescriptorConfig(max_rmse_m=WIDE_M)
         config = replace(slam.slam_preset("paper"), descriptors=limits)
@@ -159,25 +141,11 @@ def make_setting(model: Model, setting: str) -> slam.SlamMethods:
 def open_drives(options: SlamTableOptions) -> list[LidarSequence]:
     """Opens the drives that are compared; bad input is a `ValueError`."""
     drives: list[LidarSequence] = []
-    lengths_m = np.linspace(options.town_length_m[0], options.town_length_m[-1], options.num_towns)
     for entry in options.paths:
-        if entry == TOWN and not Path(entry).exists():
-            simulated = (simulate_town(number, length_m) for number, length_m in enumerate(lengths_m.tolist()))
-            drives += [cli.keep_scans(drive).take(options.selection) for drive in simulated]
-        else:
-            names: list[str | None] = io.list_lidar_sequences(entry) or [None]
-            drives += [cli.with_reference_only(cli.open_drive(Path(entry), options, name)) for name in names]
+        names: list[str | None] = io.list_lidar_sequences(entry) or [None]
+        drives += [cli.with_reference_only(cli.open_drive(Path(entry), options, name)) for name in names]
     cli.check_names_differ(drives)
     return drives
-
-
-def simulate_town(number: int, length_m: float) -> LidarSequence:
-    """Returns the drive through a town, once along its route; scans are cast when they are read."""
-    kind, route, sensor = TOWNS[number % len(TOWNS)]
-    # A car turns by at most 6 degrees from scan to scan, so that methods that expect a steady motion are not lost.
-    driving = simulation.DriveConfig(rate_hz=5.0, sensor_height_m=sensor.height_m, max_turn_deg_s=30.0)
-    town = simulation.TownConfig(kind, route, length_m, 90.0)
-    return simulation.simulate_scene(simulation.Scene(cli.FIRST_TOWN + number, town, driving, sensor))
 
 
 def map_by_setting(folder: Path, drive: LidarSequence, stop: Stop, methods: slam.SlamMethods) -> cli.Row | None:

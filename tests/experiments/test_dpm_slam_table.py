@@ -30,6 +30,7 @@ from experiments.dpm_slam_table import (
     map_by_setting,
     measure_trajectory,
 )
+from tests.data_sets import write_kitti_sequence
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
@@ -83,22 +84,22 @@ def drive_along(T_world_lidar: np.ndarray) -> LidarSequence:
 @pytest.mark.usefixtures("with_peer")
 def test_every_method_gets_a_row_and_a_resumed_run_computes_nothing_again(model, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    town = toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
-    monkeypatch.setattr(dpm_slam_table, "simulate_town", lambda *_: town)
+    drive = toy.drive(1, num_scans=NUM_SCANS, step_m=STEP_M)
+    write_kitti_sequence(tmp_path / "kitti", "00", drive)
     dpmjax.save_model(model, tmp_path / "model.safetensors")
     out, methods = tmp_path / "out", (PEER, WHOLE, NETWORK, PAPER, "agents")
-    options = ("--weights", "model.safetensors", "--num-towns", 1, "--localize", 3, "-o", out)
-    assert run(dpm_slam_table, "town", "--methods", *methods, *options) == EXIT_OK
+    options = ("--weights", "model.safetensors", "--localize", 3, "-o", out)
+    assert run(dpm_slam_table, "kitti", "--methods", *methods, *options) == EXIT_OK
     rows = {row["method"]: row for row in read_rows(out)}
     assert tuple(rows) == methods
     assert float(rows[PEER]["ate_m"]) == pytest.approx(0.0, abs=1e-6)
-    num_points = sum(len(town.read_scan(number)) for number in range(NUM_SCANS))
+    num_points = sum(len(drive.read_scan(number)) for number in range(NUM_SCANS))
     assert float(rows[PEER]["map_mb"]) == pytest.approx(num_points / 1e6)
     for method in methods[:-1]:
         assert int(rows[method]["num_scans"]) == NUM_SCANS
         assert rows[method]["num_loops"] == rows[method]["num_wrong_loops"] == "0"
         assert float(rows[method]["scan_s_last_tenth"]) > 0
-    path = out / "drives" / town.name / WHOLE / "map_int8.npz"
+    (path,) = out.glob(f"drives/*/{WHOLE}/map_int8.npz")
     assert float(rows[WHOLE]["map_int8_mb"]) == path.stat().st_size / 1e6
     assert len(dpmjax.load_map(path)) == int(rows[WHOLE]["num_keyframes"])
     places = read_rows(out, "places.csv")
@@ -193,10 +194,10 @@ def test_wrong_loops_are_counted_and_find_nothing(tmp_path) -> None:
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere"),
-        (["town", "--weights", "no_such_model"], "no_such_model"),
-        (["town", "--town-length-m", 400, 500, 600], "--town-length-m"),
-        (["town", "--localize", 3, "--methods", "paper"], "--localize"),
-        (["town", "--methods", "nonsense"], "--methods"),
+        (["drive", "--weights", "no_such_model"], "no_such_model"),
+        ([], "give at least one folder"),
+        (["drive", "--localize", 3, "--methods", "paper"], "--localize"),
+        (["drive", "--methods", "nonsense"], "--methods"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, capsys, arguments, message: str) -> None:

@@ -198,22 +198,16 @@ def find_sources(
         if entry == TOWN and not Path(entry).exists():
             sources += towns
             continue
-        reasons: dict[str, str] = {}
-        useful: list[Source] = []
         names: Sequence[str | None] = io.list_lidar_sequences(entry) or [None]
-        for name in names:
-            source = partial(open_with_poses, Path(entry), name)
-            drive = source()
-            reason = deeppointmap.why_useless(drive, sampling or deeppointmap.SamplingConfig())
-            if reason is None:
-                useful.append(source)
-            else:
-                reasons[drive.name] = reason
-        if not useful:
+        found = [partial(open_with_poses, Path(entry), name) for name in names]
+        sampling = sampling or deeppointmap.SamplingConfig()
+        reasons = {source: deeppointmap.why_useless(source(), sampling) for source in found}
+        if None not in reasons.values():
             raise ValueError("; ".join(f"{entry}: {reason}" for reason in dict.fromkeys(reasons.values())))
-        for left_out, reason in reasons.items():
-            LOGGER.warning("%s is left out: %s", left_out, reason)
-        sources += useful
+        for source, reason in reasons.items():
+            if reason is not None:
+                LOGGER.warning("%s, %s is left out: %s", entry, source.args[1], reason)
+        sources += [source for source, reason in reasons.items() if reason is None]
     return sources
 
 
@@ -225,16 +219,24 @@ def check_names_differ(drives: Iterable[LidarSequence]) -> None:
 
 
 class ScanReader:
-    """Reads scans, with point times for deskewing.
+    """Reads scans, with point times for deskewing and with odometry.
 
     Args:
         sequence: the drive.
         is_deskewed: True for points with times.
         jump: stride of the scans of the drive, for drives without times.
+        odometry: (n, 4, 4) poses of the lidar, as first guesses; None without odometry.
     """
 
-    def __init__(self, sequence: LidarSequence, *, is_deskewed: bool = False, jump: int = 1) -> None:
-        self.sequence, self._is_deskewed, self._jump = sequence, is_deskewed, jump
+    def __init__(
+        self,
+        sequence: LidarSequence,
+        *,
+        is_deskewed: bool = False,
+        jump: int = 1,
+        odometry: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.sequence, self.odometry, self._is_deskewed, self._jump = sequence, odometry, is_deskewed, jump
         self._has_warned = False
 
     def __call__(self, index: int) -> slam.TimedScan | np.ndarray:

@@ -101,7 +101,7 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     start = slam.init_slam(None if options.map is None else slam_run.open_map(options.map, methods))
     sequence = cli.open_drive(next(iter(options.data), None), options, options.sequence)
     odometry, notes = odometry_of(options, sequence)
-    reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump)
+    reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump, odometry=odometry)
     beginning = slam_run.find_beginning(run.path if run.is_resumed else None, methods, start)
     num_done = len(beginning.reports)
     found = f"{counted(num_done, 'scan')} done, {len(sequence)} wanted"
@@ -110,9 +110,8 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     run.say(f"{sequence.name}: {counted(len(sequence), 'scan')}" + (f", {num_done} done before" if num_done else ""))
     viewer = viz.LiveViewer(sequence.name, run / "slam.rrd") if options.visualize else None
     with nullcontext() if viewer is None else closing(viewer):
-        mapped = slam_run.run_scans(
-            run.path, reader, methods, beginning, stop=lambda: run.is_stopped, viewer=viewer, odometry=odometry
-        )
+        stop = lambda: run.is_stopped  # noqa: E731
+        mapped = slam_run.run_scans(run.path, reader, methods, beginning, stop=stop, viewer=viewer)
     if mapped.error is not None:
         run.fail(mapped.error)
     result = slam.finish_slam(mapped.state, mapped.reports, methods.config)

@@ -120,7 +120,6 @@ def run_scans(
     *,
     stop: Callable[[], bool],
     viewer: viz.LiveViewer | None = None,
-    odometry: np.ndarray | None = None,
 ) -> SlamRun:
     """Places the remaining scans and saves the state of the last keyframe; an error stops the run.
 
@@ -131,7 +130,6 @@ def run_scans(
         beginning: state and reports of the scans that are done.
         stop: called before each scan; True ends the run.
         viewer: shows the run.
-        odometry: (n, 4, 4) poses of the lidar, as first guesses; None without odometry.
 
     Returns:
         The run.
@@ -153,7 +151,7 @@ def run_scans(
                     break
                 before = clock.now_s()
                 scan, prepared = next(scans)
-                guessed = slam.with_guess(state.front_end, odometry, row)
+                guessed = slam.with_guess(state.front_end, reader.odometry, row)
                 state, report = slam.step_slam(methods, state._replace(front_end=guessed), prepared)
                 scan_s.append(clock.now_s() - before)
                 reports.append(report)

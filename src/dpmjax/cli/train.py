@@ -145,21 +145,7 @@ def main(options: TrainOptions, run: Run) -> Numbers:
     trained = run_training(records, store, settings, hooks, seed=options.seed, total_s=total_s)
     if records is None:
         return {}
-    numbers = {
-        "seed": options.seed,
-        "num_scans": num_scans,
-        "bad_scans": store.bad,
-        "steps": int(trained.progress.state.step),
-        "best_step": int(trained.progress.best_step) or None,
-        "selection_score": float(trained.progress.best_score),
-        "chosen_by": "the last step, as published" if records.takes_last else records.selection.chosen_by,
-        "trained": trained.model.config.trained,
-        "overlap_steps": 0 if trained.overlap is None else int(trained.overlap.step),
-        "train_s": records.run_s,
-        "compile_s": trained.speed.compile_s,
-        "scans_per_s": trained.speed.scans_per_s,
-        "calibration": {},
-    }
+    numbers = training_numbers(trained, records) | {"num_scans": num_scans, "bad_scans": store.bad, "calibration": {}}
     origin = f"{options.preset}, trained on {', '.join(options.data)}"
     # A stopped run has no minutes for the evaluation and the calibration.
     numbers |= {} if run.is_stopped else evaluate(trained, records)
@@ -250,6 +236,22 @@ def calibrate_on_sources(
     if calibrated.config.overlap is None:
         print("the overlap is not calibrated: pairs with overlap or without are missing; give more drives, or town too")
     return calibrated, numbers
+
+
+def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers:
+    """Returns steps, selection score and seconds for `metrics.json`."""
+    return {
+        "seed": records.seed,
+        "steps": int(trained.progress.state.step),
+        "best_step": int(trained.progress.best_step) or None,
+        "selection_score": float(trained.progress.best_score),
+        "chosen_by": "the last step, as published" if records.takes_last else records.selection.chosen_by,
+        "trained": trained.model.config.trained,
+        "overlap_steps": 0 if trained.overlap is None else int(trained.overlap.step),
+        "train_s": records.run_s,
+        "compile_s": trained.speed.compile_s,
+        "scans_per_s": trained.speed.scans_per_s,
+    }
 
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> Numbers:
