@@ -146,10 +146,9 @@ def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDA
 
 def _read_text(content: bytes, header: _Header, kept: list[int], source: str) -> dict[str, NDArray[Any]]:
     """Reads rows of numbers; rows may have numbers for the padding, or leave it out."""
-    lines = enumerate(content[header.size :].splitlines(), 1 + content[: header.size].count(b"\n"))
-    rows = [(number, words) for number, line in lines if (words := line.decode("latin-1").split())][: header.num_points]
+    lines = [line.decode("latin-1") for line in content[header.size :].splitlines() if line.strip()]
     widths = [header.record[i].shape[0] for i in range(len(header.names))]
-    table = to_numbers(rows, source) if rows else np.zeros((0, sum(widths)))
+    table = to_numbers(lines[: header.num_points], source) if header.num_points else np.zeros((0, sum(widths)))
     if table.shape[1] == sum(widths[i] for i in kept):
         widths = [width * (i in kept) for i, width in enumerate(widths)]
     found = f"truncated: {table.shape} numbers, the header promises {header.num_points, sum(widths)}"

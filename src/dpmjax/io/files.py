@@ -200,31 +200,28 @@ def is_number(word: str) -> bool:
     return True
 
 
-def to_numbers(rows: Sequence[tuple[int, Sequence[str]]], source: str | Path) -> FloatArray:
-    """Converts words to numbers.
+def to_numbers(lines: Sequence[str], source: str | Path) -> FloatArray:
+    """Converts lines of numbers.
 
     Args:
-        rows: n rows: the line in the file, from 1, and its k words.
+        lines: n lines of k numbers, separated by blanks.
         source: name of the file, for messages.
 
     Returns:
         (n, k).
 
     Raises:
-        InputError: there is no row, rows differ in length, or a word is no number; the line is named.
+        InputError: there is no row, rows differ in length, or a word is no number; the row is named.
     """
-    require(len(rows) > 0, source, "no row", "write rows of numbers")
-    for line, words in rows:
-        found = f"line {line}: {len(words)} columns, line {rows[0][0]} has {len(rows[0][1])}"
-        require(len(words) == len(rows[0][1]), source, found, "give rows of equal length")
-    table: list[list[float]] = []
+    require(len(lines) > 0, source, "no row", "write rows of numbers")
     try:
-        for _, words in rows:
-            table.append([float(word) for word in words])
+        return np.loadtxt(lines, ndmin=2, comments=None)
     except ValueError as error:
-        found = f"line {rows[len(table)][0]}: {str(error)[:100]}"
-        raise InputError(source, found, "write plain decimal numbers") from error
-    return np.array(table)
+        rows, width = [line.split() for line in lines], len(lines[0].split())
+        bad = (n for n, words in enumerate(rows) if len(words) != width or not all(map(is_number, words)))
+        row = next(bad, 0)
+        found = f"row {row + 1} is not {width} numbers: {lines[row][:80]!r}"
+        raise InputError(source, found, "write rows of one length, and plain decimal numbers") from error
 
 
 def read_table(path: str | Path, width: int | None = None) -> FloatArray:
@@ -242,10 +239,10 @@ def read_table(path: str | Path, width: int | None = None) -> FloatArray:
     Raises:
         InputError: there is no such file, no row, rows differ in length, a word is no number, or another width.
     """
-    rows = [(number, re.sub("[,;]", " ", line).split()) for number, line in enumerate(read_lines(path), 1)]
-    rows = [(number, words) for number, words in rows if words and words[0][:1] != "#"]
-    has_names = len(rows) > 1 and not any(map(is_number, rows[0][1]))
-    table = to_numbers(rows[has_names:], path)
+    lines = [re.sub("[,;]", " ", line).strip() for line in read_lines(path)]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    has_names = len(lines) > 1 and not any(map(is_number, lines[0].split()))
+    table = to_numbers(lines[has_names:], path)
     is_good = width is None or (table.shape[1] == width and bool(np.isfinite(table).all()))
     found = f"rows of {table.shape[1]} numbers, or some not finite"
     require(is_good, path, found, f"give {width} finite numbers a row")
@@ -280,8 +277,8 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
         table = {"points": loaded} if isinstance(loaded, np.ndarray) else loaded
         arrays = {key: table[key] for key in table if keys is None or key in keys or table is not loaded}
         for each in arrays.values():
-            if max(each.shape, default=0) > each.nbytes + 65536:
-                raise ValueError(f"an array of {each.shape}")
+            is_good = max(each.shape, default=0) <= each.nbytes + 65536
+            require(is_good, path, f"not a readable NumPy file (an array of {each.shape})", advice)
     return arrays
 
 
