@@ -125,7 +125,8 @@ def time_training(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
 
 def _model(preset: str) -> dpmjax.Model:
     # Speed does not depend on the values of the weights.
-    return dpmjax.init_model(jax.random.key(0), dpmjax.model_preset(preset))
+    config = replace(dpmjax.model_preset(preset), trained=("registration", "overlap"))
+    return dpmjax.init_model(jax.random.key(0), config)
 
 
 def _cloud(model: dpmjax.Model, num_descriptors: int, *, seed: int) -> dpmjax.DescriptorCloud:

@@ -18,8 +18,9 @@ def scans(monkeypatch):
     monkeypatch.setattr(deeppointmap.dpmjax, "model_preset", lambda name: toy.MODEL)
     monkeypatch.setattr(deeppointmap.dpm, "training_preset", lambda name: toy.TRAINING)
     angles, heights = np.linspace(0, 2 * np.pi, 400), np.tile(np.linspace(0, 3, 8), 50)
-    rings = {"town": 20.0, "KITTI": 30.0}.items()
-    return {name: np.stack([r * np.cos(angles), r * np.sin(angles), heights], 1, dtype=np.float32) for name, r in rings}
+    # A star, because a ring looks like beams without an echo.
+    star = np.stack([np.cos(angles), np.sin(angles)], 1) * (1 + 0.3 * np.sin(5 * angles))[:, None]
+    return {name: np.column_stack([r * star, heights]).astype(np.float32) for name, r in (("town", 20), ("KITTI", 30))}
 
 
 @pytest.mark.slow
