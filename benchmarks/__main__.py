@@ -54,19 +54,15 @@ def main(config: Config) -> int:
             continue
         records += [{"name": name, **row._asdict()} for row in rows]
     if records:
-        print(describe(machine), format_table(records), sep="\n")
+        versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+        print(f"{machine['cpu']}, {machine['num_cores']} cores; device {machine['device']}\n{versions}")
+        print(format_table(records))
     if config.output is not None:
         report = {"environment": machine, "quick": config.quick, "failed": failed, "rows": records}
         write_atomically(config.output, json.dumps(report, indent=2) + "\n")
     if failed:
         print(f"benchmarks: failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
-
-
-def describe(environment: dict[str, Any]) -> str:
-    """Returns machine and versions in two lines."""
-    versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
-    return f"{environment['cpu']}, {environment['num_cores']} cores; device {environment['device']}\n{versions}"
 
 
 if __name__ == "__main__":

@@ -23,17 +23,15 @@ GRAPHS = ("intel", "M3500", "parking-garage", "sphere2500")
 
 def run(quick: bool) -> list[Row]:
     """Optimises each graph with both programs."""
-    rows: list[Row] = []
     no_peer = why_not_importable("gtsam")
     if no_peer is not None:
         print(f"no peer: {no_peer}", file=sys.stderr)
-    for name in GRAPHS[:2] if quick else GRAPHS:
-        path = DATA / "g2o" / f"{name}.g2o"
-        if not path.exists():
-            print(f"{path} is not there: skipped; set DPMJAX_DATA", file=sys.stderr)
-            continue
-        rows += compare(path, 2 if quick else 5, has_peer=no_peer is None)
-    return rows
+    paths = [DATA / "g2o" / f"{name}.g2o" for name in (GRAPHS[:2] if quick else GRAPHS)]
+    missing = ", ".join(path.name for path in paths if not path.exists())
+    if missing:
+        print(f"{missing} not there: skipped; set DPMJAX_DATA", file=sys.stderr)
+    there = (path for path in paths if path.exists())
+    return [row for path in there for row in compare(path, 2 if quick else 5, has_peer=no_peer is None)]
 
 
 def compare(path: Path, repeats: int, *, has_peer: bool) -> list[Row]:

@@ -40,7 +40,7 @@ COLUMNS = ("error_px", "turn_deg", "right", "known")
 class RelocalizeOptions(cli.RunOptions):
     """Options of the experiment."""
 
-    world: Literal[0, 1, 2, "grove", "crowd"] = 0
+    world: Literal[0, 1, 2, "grove"] = 0
     """Which built-in world."""
     init: Literal["icp-plane", "zero"] = "icp-plane"
     """Where the poses of the fit start."""

@@ -64,7 +64,7 @@ def test_bad_folders_and_archives_are_refused(tmp_path, small):
     folder = write_deepmapping_folder(tmp_path / "run", small)
     for variables, found in (
         ({"pose": np.zeros((2, 3))}, "for 3 scans"),
-        ({"other": 1.0}, "other"),
+        ({"other": 1.0}, "pose"),
         ({"pose": np.full((3, 3), np.nan)}, "NaN"),
     ):
         savemat(folder / "gt_pose.mat", variables)

@@ -62,10 +62,10 @@ def test_points_are_read_whatever_the_encoding_and_order(tmp_path: Path, content
         (b"hello\nworld\n", "no PCD header"),
         (plain(encoding="binary", body=ROWS.tobytes()[:-5]), "truncated"),
         (plain(body=b"1 2 3\n"), "truncated"),
-        (plain(body=b"1 2 3\n4 5\n6 7 8\n"), "line 13 has 2 columns"),
-        (plain(body=b"1 2 3\n4 x 5\n6 7 8\n"), "line 13, column 2: 'x' is not a number"),
+        (plain(body=b"1 2 3\n4 5\n6 7 8\n"), "row 2 is not 3 numbers"),
+        (plain(body=b"1 2 3\n4 x 5\n6 7 8\n"), "row 2 is not 3 numbers: '4 x 5'"),
         (plain("x z w"), "column y"),
-        (plain(encoding="packed"), "not supported"),
+        (plain(encoding="packed"), "broken PCD header"),
         (plain(encoding="binary_compressed"), "truncated"),
         (plain(num_points=-1), "broken PCD header"),
         (plain(kind="Q"), "broken PCD header"),
@@ -153,17 +153,17 @@ def test_damaged_compression_is_named(tmp_path: Path, points: np.ndarray, damage
         read_pcd(tmp_path / "a.pcd")
 
 
-def test_padding_counted_with_the_size_of_the_next_field_is_set_right(tmp_path: Path, points: np.ndarray) -> None:
+def test_fields_behind_a_padding_of_0_are_left_out(tmp_path: Path, points: np.ndarray) -> None:
     """The Point Cloud Library writes a padding of 0 before a double that it aligns, and takes it off elsewhere."""
     kinds = {"p": ("<f4", 3), "intensity": "<f4", "timestamp": "<f8", "ring": "<u2"}
     layout = {"names": list(kinds), "formats": list(kinds.values()), "offsets": [0, 16, 24, 32], "itemsize": 48}
     records = np.zeros(NUM, np.dtype(layout))
-    records["p"], records["timestamp"], records["ring"] = points, np.linspace(0, 0.1, NUM), np.arange(NUM) % 64
+    records["p"] = points
     fields, sizes = "x y z _ intensity _ timestamp _ ring _", "4 4 4 1 4 1 8 1 2 1"
     head = header(fields, sizes, "F F F U F U F U U U", "1 1 1 4 1 0 1 6 1 12", "binary")
     (tmp_path / "a.pcd").write_bytes(head + records.tobytes())
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd"), points)
-    np.testing.assert_array_equal(read_point_times(tmp_path / "a.pcd"), np.linspace(0, 0.1, NUM))
+    assert read_point_times(tmp_path / "a.pcd") is None
 
 
 @pytest.mark.parametrize("is_padded", [False, True])

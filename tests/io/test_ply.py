@@ -52,7 +52,7 @@ def test_ascii_is_read(tmp_path):
         (b"ply\nformat ascii 1.0\nelement vertex 2\n", "no PLY header"),
         (HEADER.format("binary_little_endian").encode() + b"123", "truncated"),
         (HEADER.format("ascii").encode() + b"1 2 3 4\n", "truncated"),
-        (HEADER.format("ascii").encode() + b"1 2 3 4\n1 2\n3 4 5 6\n", "line 13 has 2 columns, line 12 has 4"),
+        (HEADER.format("ascii").encode() + b"1 2 3 4\n1 2\n3 4 5 6\n", "row 2 is not 4 numbers"),
         (HEADER.format("morse").encode(), "unknown|morse"),
         (HEADER.format("ascii").replace("float32 z", "float32 w").encode(), "PLY properties"),
         (HEADER.format("ascii").replace("double", "quadruple").encode(), "broken PLY header"),

@@ -103,7 +103,7 @@ def test_names_that_are_stamps_are_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(drive.T_world_lidar, drive_along(times - EPOCH), atol=1e-3)
 
 
-@pytest.mark.parametrize("form", ["{0}_{1:09}", "left-{0}-{1:09}", "{0}.{1:09}", "{0}.{1}"])
+@pytest.mark.parametrize("form", ["{0}_{1:09}", "left-{0}-{1:09}", "{0}.{1:09}"])
 def test_names_of_seconds_and_nanoseconds_are_times(form: str) -> None:
     stamps_ns = np.arange(23) * 100_000_000 + 12_345_678
     files = [Path(f"{form.format(1_600_000_000 + ns // 10**9, ns % 10**9)}.pcd") for ns in stamps_ns.tolist()]
@@ -187,8 +187,6 @@ def test_poses_of_a_camera_are_named_and_with_a_calibration_converted(folder: Pa
         ["1600000000.900000", "1600000001.000000"],
         [".0", ".05", ".1", ".15"],
         ["2", "10", "11"],
-        # Nanoseconds without leading zeros: 0.0123, 0.1123 and 0.2123 s.
-        ["1600000000.12345678", "1600000000.112345678", "1600000000.212345678", "1600000000.312345678"],
         # Decimals whose last zeros are left out.
         ["1600000000.15", "1600000000.2", "1600000000.25", "1600000000.3"],
     ],

@@ -62,11 +62,11 @@ def test_files_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3\n", "not finite; a line reads t1 t2"),
+        ("1 2 3\n", "some not finite"),
         ("", "no row"),
         ("1 2 3 4 5 0 0 0\n", "a height or a tilt"),
-        ("1 2 nan 4 0 0 0 0\n", "not finite; a line reads t1 t2"),
-        ("1 2 x 4 0 0 0 0\n", "not a number"),
+        ("1 2 nan 4 0 0 0 0\n", "some not finite"),
+        ("1 2 x 4 0 0 0 0\n", "row 1 is not 8 numbers"),
     ],
 )
 def test_files_that_are_none_are_refused(tmp_path: Path, text: str, message: str) -> None:

@@ -1,6 +1,5 @@
-"""Laws of the worlds, of the walk through them, of the people in them, and of the simulated sequence."""
+"""Laws of the worlds, of the walk through them, and of the simulated sequence."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,11 +8,11 @@ from scipy.ndimage import label
 from scipy.stats import kstest
 
 from dpmjax.simulation import World, make_world, simulate_sequence, simulate_trajectory
-from dpmjax.simulation.walk2d import simulate_odometry, simulate_people, stop_at_people
+from dpmjax.simulation.walk2d import simulate_odometry
 from dpmjax.simulation.world2d import beam_angles, cast_rays
 
 WORLDS = [0, 1, 2]
-NAMED = ["grove", "grove-4", "crowd"]
+NAMED = ["grove", "grove-4"]
 world = lru_cache(make_world)
 
 
@@ -58,46 +57,6 @@ def test_a_grove_has_no_straight_wall_and_no_view_of_the_border():
         assert longest_straight_edge(grid) < 60 < 300 < longest_straight_edge(world(0).is_obstacle)
         assert grid[[0, -1]].all()
         assert grid[:, [0, -1]].all()
-
-
-def test_beams_end_on_people_and_nothing_else_changes():
-    crowd = world("crowd")
-    with_people, empty = (
-        simulate_sequence(crowd, 12, seed=1),
-        simulate_sequence(replace(crowd, num_people=0), 12, seed=1),
-    )
-    np.testing.assert_array_equal(with_people.reference_poses, empty.reference_poses)
-    ranges, free = (np.linalg.norm(s.points, axis=2) for s in (with_people, empty))
-    is_met = ranges < free - 1e-3
-    assert 0.02 < is_met.mean() < 0.4
-    np.testing.assert_array_equal(with_people.points[~is_met], empty.points[~is_met])
-
-
-def test_a_person_is_a_disc_in_front_of_what_is_farther():
-    poses, angles = np.array([[10.0, 20.0, 0.5]]), beam_angles(360)
-    people = np.array([[[110.0, 20.0]], [[10.0, 320.0]], [[20.0, 20.0]]])
-    ranges = stop_at_people(np.full((1, 360), 200.0), poses, angles, people)
-    bearing = angles + 0.5
-    hits = poses[0, :2] + ranges[0, :, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
-    is_met = ranges[0] < 200.0
-    # Beams meet only the first person. The second is behind the walls, and the third stands too near to the sensor.
-    np.testing.assert_allclose(np.linalg.norm(hits[is_met] - people[0, 0], axis=1), 11.0, atol=1e-9)
-    assert (ranges[0, is_met] < 100.0).all()
-    width = np.rad2deg(2 * np.arcsin(11.0 / 100.0))
-    assert abs(is_met.sum() - width) <= 1
-    np.testing.assert_array_equal(stop_at_people(ranges, poses, angles, people[:0]), ranges)
-
-
-def test_people_walk_in_free_space():
-    crowd = world("crowd")
-    people = simulate_people(replace(crowd, num_people=3), 20, rng=np.random.default_rng(0))
-    assert people.shape == (3, 20, 2)
-    cells = people.astype(int)
-    assert not crowd.is_obstacle[cells[..., 1], cells[..., 0]].any()
-    steps = np.linalg.norm(np.diff(people, axis=1), axis=2)
-    assert (steps > 1.0).all()
-    assert len(np.unique(people[:, 0], axis=0)) == 3
-    assert simulate_people(replace(crowd, num_people=0), 20, rng=np.random.default_rng(0)).shape == (0, 20, 2)
 
 
 @pytest.mark.parametrize("index", WORLDS)

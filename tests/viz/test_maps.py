@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 
 from dpmjax import viz
 from dpmjax.types import ScanSet
-from dpmjax.viz.figures import INK, PATH, WRONG
+from dpmjax.viz.figures import INK, PATH
 from dpmjax.viz.scan_maps import UNEXPLORED_GREY
 from dpmjax.viz.scan_pairs import SOURCE, TARGET
 from tests.viz.test_figures import as_bytes, circle, colors_of, labels
@@ -59,14 +59,11 @@ def test_found_scans_are_drawn_where_they_are():
     keyframes, scans = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(4), (2, 1, 1))
     keyframes[:, 0, 3], scans[:, 1, 3] = [0, 5, 10], [2, 3]
     points = np.random.default_rng(0).uniform(-10, 10, (50, 3))
-    figure = viz.localization_figure(points, keyframes, scans, is_wrong=[False, True], title="t")
+    figure = viz.localization_figure(points, keyframes, scans, title="t")
     (axes,) = figure.axes
     np.testing.assert_array_equal(line_of(axes, INK, 3)[:, 0], [0, 5, 10])
-    np.testing.assert_array_equal(line_of(axes, PATH, 1), [[0, 2]])
-    np.testing.assert_array_equal(line_of(axes, WRONG, 1), [[0, 3]])
-    # Shape tells right and wrong apart where the colour cannot be seen.
-    assert len({line.get_marker() for line in axes.lines[:3]}) == 3
-    assert labels(figure) == ["3 keyframes", "1 found (line: forward)", "1 found elsewhere than the reference"]
+    np.testing.assert_array_equal(line_of(axes, PATH, 2), [[0, 2], [0, 3]])
+    assert labels(figure) == ["3 keyframes", "2 found (line: forward)"]
     assert viz.localization_figure(np.zeros((0, 3)), np.eye(4)[None], np.zeros((0, 4, 4)), title="t").axes
 
 
@@ -156,20 +153,3 @@ def test_scans_that_meet_are_black_and_apart_have_two_colours():
     assert [line_of(axes, SOURCE, 1)[0, 1] for axes in figure.axes[:2]] == [-5, 0]
     grey = [np.dot(to_rgb(color), (0.299, 0.587, 0.114)) for color in (INK, SOURCE, TARGET, "white")]
     assert np.diff(grey).min() > 0.15
-
-
-def test_matches_join_the_clouds_and_wrong_ones_stand_out():
-    T, matched = np.eye(4), np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]])
-    T[:2, 3] = [2.0, 3.0]
-    pair = viz.RegisteredPair("pair", np.zeros((3, 3)), np.ones((4, 3)), {"laid onto the target": T})
-    figure = viz.matches_figure(pair, matched, matched, [True, False])
-    right, wrong = figure.axes[0].collections
-    assert {"1 right match", "1 wrong match"} <= set(labels(figure))
-    # Style tells them apart where the colour cannot be seen.
-    assert right.get_linestyle() != wrong.get_linestyle()
-    for match, start in ((right, [0.0, 0.0]), (wrong, [0.5, 0.5])):
-        np.testing.assert_allclose(match.get_segments()[0][0], start)
-    np.testing.assert_allclose(line_of(figure.axes[1], SOURCE, 1), [[2.0, 3.0]])
-    many = viz.matches_figure(pair, np.zeros((400, 3)), np.zeros((400, 3)), np.ones(400))
-    assert len(many.axes[0].collections[0].get_segments()) == 30
-    assert "400 right matches, 30 drawn" in labels(many)

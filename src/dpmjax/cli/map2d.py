@@ -64,8 +64,8 @@ class Map2dOptions(cli.ScanOptions, cli.RunOptions):
     """Stop after N steps, rounded up to whole calls of the compiled program. Without it, the preset decides."""
     seconds: Annotated[float | None, arg(metavar="S"), cli.Bound(0, is_allowed=False)] = None
     """Stop the fit after S seconds of run time, without compile time."""
-    world: Literal[0, 1, 2, "grove", "crowd"] = 0
-    """Built-in world without DATA: numbered ones have walls, grove has trees and rocks, crowd has walking people."""
+    world: Literal[0, 1, 2, "grove"] = 0
+    """Built-in world without DATA: numbered ones have walls, grove has trees and rocks."""
     range_noise_px: Annotated[float, arg(metavar="PX"), cli.Bound(0)] = 0.0
     """Standard deviation of the range noise in the built-in world."""
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from dpmjax import io, metrics
+from dpmjax import io
 from dpmjax.cli.info import git_hash
 from dpmjax.cli.run import Run
 
@@ -73,12 +73,15 @@ def summarize(rows: Iterable[Row], by: Sequence[str], columns: Sequence[str]) ->
 
 
 def _summary(rows: list[Row], columns: Sequence[str]) -> Row:
+    from scipy import stats
+
     found: Row = {}
     for name in columns:
         values = [row[name] for row in rows if row.get(name) is not None]
         if values and all(isinstance(value, bool) for value in values):
-            interval = metrics.wilson_interval(sum(values), len(values))
-            found |= {name: interval.share, f"{name}_low": interval.low, f"{name}_high": interval.high}
+            interval = stats.binomtest(sum(values), len(values)).proportion_ci(method="wilson")
+            found[name] = sum(values) / len(values)
+            found |= {f"{name}_low": float(interval.low), f"{name}_high": float(interval.high)}
         else:
             found[name] = statistics.median(values) if values else None
     return found

@@ -11,7 +11,7 @@ import bisect
 import dataclasses
 import logging
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +23,8 @@ from dpmjax.sequences import BoolArray, FloatArray, ScanSequence, pad_scans, req
 _log = logging.getLogger(__name__)
 _FORMS = {
     "FLASER": "a line reads FLASER n r1..rn x y theta odom_x odom_y odom_theta timestamp host timestamp",
-    "ROBOTLASER1": (
-        "a line reads ROBOTLASER1 type start_angle field_of_view step max_range accuracy remission_mode n r1..rn m "
-        "i1..im laser_x laser_y laser_theta robot_x robot_y robot_theta, five more numbers, timestamp host timestamp"
-    ),
+    "ROBOTLASER1": "a line has 7 numbers of the laser, n r1..rn, m i1..im, poses of laser and robot, 5 numbers, times",
 }
-_LARGEST_NUMBER = 1e18
-_SHORTEST_SCALE_M = 7.9  # Least range of the code for "no echo" of the lasers of these logs.
-_LONGEST_RANGE_M = 1e6
-_CODE_BAND_M = 0.1  # Codes for "no echo" scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
-# Poses of a log as recorded are those of its ODOM lines, within the distance from one such line to the next.
-_SAME_PLACE_M = 0.5
-# Equal poses, metres and radians.
-_SAME_POSE = 1e-4
-# A line is moved to the position of its time stamp if that shortens the detour of its odometry to this share.
-_SHORTER_WAY = 0.5
-# The odometry does not jump in steps of up to this many times the median.
-_USUAL_STEP = 4.0
 
 
 class _Scan(NamedTuple):
@@ -80,25 +65,26 @@ def read_carmen_log(path: str | Path) -> ScanSequence:
         _log.warning("%s: only its FLASER lines are read, its ROBOTLASER1 lines are left out", path)
     scans = [_parse_scan(words, f"{path}:{number}") for number, words in found]
     largest = max(float(scan.ranges.max()) for scan in scans)
-    limit = min(largest - _CODE_BAND_M if largest >= _SHORTEST_SCALE_M else np.inf, _LONGEST_RANGE_M)
-    ends = []
-    for scan in scans:
-        ranges = np.where((scan.ranges > 0) & (scan.ranges < limit), scan.ranges, np.nan)
-        ends.append(ranges[:, None] * np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]))
+    # Codes for "no echo" are 7.9 m and more, and scatter by a few centimetres (81.87 to 81.91 m on a SICK LMS).
+    limit = min(largest - 0.1 if largest >= 7.9 else np.inf, 1e6)
+    ends = [
+        np.where((scan.ranges > 0) & (scan.ranges < limit), scan.ranges, np.nan)[:, None]
+        * np.column_stack([np.cos(scan.angles), np.sin(scan.angles)])
+        for scan in scans
+    ]
     points, mask = pad_scans(ends)
-    times = np.array([scan.time for scan in scans])
-    poses, odometry = np.array([scan.pose for scan in scans]), np.array([scan.odometry for scan in scans])
+    poses, odometry, times = (np.array(x) for x in zip(*((s.pose, s.odometry, s.time) for s in scans), strict=True))
     if is_newer:
         # The second pose is that of the robot, on which the laser is fixed somewhere.
         mounting = np.median(se2.relative(odometry, poses), axis=0)
         odometry = np.asarray(se2.compose(odometry, np.broadcast_to(mounting, odometry.shape)))
-    are_equal = bool(np.abs(poses - odometry).max() < _SAME_POSE)
+    are_equal = bool(np.abs(poses - odometry).max() < 1e-4)
     # NEFF lines are those of the SLAM program GMapping.
     is_raw = (are_equal and is_newer) or _is_at_wheels([words for _, words in lines["ODOM"]], poses, times)
     reference = None if is_raw and not lines["NEFF"] else poses
     wheels = None if are_equal and reference is not None else odometry
-    name = Path(path).name.split(".")[0]
-    return _in_order_of_time(ScanSequence(name, points, mask, "m", reference, wheels, times), path)
+    sequence = ScanSequence(Path(path).name.split(".")[0], points, mask, "m", reference, wheels, times)
+    return _in_order_of_time(sequence, path)
 
 
 def scan_angles(num_beams: int) -> FloatArray:
@@ -138,7 +124,7 @@ def _parse_scan(words: list[str], source: str) -> _Scan:
         time = float(words[stamp]) if len(words) > stamp else 0.0
         if len(ranges) != count or len(poses) != 6:
             raise ValueError(f"{len(words)} words for {count} ranges")
-        if np.isnan(ranges).any() or not (np.abs([*angles, *poses, time]) < _LARGEST_NUMBER).all():
+        if np.isnan(ranges).any() or not (np.abs([*angles, *poses, time]) < 1e18).all():
             raise ValueError("NaN, infinite or huge values")
     return _Scan(ranges, angles, poses[:3], poses[3:], time)
 
@@ -153,7 +139,8 @@ def _is_at_wheels(lines: list[list[str]], poses: FloatArray, times: FloatArray) 
     ordered = wheels[np.argsort(wheels[:, 0], kind="stable")]
     after = np.searchsorted(ordered[:, 0], times)
     beside = ordered[np.clip([after - 1, after], 0, len(ordered) - 1), 1:]
-    return float(np.median(np.linalg.norm(beside - poses[:, :2], axis=-1).min(axis=0))) < _SAME_PLACE_M
+    # Poses of a log as recorded differ from those of its ODOM lines by the way from one such line to the next.
+    return float(np.median(np.linalg.norm(beside - poses[:, :2], axis=-1).min(axis=0))) < 0.5
 
 
 def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
@@ -161,60 +148,53 @@ def _in_order_of_time(sequence: ScanSequence, path: str | Path) -> ScanSequence:
 
     Some published logs have lines with the scan, time stamp and odometry of another time, while their corrected poses
     are in order. There the time stamps are out of order, and the odometry jumps by metres and back. Where the stamp
-    alone is wrong, the time is interpolated, and the odometry, too, if it jumps. A clock that was set back for the
-    remaining lines goes on from there. Without any order of the stamps the sequence gets no times.
+    alone is wrong, the time is interpolated, and the odometry, too, if it jumps. Without any order of the stamps the
+    sequence gets no times.
 
     Returns:
         The scans in the order of time.
     """
-    times, rows = np.asarray(sequence.times), np.arange(len(sequence))
-    if np.ptp(times) == 0:
-        return dataclasses.replace(sequence, times=None)
-    given = sequence.odometry_poses
-    odometry = np.zeros((len(rows), 3)) if given is None else given
-    lengths = _step_lengths(odometry[:-1], odometry[1:])
-    is_usual = lengths <= _USUAL_STEP * np.median(lengths)
-    times = _with_one_clock(times, is_usual)
+    times, rows = _with_one_clock(np.array(sequence.times)), np.arange(len(sequence))
     ordered = _longest_ascending(times)
     late = np.setdiff1d(rows, ordered)
     if 2 * len(late) > len(times):
         _log.warning("%s: time stamps are in no order; lines stay in their order, times are dropped", path)
+    if np.ptp(times) == 0 or 2 * len(late) > len(times):
         return dataclasses.replace(sequence, times=None)
+    given = sequence.odometry_poses
+    odometry = np.zeros((len(rows), 3)) if given is None else given
     by_row, by_time = (_detours(odometry, late, ordered, keys) for keys in (rows.astype(np.float64), times))
-    moved = np.zeros(len(times), bool)
-    moved[late] = by_time < _SHORTER_WAY * by_row
+    # A line is moved to the position of its time stamp if that halves the detour of its odometry.
+    is_moved = np.isin(rows, late[by_time < 0.5 * by_row])
     if len(late):
         message = "%s: %d of %d lines are of another moment; %d are moved to their time, the others are interpolated"
-        _log.warning(message, path, len(late), len(times), moved.sum())
-    known = np.union1d(ordered, np.flatnonzero(moved))
-    stamps = np.interp(rows, ordered, times[ordered])
-    stamps[known] = times[known]
-    # Lines that join lines in order by usual steps alone have the odometry of their place.
-    piece = np.concatenate([[0], np.cumsum(~is_usual)])
-    is_continuous = np.isin(piece, piece[ordered])
-    odometry = _interpolated(odometry, ordered, np.union1d(known, np.flatnonzero(is_continuous)))
-    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=None if given is None else odometry)
+        _log.warning(message, path, len(late), len(times), is_moved.sum())
+    is_known = is_moved | np.isin(rows, ordered)
+    stamps = np.where(is_known, times, np.interp(rows, ordered, times[ordered]))
+    if given is not None:
+        # Lines that join lines in order by usual steps alone have the odometry of their place.
+        lengths = _step_lengths(odometry[:-1], odometry[1:])
+        # Steps of up to four times the median are no jumps.
+        piece = np.concatenate([[0], np.cumsum(lengths > 4.0 * np.median(lengths))])
+        is_right = is_known | np.isin(piece, piece[ordered])
+        heading = np.unwrap(odometry[ordered, 2])
+        columns = (*odometry[ordered, :2].T, heading)
+        between = np.column_stack([np.interp(rows, ordered, column) for column in columns])
+        between[:, 2] = np.pi - (np.pi - between[:, 2]) % (2 * np.pi)
+        odometry = np.where(is_right[:, None], odometry, between)
     order = np.argsort(stamps, kind="stable")
-    return _carry_reference(repaired.take(order), moved[order])
+    poses = None if given is None else odometry
+    repaired = dataclasses.replace(sequence, times=stamps, odometry_poses=poses).take(order)
+    return _carry_reference(repaired, is_moved[order])
 
 
-def _with_one_clock(times: FloatArray, is_usual: BoolArray) -> FloatArray:
+def _with_one_clock(times: FloatArray) -> FloatArray:
     """Continues the times where a clock was set back: all later stamps precede half of those before it."""
-    steps, times = np.diff(times), times.copy()
-    for last in np.flatnonzero((steps < 0) & is_usual):
+    steps = np.diff(times)
+    for last in np.flatnonzero(steps < 0):
         if times[last + 1 :].max() < np.median(times[: last + 1]):
             times[last + 1 :] += times[last] - times[last + 1] + np.median(steps)
     return times
-
-
-def _interpolated(odometry: FloatArray, ordered: NDArray[np.int64], known: NDArray[np.int64]) -> FloatArray:
-    """Interpolates unknown odometry between the ordered lines."""
-    pose = odometry[ordered].copy()
-    pose[:, 2] = np.unwrap(pose[:, 2])
-    between = np.column_stack([np.interp(np.arange(len(odometry)), ordered, column) for column in pose.T])
-    between[:, 2] = np.pi - (np.pi - between[:, 2]) % (2 * np.pi)
-    between[known] = odometry[known]
-    return between
 
 
 def _step_lengths(start: FloatArray, end: FloatArray) -> FloatArray:
@@ -231,29 +211,27 @@ def _detours(odometry: FloatArray, late: NDArray[np.int64], ordered: NDArray[np.
     return _step_lengths(start, middle) + _step_lengths(middle, end) - _step_lengths(start, end)
 
 
-def _carry_reference(sequence: ScanSequence, moved: BoolArray) -> ScanSequence:
+def _carry_reference(sequence: ScanSequence, is_moved: BoolArray) -> ScanSequence:
     """Computes the reference of moved scans from the reference before and the odometry."""
     reference, odometry = sequence.reference_poses, sequence.odometry_poses
-    if reference is None or odometry is None or not moved.any():
+    if reference is None or odometry is None or not is_moved.any():
         return sequence
-    rows = np.arange(len(moved))
-    before = np.maximum.accumulate(np.where(moved, -1, rows))
-    before = np.where(before < 0, np.flatnonzero(~moved)[0], before)
+    kept = np.flatnonzero(~is_moved)
+    before = kept[np.maximum(np.searchsorted(kept, np.arange(len(is_moved)), side="right") - 1, 0)]
     carried = se2.compose(reference[before], se2.relative(odometry[before], odometry))
-    return dataclasses.replace(sequence, reference_poses=np.where(moved[:, None], carried, reference))
+    return dataclasses.replace(sequence, reference_poses=np.where(is_moved[:, None], carried, reference))
 
 
 def _longest_ascending(values: FloatArray) -> NDArray[np.int64]:
     """Finds the indices of the longest subsequence that never falls (patience sorting)."""
     tails: list[float] = []
-    ends: list[int] = []
-    before = np.full(len(values), -1)
+    chains: list[Any] = []
     for index, value in enumerate(values.tolist()):
         pile = bisect.bisect_right(tails, value)
         tails[pile : pile + 1] = [value]
-        ends[pile : pile + 1] = [index]
-        before[index] = ends[pile - 1] if pile else -1
-    chain = [ends[-1]]
-    while before[chain[-1]] >= 0:
-        chain.append(int(before[chain[-1]]))
-    return np.array(chain[::-1])
+        chains[pile : pile + 1] = [(index, chains[pile - 1] if pile else None)]
+    link, found = chains[-1], []
+    while link is not None:
+        index, link = link
+        found.append(index)
+    return np.array(found[::-1])

@@ -15,18 +15,13 @@ from dpmjax.sequences import FloatArray, require
 
 # Names of columns of point times of lidar drivers and data sets.
 _TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "time_offset", "offset_time", "gps_time")
-_PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+_PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+              "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
+              "uint32": "u4", "float32": "f4", "float64": "f8"}  # fmt: skip
 _PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 _PCD_ENCODINGS = ("ascii", "binary", "binary_compressed")
-_PADDING = "_"  # the Point Cloud Library's name of a field without values
-_MOST_EXPANSION = 88  # three bytes of LZF unpack to up to 264
 _DAMAGED = (KeyError, ValueError, IndexError, TypeError, ArithmeticError, StopIteration)
-_AGAIN = "copy the file again"
 
 
 class TimedCloud(NamedTuple):
@@ -107,81 +102,57 @@ def parse_pcd(content: bytes, source: str) -> TimedCloud:
     start = content.find(b"\nDATA", 0, 4096) + 1
     size = content.find(b"\n", start) + 1
     require(start > 0 and size > 0, source, "no PCD header", "give PCD files (VERSION, FIELDS, SIZE, TYPE, ..., DATA)")
-    advice = "write FIELDS, SIZE, TYPE, COUNT of one length, POINTS and DATA"
+    advice = f"write FIELDS, SIZE, TYPE, COUNT of one length, POINTS, and DATA as one of {' '.join(_PCD_ENCODINGS)}"
     with refusing(source, "broken PCD header ({kind}: {error})", advice, _DAMAGED):
         rows = (line.split() for line in content[:size].decode("latin-1").splitlines())
         entries = {row[0].upper(): row[1:] for row in rows if row}
-        names, sizes, encoding = entries["FIELDS"], list(map(int, entries["SIZE"])), entries["DATA"][0].lower()
-        counts = [int(count) for count in entries.get("COUNT", ["1"] * len(names))]
-        if encoding == "binary":
-            counts = _with_true_padding(names, sizes, counts)
-        kinds = zip(names, entries["TYPE"], sizes, counts, strict=True)
-        record = np.dtype([(f"{i}", f"<{_PCD_TYPES[t]}{size}", (n,)) for i, (_, t, size, n) in enumerate(kinds)])
+        names, encoding = entries["FIELDS"], _PCD_ENCODINGS.index(entries["DATA"][0].lower())
+        kinds = zip(names, entries["TYPE"], entries["SIZE"], entries.get("COUNT", ["1"] * len(names)), strict=True)
+        fields = [(f"{i}", f"<{_PCD_TYPES[kind]}{size}", (int(n),)) for i, (_, kind, size, n) in enumerate(kinds)]
         count = math.prod(map(int, entries.get("POINTS") or [*entries["WIDTH"], *entries["HEIGHT"]]))
+        header = _Header(names, np.dtype(fields), count, _PCD_ENCODINGS[encoding], size)
     require(count >= 0, source, f"broken PCD header ({count} points)", advice)
-    for name in ("x", "y"):
-        is_there = name in names and counts[names.index(name)] > 0
-        require(is_there, source, f"fields are {' '.join(names)}", f"the file needs a column {name}")
-    advice = f"save the cloud as one of {' '.join(_PCD_ENCODINGS)}"
-    require(encoding in _PCD_ENCODINGS, source, f"DATA {encoding} is not supported", advice)
-    columns = _read_columns(content, _Header(names, record, count, encoding, size), source)
+    columns = _read_columns(content, header, source)
+    found = f"fields are {' '.join(names)}"
+    require({"x", "y"} <= set(columns), source, found, "the file needs a column x and a column y")
     return cloud_of({"z": np.zeros(count), **columns})
-
-
-def _with_true_padding(names: list[str], sizes: list[int], counts: list[int]) -> list[int]:
-    """Returns the counts of fields with those of the padding corrected, if only that aligns the fields.
-
-    The Point Cloud Library counts the padding before a field as if the field before the padding had its size.
-    """
-    true = list(counts)
-    for i in range(1, len(names) - 1):
-        if names[i] == _PADDING:
-            true[i] += counts[i - 1] * (sizes[i + 1] - sizes[i - 1])
-    true[-1] += sum(size * (old - new) for size, old, new in zip(sizes, counts, true, strict=True)) // sizes[-1]
-
-    def is_aligned(counts: list[int]) -> bool:
-        starts = np.cumsum([0, *(size * count for size, count in zip(sizes, counts, strict=True))])
-        return not any(starts[i] % sizes[i] for i, name in enumerate(names) if name != _PADDING)
-
-    is_better = names[-1] == _PADDING and min(true) >= 0 and is_aligned(true) and not is_aligned(counts)
-    return true if is_better else counts
 
 
 def _read_columns(content: bytes, header: _Header, source: str) -> dict[str, NDArray[Any]]:
     """Reads the first number of each field by its name, without the padding."""
+    # The Point Cloud Library counts some padding as 0; the places of the fields behind it are unknown.
     fields = [header.record[i] for i in range(len(header.names))]
-    kept = [i for i, field in enumerate(fields) if field.itemsize > 0 and header.names[i] != _PADDING]
+    known = next((i for i, field in enumerate(fields) if field.itemsize == 0), len(fields))
+    # The Point Cloud Library calls padding "_".
+    kept = [i for i in range(known) if header.names[i] != "_"]
     if header.encoding == "ascii":
         return _read_text(content, header, kept, source)
     body, sizes = content[header.size :], [header.num_points * field.itemsize for field in fields]
     columns: dict[str, NDArray[Any]] = {}
     found = f"truncated or damaged, {header.num_points} points in {header.encoding} ({{error}})"
-    with refusing(source, found, _AGAIN, _DAMAGED):
+    with refusing(source, found, "copy the file again", _DAMAGED):
         if header.encoding != "binary_compressed":
             records = np.frombuffer(body, header.record, header.num_points)
             return {header.names[i]: records[f"{i}"][:, 0] for i in kept}
         packed, size = np.frombuffer(body, "<u4", 2).tolist()
-        orders = (order for order in (range(len(sizes)), kept) if sum(sizes[i] for i in order) == size)
-        order, values, start = next(orders), unpack_lzf(body[8 : 8 + packed], size), 0
+        order = next(order for order in (range(len(sizes)), kept) if sum(sizes[i] for i in order) == size)
+        values, start = unpack_lzf(body[8 : 8 + packed], size), 0
         for i in order:
-            values_of_field = np.frombuffer(values, fields[i].base, sizes[i] // fields[i].base.itemsize, start)
-            columns[header.names[i]] = values_of_field.reshape(header.num_points, -1)[:, 0]
+            column = np.frombuffer(values, fields[i].base, sizes[i] // fields[i].base.itemsize, start)
+            columns[header.names[i]] = column.reshape(header.num_points, -1)[:, 0]
             start += sizes[i]
     return columns
 
 
 def _read_text(content: bytes, header: _Header, kept: list[int], source: str) -> dict[str, NDArray[Any]]:
     """Reads rows of numbers; rows may have numbers for the padding, or leave it out."""
-    lines = enumerate(content[header.size :].splitlines(), 1 + content[: header.size].count(b"\n"))
-    rows = [(number, words) for number, line in lines if (words := line.decode("latin-1").split())][: header.num_points]
-    found = f"truncated: the header promises {header.num_points} points, {len(rows)} are there"
-    require(len(rows) >= header.num_points, source, found, _AGAIN)
+    lines = [line.decode("latin-1") for line in content[header.size :].splitlines() if line.strip()]
     widths = [header.record[i].shape[0] for i in range(len(header.names))]
-    table = to_numbers(rows, source) if rows else np.zeros((0, sum(widths)))
+    table = to_numbers(lines[: header.num_points], source) if header.num_points else np.zeros((0, sum(widths)))
     if table.shape[1] == sum(widths[i] for i in kept):
         widths = [width * (i in kept) for i, width in enumerate(widths)]
-    found = f"rows of {table.shape[1]} numbers, the header promises {sum(widths)}"
-    require(table.shape[1] == sum(widths), source, found, "write one number per field in each row")
+    found = f"truncated: {table.shape} numbers, the header promises {header.num_points, sum(widths)}"
+    require(table.shape == (header.num_points, sum(widths)), source, found, "copy the file again")
     starts = np.cumsum([0, *widths])
     return {header.names[i]: table[:, starts[i]] for i in kept}
 
@@ -204,7 +175,8 @@ def unpack_lzf(packed: bytes, size: int) -> bytes:
         ValueError: the block is damaged, or holds another number of bytes.
         IndexError: the block ends within a copy.
     """
-    if size > _MOST_EXPANSION * len(packed):
+    # Three bytes of LZF unpack to up to 264.
+    if size > 88 * len(packed):
         raise ValueError(f"{len(packed)} bytes cannot unpack to {size}")
     out, at = bytearray(), 0
     while at < len(packed):
@@ -240,17 +212,14 @@ def write_ply(path: str | Path, points: ArrayLike, *, colors: ArrayLike | None =
     Raises:
         ValueError: another shape.
     """
-    columns = {"points": np.asarray(points, "<f4")}
+    columns, axes = {"points": np.asarray(points, "<f4")}, [f"property float {axis}" for axis in "xyz"]
     if colors is not None:
         columns["colors"] = np.asarray(colors, np.uint8)
-    count = len(columns["points"])
+        axes += [f"property uchar {color}" for color in ("red", "green", "blue")]
+    records = np.empty(len(columns["points"]), [(name, values.dtype, 3) for name, values in columns.items()])
     for name, values in columns.items():
-        if values.shape != (count, 3):
-            raise ValueError(f"{name} must be ({count}, 3), got {values.shape}")
-    records = np.empty(count, [(name, values.dtype, 3) for name, values in columns.items()])
-    for name, values in columns.items():
+        if values.shape != (len(records), 3):
+            raise ValueError(f"{name} must be ({len(records)}, 3), got {values.shape}")
         records[name] = values
-    properties = [f"property float {axis}" for axis in "xyz"]
-    properties += [f"property uchar {color}" for color in ("red", "green", "blue") if colors is not None]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(records)}", *axes, "end_header", ""]
     return write_atomically(path, "\n".join(header).encode() + records.tobytes())

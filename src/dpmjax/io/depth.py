@@ -26,7 +26,6 @@ from dpmjax.io.poses import check_poses
 from dpmjax.sequences import ACTIVE_VISION, BoolArray, Camera, DepthSequence, FloatArray, homogeneous, require
 
 _log = logging.getLogger(__name__)
-_NOTHING_MM = 65535  # besides 0
 _MOVES, _TURNS = ("forward", "backward", "left", "right"), ("rotate_cw", "rotate_ccw")
 
 
@@ -59,17 +58,14 @@ def read_pose_folder(path: str | Path, *, height: int = 30, width: int = 40, max
     require(len(missing) in (0, len(poses)), folder, found, "give a pose to every image or to none")
     rows, columns = read_depth_png(images[0]).shape
     fx, fy, cx, cy = _read_matrix(named[0], 3)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    advice = "give focal lengths above 0; where one is negative, the x or y axis of its poses points the other way"
+    advice = "give rows fx 0 cx, 0 fy cy, 0 0 1, with focal lengths above 0, of the size of the images"
     with refusing(named[0], "not a camera ({error})", advice, (ValueError,)):
         camera = Camera(columns, rows, fx, fy, cx, cy)
     found = f"the optical axis at column {cx:g}, row {cy:g}, beside the images of {columns} x {rows} pixels"
-    is_inside = 0 < cx < columns - 1 and 0 < cy < rows - 1
-    require(is_inside, named[0], found, "give rows fx 0 cx, 0 fy cy, 0 0 1, of the size of the images")
+    require(0 < cx < columns - 1 and 0 < cy < rows - 1, named[0], found, advice)
     points, mask = _read_clouds(images, camera, (height, width), max_depth_m)
-    T_world_camera = None
-    if not missing:
-        T_world_camera = np.concatenate([check_poses(_read_matrix(pose, 4)[None], pose) for pose in poses])
-    return DepthSequence(folder.name, points, mask, False, T_world_camera)
+    matrices = [] if missing else [check_poses(_read_matrix(pose, 4)[None], pose) for pose in poses]
+    return DepthSequence(folder.name, points, mask, False, np.concatenate(matrices) if matrices else None)
 
 
 def read_active_vision(
@@ -96,7 +92,12 @@ def read_active_vision(
         raise ValueError(f"num_views: expected at least 2, got {num_views}")
     scene = Path(path)
     poses = _read_scene_poses(scene / "image_structs.mat")
-    links = _read_links(scene / "annotations.json")
+    path, kinds = scene / "annotations.json", (ValueError, AttributeError, RecursionError)
+    content = read_bytes(path)
+    with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
+        links = {
+            name: {kind: str(other) for kind, other in entry.items()} for name, entry in json.loads(content).items()
+        }
     depth_of = {name: scene / "high_res_depth" / f"{Path(name).stem[:-2]}03.png" for name in poses}
     known = sorted(name for name in poses if name in links and depth_of[name].is_file())
     found = "no image with links, pose and depth"
@@ -119,48 +120,23 @@ def is_active_vision(path: Path) -> bool:
     return (path / "image_structs.mat").is_file()
 
 
-def back_project(
-    depth_m: NDArray[np.floating], camera: Camera, *, height: int, width: int, max_depth_m: float
-) -> tuple[NDArray[np.float32], BoolArray]:
-    """Makes an organised cloud from a depth image, thinned to `height` x `width` of its pixels.
-
-    Args:
-        depth_m: (rows, columns) depth along z, metres; zero, negative or not finite: invalid.
-        camera: camera of the image, with the size of the image.
-        height: rows of the cloud.
-        width: columns of the cloud.
-        max_depth_m: deeper pixels are masked.
-
-    Returns:
-        points: (height, width, 3) in the camera frame, zero where masked.
-        mask: (height, width) True for valid pixels.
-
-    Raises:
-        ValueError: the image has another size than the camera, or is smaller than the cloud.
-    """
-    if depth_m.shape != (camera.height, camera.width):
-        raise ValueError(f"depth_m: expected {(camera.height, camera.width)} as the camera, got {depth_m.shape}")
-    if height > camera.height or width > camera.width:
-        raise ValueError(f"height, width: expected at most {depth_m.shape}, got {(height, width)}")
-    rows, columns = camera.sample_pixels(height, width)
-    depth = np.asarray(depth_m, np.float64)[np.ix_(rows, columns)]
-    mask = np.isfinite(depth) & (depth > 0.0) & (depth <= max_depth_m)
-    points = camera.rays(columns, rows) * np.where(mask, depth, 0.0)[..., None]
-    return points.astype(np.float32), mask
-
-
 def _read_clouds(
     images: Sequence[Path], camera: Camera, shape: tuple[int, int], max_depth_m: float
 ) -> tuple[NDArray[np.float32], BoolArray]:
     """Reads points (n, h, w, 3) and mask (n, h, w) of depth images in millimetres; warns of most pixels too deep."""
-    clouds, depths = [], []
+    rows, columns = camera.sample_pixels(*shape)
+    rays, clouds, depths = camera.rays(columns, rows), [], []
     for image in images:
         depth_mm = read_depth_png(image)
-        depth_m = np.where(depth_mm == _NOTHING_MM, 0, depth_mm) / 1000.0
+        is_good = depth_mm.shape == (camera.height, camera.width) and np.greater_equal(depth_mm.shape, shape).all()
+        advice = "give images of the camera's size, not smaller than a cloud"
+        require(is_good, image, f"{depth_mm.shape} pixels, the camera has {camera.height, camera.width}", advice)
+        # Some cameras write the largest number for nothing.
+        depth_m = np.where(depth_mm == 65535, 0, depth_mm) / 1000.0
         depths.append(float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0)
-        with refusing(image, "{error}", "give images of the camera's size, not smaller than a cloud", (ValueError,)):
-            clouds.append(back_project(depth_m, camera, height=shape[0], width=shape[1], max_depth_m=max_depth_m))
-    points, mask = (np.stack(arrays) for arrays in zip(*clouds, strict=True))
+        clouds.append(depth_m[np.ix_(rows, columns)])
+    depth = np.stack(clouds)
+    mask = (depth > 0) & (depth <= max_depth_m)
     median, blank = float(np.median(depths)), np.flatnonzero(~mask.any(axis=(1, 2)))
     found = f"the median depth is {median:.3g} m, deeper pixels than {max_depth_m:g} m are left out"
     advice = "give millimetres, 0 for nothing; TUM's images have 5000 a metre"
@@ -169,8 +145,8 @@ def _read_clouds(
     if median > max_depth_m:
         _log.warning("%s: %s; %s", images[0].parent, found, advice)
     which = f"leave out such images, {len(blank)} of {len(images)}"
-    require(not len(blank), images[blank[0] if len(blank) else 0], f"no pixel measures up to {max_depth_m:g} m", which)
-    return points, mask
+    require(not len(blank), images[[*blank, 0][0]], f"no pixel measures up to {max_depth_m:g} m", which)
+    return (rays * np.where(mask, depth, 0.0)[..., None]).astype(np.float32), mask
 
 
 def _read_matrix(path: Path, size: int) -> FloatArray:
@@ -182,16 +158,15 @@ def _read_matrix(path: Path, size: int) -> FloatArray:
 
 def _draw_walk(known: list[str], links: dict[str, Any], num_views: int, rng: np.random.Generator) -> list[str]:
     """Draws the names of the images of a walk; a turn replaces an unavailable move, and the reverse."""
-    name = known[rng.integers(len(known))]
-    names, is_known = [name], set(known)
+    names, is_known = [known[rng.integers(len(known))]], set(known)
     while len(names) < num_views:
         moves, turns = (
-            [links[name][kind] for kind in kinds if links[name].get(kind) in is_known] for kinds in (_MOVES, _TURNS)
+            [links[names[-1]][kind] for kind in kinds if links[names[-1]].get(kind) in is_known]
+            for kinds in (_MOVES, _TURNS)
         )
         options = moves if (rng.random() < 0.5 and moves) or not turns else turns
-        require(len(options) > 0, name, "no neighbour with a depth image and a pose", "unpack the whole scene")
-        name = options[rng.integers(len(options))]
-        names.append(name)
+        require(len(options) > 0, names[-1], "no neighbour with a depth image and a pose", "unpack the whole scene")
+        names.append(options[rng.integers(len(options))])
     return names
 
 
@@ -208,13 +183,6 @@ def _read_scene_poses(path: Path) -> dict[str, FloatArray]:
             if R.shape == (3, 3) and t.shape == (3,) and np.isfinite(R).all() and np.isfinite(t).all():
                 poses[str(entry["image_name"])] = homogeneous(R.T, -R.T @ t * scale_m)
     return poses
-
-
-def _read_links(path: Path) -> dict[str, dict[str, str]]:
-    content, kinds = read_bytes(path), (ValueError, AttributeError, RecursionError)
-    with refusing(path, "not readable ({error})", "copy annotations.json of the scene", kinds):
-        links = json.loads(content)
-        return {name: {kind: str(other) for kind, other in entry.items()} for name, entry in links.items()}
 
 
 def _read_colmap_camera(path: Path) -> Camera:

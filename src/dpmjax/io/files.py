@@ -15,7 +15,6 @@ import pickle
 import re
 import subprocess
 import sys
-import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +23,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.sequences import FloatArray, InputError, Note, require
@@ -77,12 +75,13 @@ def import_for(source: str | Path, module: str, extra: str) -> ModuleType:
     Raises:
         InputError: the module cannot be imported.
     """
-    try:
-        return importlib.import_module(module)
-    except Exception as error:  # a package may be broken in any way
-        why = "which is not installed" if isinstance(error, ModuleNotFoundError) else "whose import fails"
-        found = f"needs {module.partition('.')[0]}, {why}"
-        raise InputError(source, found, f"pip install 'dpmjax[{extra}]'") from error
+    package = module.partition(".")[0]
+    with refusing(source, f"needs {package}, whose import fails", f"pip install 'dpmjax[{extra}]'", (Exception,)):
+        try:
+            return importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            found = f"needs {package}, which is not installed"
+            raise InputError(source, found, f"pip install 'dpmjax[{extra}]'") from error
 
 
 def log_notes(notes: Iterable[Note]) -> None:
@@ -192,39 +191,37 @@ def read_lines(path: str | Path) -> list[str]:
     return content.decode(encoding, errors="replace").splitlines()
 
 
-def is_number(word: str, kind: type[int | float] = float) -> bool:
-    """Returns True for a word that Python reads as a number of this kind."""
+def is_number(word: str) -> bool:
+    """Returns True for a word that Python reads as a number."""
     try:
-        kind(word)
+        float(word)
     except ValueError:
         return False
     return True
 
 
-def to_numbers(rows: Sequence[tuple[int, Sequence[str]]], source: str | Path) -> FloatArray:
-    """Converts words to numbers.
+def to_numbers(lines: Sequence[str], source: str | Path) -> FloatArray:
+    """Converts lines of numbers.
 
     Args:
-        rows: n rows: the line in the file, from 1, and its k words.
+        lines: n lines of k numbers, separated by blanks.
         source: name of the file, for messages.
 
     Returns:
         (n, k).
 
     Raises:
-        InputError: there is no row, rows differ in length, or a word is no number; line and column are named.
+        InputError: there is no row, rows differ in length, or a word is no number; the row is named.
     """
-    require(len(rows) > 0, source, "no row", "write rows of numbers")
+    require(len(lines) > 0, source, "no row", "write rows of numbers")
     try:
-        return np.array([[float(word) for word in words] for _, words in rows])
+        return np.loadtxt(lines, ndmin=2, comments=None)
     except ValueError as error:
-        for line, words in rows:
-            found = f"line {line} has {len(words)} columns, line {rows[0][0]} has {len(rows[0][1])}"
-            require(len(words) == len(rows[0][1]), source, found, "give rows of equal length")
-            for column, word in enumerate(words, 1):
-                found = f"line {line}, column {column}: {word[:40]!r} is not a number"
-                require(is_number(word), source, found, "write plain decimal numbers")
-        raise InputError(source, f"no table of numbers ({error})", "write plain decimal numbers") from error
+        rows, width = [line.split() for line in lines], len(lines[0].split())
+        bad = (n for n, words in enumerate(rows) if len(words) != width or not all(map(is_number, words)))
+        row = next(bad, 0)
+        found = f"row {row + 1} is not {width} numbers: {lines[row][:80]!r}"
+        raise InputError(source, found, "write rows of one length, and plain decimal numbers") from error
 
 
 def read_table(path: str | Path, width: int | None = None) -> FloatArray:
@@ -242,10 +239,10 @@ def read_table(path: str | Path, width: int | None = None) -> FloatArray:
     Raises:
         InputError: there is no such file, no row, rows differ in length, a word is no number, or another width.
     """
-    rows = [(number, re.sub("[,;]", " ", line).split()) for number, line in enumerate(read_lines(path), 1)]
-    rows = [(number, words) for number, words in rows if words and words[0][:1] != "#"]
-    has_names = len(rows) > 1 and not any(map(is_number, rows[0][1]))
-    table = to_numbers(rows[has_names:], path)
+    lines = [re.sub("[,;]", " ", line).strip() for line in read_lines(path)]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    has_names = len(lines) > 1 and not any(map(is_number, lines[0].split()))
+    table = to_numbers(lines[has_names:], path)
     is_good = width is None or (table.shape[1] == width and bool(np.isfinite(table).all()))
     found = f"rows of {table.shape[1]} numbers, or some not finite"
     require(is_good, path, found, f"give {width} finite numbers a row")
@@ -271,28 +268,18 @@ def load_arrays(path: str | Path, keys: Sequence[str] | None = None) -> dict[str
     Raises:
         InputError: no such file, no NumPy file, a damaged one, or one of Python objects.
     """
-    require(not Path(path).is_dir(), path, "a folder", "give one file")
     content = read_bytes(path)
     require(len(content) > 0, path, "an empty file of 0 bytes", "copy it again")
-    advice = "save it again with numpy.save or numpy.savez"
-    is_numpy = content.startswith((npy_format.MAGIC_PREFIX, b"PK"))
-    require(is_numpy, path, "not a readable NumPy file (it has no header of NumPy)", advice)
     # The parsers of zip, zlib and NumPy headers raise many kinds of errors.
+    advice = "save it again with numpy.save or numpy.savez"
     with refusing(path, "not a readable NumPy file ({error})", advice, (Exception,)):
-        if content.startswith(npy_format.MAGIC_PREFIX):
-            return {"points": _parse_npy(content)}
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
-            chosen = [key for key in (members if keys is None else keys) if key in members]
-            return {key: _parse_npy(archive.read(members[key])) for key in chosen}
-
-
-def _parse_npy(content: bytes) -> NDArray[np.generic]:
-    """Parses the bytes of an `.npy`; raises a ValueError for Python objects, and for more rows than bytes."""
-    values = npy_format.read_array(io.BytesIO(content), allow_pickle=False)
-    if max(values.shape, default=0) > len(content) + 65536:
-        raise ValueError(f"an array of {values.shape}")
-    return values
+        loaded = np.load(io.BytesIO(content), allow_pickle=False)
+        table = {"points": loaded} if isinstance(loaded, np.ndarray) else loaded
+        arrays = {key: table[key] for key in table if keys is None or key in keys or table is not loaded}
+        for each in arrays.values():
+            is_good = max(each.shape, default=0) <= each.nbytes + 65536
+            require(is_good, path, f"not a readable NumPy file (an array of {each.shape})", advice)
+    return arrays
 
 
 def load_mat(content: bytes, source: str | Path) -> dict[str, Any]:

@@ -10,14 +10,6 @@ from jaxtyping import Bool, Float
 from dpmjax.geometry import se2
 from dpmjax.io.files import write_atomically
 
-# A cell is occupied where a larger share of the beams that reach it ends there: beams that graze a wall pass its cells.
-_OCCUPIED_SHARE = 0.15
-# Values of a cell in the picture, as the map server reads them.
-_OCCUPIED, _UNKNOWN, _FREE = 0, 205, 254
-# Scans that are drawn at most, because more of them add no cell. Most cells along a side, because planners hold the map
-# in memory; larger places have larger cells.
-_MOST_SCANS, _MOST_CELLS = 2000, 4000
-
 
 def write_grid_map(
     path: str | Path,
@@ -39,10 +31,11 @@ def write_grid_map(
     Returns:
         The path of the `.yaml`.
     """
-    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MOST_SCANS)).astype(int))
+    # More scans add no cell. Planners hold the map in memory, so larger places have larger cells.
+    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 2000)).astype(int))
     ends = np.asarray(se2.transform_points(poses[rows], points[rows]), np.float64)
     hits = ends[mask[rows]]
-    cell_m = max(cell_m, float(np.ptp(hits, axis=0).max()) / _MOST_CELLS)
+    cell_m = max(cell_m, float(np.ptp(hits, axis=0).max()) / 4000)
     low = np.floor(hits.min(axis=0) / cell_m) - 2
     width, height = (np.floor(hits.max(axis=0) / cell_m) - low + 3).astype(int)
     passed, ended = np.zeros(width * height), np.zeros(width * height)
@@ -58,7 +51,9 @@ def write_grid_map(
         column, row = (np.floor(beams / cell_m) - low).astype(int).T
         np.add.at(ended, row * width + column, 1)
     share = ended / np.maximum(passed + ended, 1)
-    values = np.where(share > _OCCUPIED_SHARE, _OCCUPIED, np.where(passed + ended > 0, _FREE, _UNKNOWN))
+    # Beams that graze a wall pass its cells: a cell is occupied where more than 15 % of its beams end.
+    # The map server reads 0 as occupied, 254 as free, 205 as unknown.
+    values = np.where(share > 0.15, 0, np.where(passed + ended > 0, 254, 205))
     # The first row of the picture has the largest y.
     picture = values.reshape(height, width)[::-1].astype(np.uint8)
     path = Path(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,22 +56,16 @@ def open_lidar_sequence(
     of_times = None if whole.times is None else order_note(whole.times, path)
     notes = (*whole.notes, *(note for note in (of_poses, of_times) if note is not None))
     log_notes(notes)
-    whole = replace(whole, read_scan=_with_unit_doubt(whole), notes=notes)
-    part = whole.take(selection)
-    require(len(part) > 0, path, f"{selection} chooses 0 of {len(whole)} scans", "choose others")
-    return part
 
-
-def _with_unit_doubt(sequence: LidarSequence) -> Callable[[int], NDArray[np.float32]]:
-    """Returns the reader of the scans; it logs a doubt about the unit of the first one."""
-
-    def read(index: int) -> NDArray[np.float32]:
-        points = sequence.read_scan(index)
-        if index == 0 and (note := unit_note(points, sequence.sources[0])) is not None:
-            log_notes([note])
+    def read_scan(index: int) -> NDArray[np.float32]:
+        points = whole.read_scan(index)
+        note = unit_note(points, whole.sources[0]) if index == 0 else None
+        log_notes([note] if note is not None else [])
         return points
 
-    return read
+    part = replace(whole, read_scan=read_scan, notes=notes).take(selection)
+    require(len(part) > 0, path, f"{selection} chooses 0 of {len(whole)} scans", "choose others")
+    return part
 
 
 def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequence:
@@ -82,12 +75,11 @@ def _open_bag(path: Path, topic: str | None, poses: Path | None) -> LidarSequenc
     if beside is None:
         return sequence
     try:
-        T, notes = match_reference(read_stamped_poses(beside), sequence.times, len(sequence), beside)
+        T, notes = read_odometry(beside, sequence)
     except InputError as error:
         if poses is not None:
             raise
-        note = Note(f"{beside}: {error.found}; these poses are not used", is_doubt=True)
-        return replace(sequence, notes=(*sequence.notes, note))
+        T, notes = None, (Note(f"{beside}: {error.found}; these poses are not used", is_doubt=True),)
     return replace(sequence, T_world_lidar=T, notes=(*sequence.notes, *notes))
 
 
@@ -141,21 +133,21 @@ def list_lidar_sequences(path: str | Path) -> list[str]:
 def _choose(path: Path, sequence: str | None) -> Path:
     """Returns the folder of the selected drive."""
     require(path.exists(), path, "no such file or folder", "check the path")
-    converter = "convert it to a bag or to .pcd files with ouster-cli (Ouster) or velodyne-decoder (Velodyne)"
+    converter = "convert captures of packets to a bag or to .pcd files by ouster-cli or velodyne-decoder"
     is_capture = path.suffix.lower() in (".pcap", ".pcapng", ".osf")
-    require(not is_capture, path, "a capture of packets, which is not read", converter)
-    require(not path.is_file(), path, "a single file", "give the folder that holds all scans of the drive")
+    advice = converter if is_capture else "give the folder that holds all scans of the drive"
+    require(not path.is_file(), path, "a single file", advice)
     if is_drive(path) and sequence in (None, path.resolve().name):
         return path
     drives = _drives(path)
     known = ", ".join(sorted(drives, key=natural_key)[:30])
-    if sequence is not None:
-        found = f"no sequence {sequence}, it has {known or 'none'}"
-        require(sequence in drives, path, found, "name one of those, or leave the name out")
-        return drives[sequence]
-    require(len(drives) > 0, path, "a folder without scans", f"give {DRIVES}")
-    require(len(drives) == 1, path, f"{len(drives)} sequences: {known}", "name one of them, or give its folder")
-    return next(iter(drives.values()))
+    if sequence is None:
+        require(len(drives) > 0, path, "a folder without scans", f"give {DRIVES}")
+        require(len(drives) == 1, path, f"{len(drives)} sequences: {known}", "name one of them, or give its folder")
+        return next(iter(drives.values()))
+    found = f"no sequence {sequence}, it has {known or 'none'}"
+    require(sequence in drives, path, found, "name one of those, or leave the name out")
+    return drives[sequence]
 
 
 def _drives(path: Path) -> dict[str, Path]:

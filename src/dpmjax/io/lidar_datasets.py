@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from dpmjax.geometry import rigid
-from dpmjax.io.files import load_arrays, log_notes, natural_key, read_lines, read_table
+from dpmjax.io.files import load_arrays, natural_key, read_lines, read_table, refusing
 from dpmjax.io.lidar_file import columns_of_drive, read_point_times, read_timed_cloud
 from dpmjax.io.poses import StampedPoses, check_poses, from_rows, interpolate_poses, read_stamped_poses
 from dpmjax.io.references import camera_note, match_reference, match_rows, matching_note, scan_times
@@ -25,12 +24,6 @@ DRIVES = (
     "of ROS (.bag, .mcap, or a folder with metadata.yaml)"
 )
 _CARLA_POSES_PER_FRAME = 100  # KITTI-CARLA writes poses at 1000 Hz and frames at 10 Hz.
-_EARTH_RADIUS_M = 6378137.0
-# MulRan's published calibration: the Ouster in the car's frame; rotation about z by 179.6654 degrees.
-_MULRAN_OUSTER_XYZ = (1.7042, -0.021, 1.8047)
-_MULRAN_OUSTER_RPY_DEG = (0.0001, 0.0003, 179.6654)
-_MULRAN_SLACK_S = 0.5
-_DATE = r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?"
 
 
 class SideData(NamedTuple):
@@ -79,46 +72,40 @@ def read_plain_drive(
     times, notes = scan_times(homes, files)
     if path is None:
         return SideData(None, times, notes)
-    found = read_stamped_poses(path)
-    if path in in_camera:
-        found = found._replace(poses=_from_camera(found.poses, folder / "calib.txt"))
-    try:
-        if in_camera and found.stamps is None:
-            found = found._replace(poses=match_rows(found.poses, files, path))
-        T, pose_notes = match_reference(found, times, len(files), path)
-    except InputError:
-        log_notes(notes)  # times.txt may be the reason
-        raise
-    calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), None)
-    if calibration is not None and path not in in_camera and camera_note(T, path) is not None:
-        T = _from_camera(T, calibration)
+    found, calibration = read_stamped_poses(path), folder / "calib.txt"
+    if path in in_camera and found.stamps is None:
+        found = found._replace(poses=match_rows(found.poses, files, path))
+    T, pose_notes = match_reference(found, times, len(files), path)
+    if path not in in_camera:
+        calibration = next((home / "calib.txt" for home in homes if (home / "calib.txt").is_file()), calibration)
+    if path in in_camera or (calibration.is_file() and camera_note(T, path) is not None):
+        advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
+        names = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
+        T_cam0_lidar = from_rows(_read_labelled(calibration, names, 12, advice), calibration)[0]
+        T = np.asarray(rigid.inverse(T_cam0_lidar) @ T @ T_cam0_lidar)
     return SideData(T, times, (*notes, *pose_notes))
 
 
 def _read_learned(folder: Path, files: list[Path]) -> SideData:
     """Reads the poses in N.npz: lidar_pcd, ego_rotation, ego_translation (DeepPointMap's published data).
 
-    Broken files get the pose of the file before. Where a readable file has no pose, it is a plain folder.
+    Broken files have no pose. Where a readable file has none, it is a plain folder.
 
     Returns:
         Poses, times and notes; none where the files are missing.
     """
-    keys = ("ego_rotation", "ego_translation")
-    poses: list[FloatArray | None] = []
-    for file in files:
+    T, keys = np.full((len(files), 4, 4), np.nan), ("ego_rotation", "ego_translation")
+    for index, file in enumerate(files):
         try:
             table = load_arrays(file, keys)
         except InputError:  # The scan is damaged, too, and a warning names it when it is read.
-            poses.append(poses[-1] if poses else None)
             continue
         parts = [table.get(key, np.zeros(0)) for key in keys]
         if [part.size for part in parts] != [9, 3] or any(part.dtype.kind not in "fiu" for part in parts):
             return read_plain_drive(folder, files)
-        poses.append(homogeneous(*(part.astype(np.float64).reshape(3, -1).squeeze() for part in parts)))
-    known = next((pose for pose in poses if pose is not None), None)
-    if known is None:
-        return SideData()
-    return SideData(check_poses(np.stack([known if pose is None else pose for pose in poses]), folder))
+        pose = homogeneous(parts[0].astype(np.float64).reshape(3, 3), parts[1].astype(np.float64).ravel())
+        T[index] = check_poses(pose[None], file)[0]
+    return SideData(T if np.isfinite(T).any() else None)
 
 
 def _read_kitti(folder: Path, files: list[Path]) -> SideData:
@@ -145,13 +132,13 @@ def _read_kitti_raw(folder: Path, files: list[Path]) -> SideData:
     if not records:
         return SideData(None, times)
     day = next((up for up in (folder, folder.resolve().parent) if (up / "calib_imu_to_velo.txt").is_file()), folder)
-    advice = "put the calibration of the day (calib_imu_to_velo.txt) into the folder above"
-    path = day / "calib_imu_to_velo.txt"
-    turn, shift = read_labelled(path, ("R",), 9, advice), read_labelled(path, ("T",), 3, advice)
+    path, advice = day / "calib_imu_to_velo.txt", "put the calibration of the day into the folder above"
+    turn, shift = _read_labelled(path, ("R",), 9, advice), _read_labelled(path, ("T",), 3, advice)
     T_lidar_imu = check_poses(homogeneous(turn.reshape(1, 3, 3), shift[None]), path)[0]
-    T_world_imu = _poses_from_oxts(np.vstack([_first_row(record, 6) for record in records]), home)
+    with refusing(home, "a record without six numbers ({error})", "copy them again", (ValueError,)):
+        table = np.vstack([read_table(record)[:1, :6] for record in records]).reshape(-1, 6)
     # A drive may lack scans that have a record: poses are matched by number.
-    poses = match_rows(T_world_imu @ rigid.inverse(T_lidar_imu), files, home)
+    poses = match_rows(_poses_from_oxts(table, home) @ rigid.inverse(T_lidar_imu), files, home)
     return SideData(rigid.inverse(poses[0]) @ poses, times)
 
 
@@ -170,11 +157,11 @@ def _read_kitti_360(folder: Path, files: list[Path], times: FloatArray | None) -
         return SideData(None, times)
     rows = read_table(path, 13)  # frame and pose
     cameras, lidar = calibration / "calib_cam_to_pose.txt", calibration / "calib_cam_to_velo.txt"
-    T_imu_cam0 = from_rows(read_labelled(cameras, ("image_00",), 12, "take KITTI-360's calibration folder"), cameras)
-    T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(from_rows(_first_row(lidar, 12), lidar))
+    T_imu_cam0 = from_rows(_read_labelled(cameras, ("image_00",), 12, "take KITTI-360's calibration folder"), cameras)
+    T_lidar_cam0 = from_rows(read_table(lidar, 12)[:1], lidar)
+    T_world_lidar = from_rows(rows[:, 1:], path) @ T_imu_cam0 @ rigid.inverse(T_lidar_cam0)
     numbers = np.array(last_numbers(files), np.float64)
-    T, note = _interpolate(numbers, StampedPoses(T_world_lidar, rows[:, 0]), path, slack=0.0)
-    return SideData(T, times, (note,))
+    return _interpolate(numbers, times, StampedPoses(T_world_lidar, rows[:, 0]), path, slack=0.0)
 
 
 def _read_carla(folder: Path, files: list[Path]) -> SideData:
@@ -213,13 +200,15 @@ def _read_mulran(folder: Path, files: list[Path]) -> SideData:
     rows = read_table(path, 13)  # stamp and pose
     # In float64 a stamp of 1.5e18 ns is good to 256 ns.
     pose_times = (rows[:, 0] - float(stamps[0])) * 1e-9
-    R_car_lidar = Rotation.from_euler("xyz", _MULRAN_OUSTER_RPY_DEG, degrees=True).as_matrix()
-    poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array(_MULRAN_OUSTER_XYZ))
-    T, note = _interpolate(times, StampedPoses(poses, pose_times), path, slack=_MULRAN_SLACK_S)
-    return SideData(T, times, (note,))
+    # The published calibration: the Ouster in the car's frame.
+    R_car_lidar = Rotation.from_euler("xyz", (0.0001, 0.0003, 179.6654), degrees=True).as_matrix()
+    poses = from_rows(rows[:, 1:], path) @ homogeneous(R_car_lidar, np.array((1.7042, -0.021, 1.8047)))
+    return _interpolate(times, times, StampedPoses(poses, pose_times), path, slack=0.5)
 
 
-def _interpolate(wanted: FloatArray, found: StampedPoses, path: Path, slack: float) -> tuple[FloatArray, Note]:
+def _interpolate(
+    wanted: FloatArray, times: FloatArray | None, found: StampedPoses, path: Path, slack: float
+) -> SideData:
     """Interpolates poses, relative to the first, for the scans within `slack` of the stamps of the poses."""
     stamps, first = np.unique(np.asarray(found.stamps), return_index=True)
     kept = (wanted >= stamps[0] - slack) & (wanted <= stamps[-1] + slack)
@@ -227,55 +216,25 @@ def _interpolate(wanted: FloatArray, found: StampedPoses, path: Path, slack: flo
     T = interpolate_poses(stamps, found.poses[first], wanted)
     # In the frame of the first, without the 1e6 m of national grids.
     T = np.where(kept[:, None, None], rigid.inverse(T[kept.argmax()]) @ T, np.nan)
-    return T, matching_note(path, "time" if slack else "the numbers of the frames", T)
+    return SideData(T, times, (matching_note(path, "time" if slack else "the numbers of the frames", T),))
 
 
-def _first_row(path: Path, width: int) -> FloatArray:
-    """Reads the first numbers (1, width) of a file."""
-    rows = read_table(path)
-    require(rows.shape[1] >= width, path, f"rows of {rows.shape[1]} numbers", f"give {width} numbers or more")
-    return rows[:1, :width]
-
-
-def read_labelled(path: Path, names: Sequence[str], count: int, advice: str) -> FloatArray:
-    """Reads the first line `name: numbers` of a calibration file that has one of these names.
-
-    Args:
-        path: the file.
-        names: usual names of the line.
-        count: number of its numbers.
-        advice: see `InputError`.
-
-    Returns:
-        (count,).
-
-    Raises:
-        InputError: no such file, or no such line.
-    """
-    for key, _, words in (line.partition(":") for line in read_lines(path)):
-        try:
-            numbers = np.array(words.split(), np.float64)
-        except ValueError:
-            continue
-        if key.strip() in names and len(numbers) == count:
-            return numbers
-    raise InputError(path, f"no line '{names[0]}:' of {count} numbers", advice)
-
-
-def _from_camera(T_world_cam0: FloatArray, path: Path) -> FloatArray:
-    """Converts poses of the left grey camera to those of the lidar by `Tr`, T_cam0_lidar, of KITTI's calib.txt."""
-    advice = "take the calib.txt with a line 'Tr:' of 12 numbers (data_odometry_calib); camera poses need it"
-    T_cam0_lidar = from_rows(read_labelled(path, ("Tr", "Tr_velo_to_cam", "Tr_velo_cam"), 12, advice), path)[0]
-    return np.asarray(rigid.inverse(T_cam0_lidar) @ T_world_cam0 @ T_cam0_lidar)
+def _read_labelled(path: Path, names: Sequence[str], count: int, advice: str) -> FloatArray:
+    """Reads the first line `name: numbers` of a calibration file with one of these names and so many numbers."""
+    lines = (line.partition(":") for line in read_lines(path))
+    found = next((words.split() for key, _, words in lines if key.strip() in names and len(words.split()) == count), [])
+    require(len(found) > 0, path, f"no line '{names[0]}:' of {count} numbers", advice)
+    with refusing(path, f"line '{names[0]}:' ({{error}})", advice, (ValueError,)):
+        return np.array(found, np.float64)
 
 
 def _read_dates(path: Path, files: list[Path]) -> FloatArray | None:
     """Reads KITTI raw's timestamps.txt (2011-09-26 13:02:25.951199337), s from the first; None if it does not fit."""
     try:
-        lines = [line.strip() for line in read_lines(path) if line.strip()]
-        if not all(re.fullmatch(_DATE, line) for line in lines):
+        lines = [line.strip().replace(" ", "T") for line in read_lines(path) if line.strip()]
+        if not all(re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?", line) for line in lines):
             return None
-        dates = match_rows(np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]"), files, path)
+        dates = match_rows(np.array(lines, "datetime64[ns]"), files, path)
     except ValueError:
         return None
     return (dates - dates[0]).astype(np.float64) * 1e-9
@@ -300,41 +259,36 @@ def _poses_from_oxts(records: FloatArray, source: Path) -> FloatArray:
     found = "records that are not finite, or beyond 89 degrees of latitude, 361 of longitude, or 1000 km of height"
     require(is_good, source, found, "copy them again")
     latitude, longitude = np.radians(records[:, 0]), np.radians(records[:, 1])
-    scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    # The radius of the Earth, m.
+    scale = np.cos(latitude[0]) * 6378137.0
     east, north = scale * longitude, scale * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
     rotations = Rotation.from_euler("ZYX", records[:, [5, 4, 3]]).as_matrix()
     return homogeneous(rotations, np.column_stack([east, north, records[:, 2]]))
 
 
-class _Layout(NamedTuple):
-    """A published layout: what its folder holds, where the scans lie, and the reader of poses and times."""
-
-    marker: str
-    scans: str
-    read: Callable[[Path, list[Path]], SideData]
-
-
-_LAYOUTS = (
-    _Layout("generated/frames", "generated/frames", _read_carla),
-    _Layout("full_poses_lidar.txt", "frames", _read_carla),
-    _Layout("Ouster", "Ouster", _read_mulran),
-    _Layout("sensor_data/Ouster", "sensor_data/Ouster", _read_mulran),
-    _Layout("velodyne_points", "velodyne_points/data", _read_kitti_raw),
-    _Layout("velodyne", "velodyne", _read_kitti),
-)
+_Reader = Callable[[Path, list[Path]], SideData]
+# Published layouts: by what their folder holds, the folder of the scans, and the reader of poses and times.
+_LAYOUTS: dict[str, tuple[str, _Reader]] = {
+    "generated/frames": ("generated/frames", _read_carla),
+    "full_poses_lidar.txt": ("frames", _read_carla),
+    "Ouster": ("Ouster", _read_mulran),
+    "sensor_data/Ouster": ("sensor_data/Ouster", _read_mulran),
+    "velodyne_points": ("velodyne_points/data", _read_kitti_raw),
+    "velodyne": ("velodyne", _read_kitti),
+}
 
 
-def _layout_of(path: Path) -> _Layout:
+def _layout_of(path: Path) -> tuple[str, _Reader]:
     """Returns the layout of a folder: a published one, or scans right in it or in data/."""
     scans = "data" if not scan_files(path) and scan_files(path / "data") else ""
-    plain = _Layout("", scans, read_plain_drive)
-    return next((layout for layout in _LAYOUTS if (path / layout.marker).exists()), plain)
+    found = (layout for marker, layout in _LAYOUTS.items() if (path / marker).exists())
+    return next(found, (scans, read_plain_drive))
 
 
 def is_drive(path: Path) -> bool:
     """Returns True for a folder of a known layout, or with scans in it or in data/."""
-    layout = _layout_of(path)
-    return bool(layout.marker or scan_files(path / layout.scans))
+    is_published = any((path / marker).exists() for marker in _LAYOUTS)
+    return is_published or bool(scan_files(path / _layout_of(path)[0]))
 
 
 def open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> LidarSequence:
@@ -351,12 +305,11 @@ def open_folder(path: Path, poses: Path | None, bin_columns: int | None) -> Lida
     Raises:
         InputError: no scans, broken files, or poses that do not match the scans.
     """
-    layout = _layout_of(path)
-    files = scan_files(path / layout.scans)
+    scans, read = _layout_of(path)
+    files = scan_files(path / scans)
     require(len(files) > 0, path, "a folder without scans", f"give {DRIVES}")
-    is_learned = layout.scans == "" and files[0].suffix.lower() == ".npz"
-    read = partial(read_plain_drive, poses=poses) if poses else _read_learned if is_learned else layout.read
-    T, times, notes = read(path, files)
+    read = _read_learned if scans == "" and files[0].suffix.lower() == ".npz" else read
+    T, times, notes = read_plain_drive(path, files, poses) if poses else read(path, files)
     columns, note = columns_of_drive(files, bin_columns)
     notes = tuple(each for each in (folder_note(files[0].parent), *notes, note) if each is not None)
     given, sources = Path(os.path.abspath(path)), tuple(map(str, files))

@@ -5,6 +5,7 @@ The number of columns of a raw file of float32 is inferred from its name and its
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 from collections.abc import Iterable
@@ -15,16 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpmjax.io.clouds import TimedCloud, parse_pcd, parse_ply
-from dpmjax.io.files import (
-    import_for,
-    load_arrays,
-    log_notes,
-    read_bytes,
-    read_table,
-    read_unpacked,
-    refusing,
-    to_float32,
-)
+from dpmjax.io.files import import_for, load_arrays, log_notes, read_table, read_unpacked, refusing, to_float32
 from dpmjax.sequences import EmptyScanError, FloatArray, InputError, Note, require
 
 # Of equally many files of several endings the first is read; arrays may be labels, so they are last.
@@ -41,27 +33,10 @@ _TO_CONVERT = {
 _NPZ_KEYS, _NPZ_TIMES = ("lidar_pcd", "points", "xyz", "arr_0"), "times"
 # Least range, usual range and largest range of lidars on the ground, m; nearly all points are within the usual range.
 _NEAREST_M, _USUAL_M, _FARTHEST_M = 0.1, 120.0, 400.0
-_LEAST_USUAL_SHARE = 0.05
-# Number of points whose median range is taken.
-_NUM_MEDIAN = 4096
-# An array of fewer rows and more columns than this has the coordinates in its rows.
-_MOST_ROWS_OF_TRANSPOSE = 16
-# Points in map coordinates are nearer to their middle than to the origin by this factor.
-_MAP_RATIO = 5.0
 # LAZ packs a point of 20 bytes or more to 3, to less only where all points are alike; a record has 54 bytes or more.
-_MOST_POINTS_PER_BYTE, _RECORD_BYTES = 100, 54
-_COLUMN_COUNTS, _USUAL_COLUMNS = (3, 4, 5, 6, 7, 8), 4
-_NUSCENES_ENDING, _NUSCENES_COLUMNS = ".pcd.bin", 5
+_COLUMN_COUNTS, _USUAL_COLUMNS, _NUSCENES_COLUMNS = (3, 4, 5, 6, 7, 8), 4, 5
 # NCLT packs a point to the 8 bytes of two float32: 5 mm from -100 m as uint16, intensity, and one of 32 lasers.
 _NCLT_COLUMNS, _NCLT_RECORD, _NCLT_LASERS = 2, np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]), 32
-# Largest number of values, largest number of bins of their histogram, and least number of values of a bin.
-_MOST_VALUES, _MOST_BINS, _LEAST_PER_BIN = 60_000, 64, 50
-# Mutual information of column and value: least value of the best layout, bits, and least ratio to the next layout.
-_LEAST_BITS, _LEAST_RATIO = 0.05, 1.3
-# Six and eight columns repeat the order of three and four, so their information must be larger by this ratio.
-_DOUBLED_RATIO = 1.1
-# Usual magnitudes of coordinates, least share of such float64, and largest share of their lower halves as float32.
-_USUAL_SIZES, _LEAST_DOUBLES, _MOST_HALVES = (1e-4, 1e5), 0.95, 0.7
 
 
 def read_lidar_file(path: str | Path, *, bin_columns: int | None = None) -> NDArray[np.float32]:
@@ -103,9 +78,8 @@ def scan_notes(path: str | Path, points: NDArray[np.float32], *, bin_columns: in
     Raises:
         InputError: the file cannot be read any more.
     """
-    path = Path(path)
-    is_raw = _suffix_of(path) == ".bin"
-    columns = find_columns(path, read_unpacked(path), bin_columns)[1] if is_raw else None
+    is_raw = _suffix_of(Path(path)) == ".bin"
+    columns = find_columns(Path(path), read_unpacked(path), bin_columns)[1] if is_raw else None
     return [note for note in (columns, unit_note(points, path)) if note is not None]
 
 
@@ -124,34 +98,31 @@ def read_point_times(path: str | Path) -> FloatArray | None:
         InputError: see `read_lidar_file`.
     """
     path = Path(path)
-    return None if _suffix_of(path) in (".bin", ".npy") else read_timed_cloud(path, None).times
+    return None if _suffix_of(path) == ".bin" else read_timed_cloud(path, None).times
 
 
 def read_timed_cloud(path: Path, bin_columns: int | None) -> TimedCloud:
     """Reads points and times of a scan of any kind, checked; see `read_lidar_file`."""
     suffix = _suffix_of(path)
     require(not path.is_dir(), path, "a folder", "give one scan file")
-    found, known = (
-        f"an unknown kind of scan, {suffix or 'without ending'}",
-        dict.fromkeys(SCAN_SUFFIXES + _TEXT_SUFFIXES),
-    )
-    advice = _TO_CONVERT.get(suffix, f"give one of {' '.join(known)}")
-    require(suffix in known, path, found, advice)
     if suffix in (".npy", ".npz"):
-        return check_scan(_read_arrays(path), path)
-    if suffix in _TEXT_SUFFIXES:
+        cloud = _read_arrays(path)
+    elif suffix in _TEXT_SUFFIXES:
         table = read_table(path)
         require(table.shape[1] >= 3, path, f"rows of {table.shape[1]} numbers", "give rows of x y z")
-        return check_scan(TimedCloud(to_float32(table[:, :3]), None), path)
-    content = read_unpacked(path)
-    if suffix == ".bin":
+        cloud = TimedCloud(to_float32(table[:, :3]), None)
+    elif suffix == ".bin":
+        content = read_unpacked(path)
         columns = bin_columns or find_columns(path, content)[0]
         check_size(path, len(content), columns)
         is_nclt = columns == _NCLT_COLUMNS
         points = _nclt_points(content) if is_nclt else np.frombuffer(content, "<f4").reshape(-1, columns)[:, :3]
         cloud = TimedCloud(points, None)
     else:
-        cloud = {".pcd": parse_pcd, ".ply": parse_ply}.get(suffix, _parse_las)(content, str(path))
+        parsers = {".pcd": parse_pcd, ".ply": parse_ply, ".las": _parse_las, ".laz": _parse_las}
+        advice = _TO_CONVERT.get(suffix, f"give one of {' '.join(dict.fromkeys(SCAN_SUFFIXES + _TEXT_SUFFIXES))}")
+        require(suffix in parsers, path, f"an unknown kind of scan, {suffix or 'without ending'}", advice)
+        cloud = parsers[suffix](read_unpacked(path), str(path))
     return check_scan(cloud, path)
 
 
@@ -166,7 +137,8 @@ def _read_arrays(path: Path) -> TimedCloud:
     values = next((table[key] for key in _NPZ_KEYS if key in table), np.zeros(0))
     found = f"an array of {values.shape} {values.dtype}" if values.size else "no array of points"
     is_good = values.ndim in (2, 3) and values.shape[-1] >= 3 and values.dtype.kind in "fiu"
-    is_good = is_good and not (values.ndim == 2 and len(values) < _MOST_ROWS_OF_TRANSPOSE < values.shape[1])
+    # An array of few rows and many columns has the coordinates in its rows.
+    is_good = is_good and not (values.ndim == 2 and len(values) < 16 < values.shape[1])
     advice = f"give points (n, 3), or organised (rows, columns, 3), in metres, as one of {', '.join(_NPZ_KEYS)}"
     require(is_good, path, found, advice)
     points, times = values.reshape(-1, values.shape[-1])[:, :3], table.get(_NPZ_TIMES)
@@ -182,40 +154,40 @@ def _parse_las(content: bytes, source: str) -> TimedCloud:
     """Reads the points of a LAS or LAZ file by laspy (extra `las`), with GPS times where the point format has them."""
     laspy = import_for(source, "laspy", "las")
     options = {"laz_backend": (laspy.LazBackend.Lazrs,), "read_evlrs": False}
-    advice = "copy the file again, or save it anew as LAS 1.2 or 1.4"
-    try:
-        # Damaged headers raise many kinds of errors.
-        with (
-            refusing(source, "not a readable LAS file ({kind}: {error})", advice, (Exception,)),
-            np.errstate(all="ignore"),
-        ):
+    found, advice = (
+        "not a readable LAS file ({kind}: {error})",
+        "copy the file again, or save it anew as LAS 1.2 or 1.4",
+    )
+    # Damaged headers raise many kinds of errors.
+    with refusing(source, found, advice, (Exception,)), np.errstate(all="ignore"):
+        try:
             header_size, start, num_records = struct.unpack_from("<HII", content, 94)
-            if content[:4] != b"LASF" or not header_size + num_records * _RECORD_BYTES <= start <= len(content):
+            if content[:4] != b"LASF" or not header_size + num_records * 54 <= start <= len(content):
                 raise ValueError("no LAS header, or more records than bytes before the points")
             with laspy.open(io.BytesIO(content), **options) as reader:
                 _require_points(reader.header, content)
                 cloud = reader.read()
-            has_times = "gps_time" in cloud.point_format.dimension_names
-            points = to_float32(np.stack([cloud.x, cloud.y, cloud.z], axis=1))
-            return TimedCloud(points, np.asarray(cloud.gps_time, np.float64) if has_times else None)
-    except BaseException as error:
-        # A panic of the decompressor, which is written in Rust, is no Exception.
-        if type(error).__name__ == "PanicException":
-            raise InputError(source, f"not a readable LAS file ({error})", advice) from error
-        raise
+        except BaseException as error:
+            # A panic of the decompressor, which is written in Rust, is no Exception.
+            if type(error).__name__ == "PanicException":
+                raise ValueError(str(error)) from error
+            raise
+        has_times = "gps_time" in cloud.point_format.dimension_names
+        points = to_float32(np.stack([cloud.x, cloud.y, cloud.z], axis=1))
+        return TimedCloud(points, np.asarray(cloud.gps_time, np.float64) if has_times else None)
 
 
 def _require_points(header: Any, content: bytes) -> None:
     """Raises a ValueError where a file is shorter than its header says, or has no table of its compressed chunks."""
     start, size, count = int(header.offset_to_point_data), len(content), int(header.point_count)
-    if not header.are_points_compressed:
-        is_good = start + count * int(header.point_format.size) <= size
-    else:
+    is_good = start + count * int(header.point_format.size) <= size
+    if header.are_points_compressed:
         # The decompressor reserves memory by the number in the table, and ends the process where it fails.
         (place,) = struct.unpack_from("<q", content, start)
         (place,) = struct.unpack_from("<q", content, size - 8) if place == -1 else (place,)
         version, num_chunks = struct.unpack_from("<II", content, place) if 0 < place <= size - 8 else (1, 0)
-        is_good = count <= _MOST_POINTS_PER_BYTE * size and version == 0 and num_chunks <= size
+        # LAZ packs a point of 20 bytes or more to 3, to less only where all points are alike.
+        is_good = count <= 100 * size and version == 0 and num_chunks <= size
     if not is_good:
         raise ValueError(f"truncated: {count} points, {size} bytes are there")
 
@@ -235,7 +207,9 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
         InputError: see `read_lidar_file`.
     """
     points, times = cloud
-    x, y, z = np.asarray(points, np.float64).T
+    # Three products are much faster than `numpy.linalg.norm`.
+    with np.errstate(invalid="ignore"):
+        x, y, z = points.astype(np.float64).T
     squared = x * x + y * y + z * z
     is_kept = np.isfinite(squared) & (squared > 0)
     kept = points.take(np.flatnonzero(is_kept), axis=0)
@@ -243,16 +217,16 @@ def check_scan(cloud: TimedCloud, source: str | Path) -> TimedCloud:
         why = f": all {len(points)} are zero or not finite" if len(points) else ""
         raise EmptyScanError(source, f"no point in the scan{why}", "remove the file, or copy it again")
     ranges = np.sqrt(squared[is_kept])
-    # A sample of the points suffices for the median range.
-    some = slice(None, None, max(1, len(kept) // _NUM_MEDIAN))
-    median_m = np.median(ranges[some])
+    # A sample of the points suffices for medians.
+    some = slice(None, None, max(1, len(kept) // 4096))
+    median_m = float(np.median(ranges[some]))
     found, advice = f"the median range is {median_m:.4g} m", "convert millimetres or centimetres to metres"
     if _is_far_place(kept[some].astype(np.float64)):
         at = " ".join(f"{value:.0f}" for value in np.median(kept, axis=0))
         found = f"{found}, around one place far away: coordinates of a map, such as UTM"
         advice = f"subtract an origin such as {at}, and give points in the lidar's own frame"
     elif median_m > 1000 * _FARTHEST_M:
-        advice = "check the number of columns"
+        advice = "check the number of columns, and that they are float32"
     require(median_m <= _FARTHEST_M, source, found, advice)
     is_near = ((ranges > _NEAREST_M) & (ranges < _FARTHEST_M)).any()
     require(is_near, source, f"all {len(kept)} points are out of range", "give metres in the lidar's own frame")
@@ -270,7 +244,7 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
         The note, or None.
     """
     share = float((np.linalg.norm(points.astype(np.float64), axis=1) < _USUAL_M).mean()) if len(points) else 1.0
-    if share >= _LEAST_USUAL_SHARE:
+    if share >= 0.05:
         return None
     found = f"{100 * share:.1f} % of the points lie within {_USUAL_M:g} m"
     what = "coordinates of a map" if _is_far_place(points) else "millimetres or centimetres"
@@ -280,11 +254,8 @@ def unit_note(points: NDArray[np.float32], source: str | Path) -> Note | None:
 def _is_far_place(points: NDArray[Any]) -> bool:
     """Returns True for points around one place far from the origin."""
     middle = np.median(points, axis=0)
-    return bool(np.median(np.linalg.norm(points - middle, axis=1)) * _MAP_RATIO < np.linalg.norm(middle))
-
-
-class Float64Error(InputError):
-    """A raw file of float64, as all files of its drive are."""
+    # Points in map coordinates are five times as near to their middle as to the origin.
+    return bool(np.median(np.linalg.norm(points - middle, axis=1)) * 5.0 < np.linalg.norm(middle))
 
 
 def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[int, Note | None]:
@@ -304,29 +275,27 @@ def find_columns(path: Path, content: bytes, given: int | None = None) -> tuple[
         four, if the values fit another number as well, or if they contradict the given one.
 
     Raises:
-        Float64Error: the file holds float64, and no layout is given.
-        InputError: the file has no whole number of points of the layout, or of any.
+        InputError: the file holds float64, and no layout is given.
     """
     if given is None and _is_nclt(content):
         return _NCLT_COLUMNS, Note(f"{path}: points of 8 bytes, as of NCLT; y and z are turned, so that z is up")
-    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")[:_MOST_VALUES]
+    # Bins hold 50 values or more.
+    values = np.frombuffer(content[: len(content) // 4 * 4], "<f4")[:60_000]
+    are_doubles = given is None and _are_doubles(values)
+    require(not are_doubles, path, "the values are float64", "save them as float32, or the points as .npy")
     inferred = _columns_by_values(values)
     if given is not None:
         text = f"{path}: --columns {given}, but the values look like {inferred} columns a point"
         return given, None if inferred in (None, given) else Note(text, is_doubt=True)
-    if _are_doubles(values):
-        raise Float64Error(path, "the values are float64", "save them as float32, or the points as .npy")
     fitting = [n for n in _COLUMN_COUNTS if len(content) % (4 * n) == 0]
-    is_nuscenes = path.name.lower().endswith(_NUSCENES_ENDING) and _NUSCENES_COLUMNS in fitting
-    if inferred is None and is_nuscenes:
-        return _NUSCENES_COLUMNS, Note(f"{path}: 5 columns a point, by its ending; --columns decides")
-    check_size(path, len(content), inferred or _USUAL_COLUMNS)
-    if inferred is not None:
-        text = f"{path}: {inferred} columns a point, inferred from the values; --columns decides"
-        return inferred, None if inferred == _USUAL_COLUMNS else Note(text)
-    others = " or ".join(str(n) for n in fitting if n != _USUAL_COLUMNS)
+    is_nuscenes = inferred is None and path.name.lower().endswith(".pcd.bin") and _NUSCENES_COLUMNS in fitting
+    columns = inferred or (_NUSCENES_COLUMNS if is_nuscenes else _USUAL_COLUMNS)
+    others = " or ".join(str(n) for n in fitting if n != columns)
+    if columns != _USUAL_COLUMNS:
+        how = "by its ending" if is_nuscenes else "inferred from the values"
+        return columns, Note(f"{path}: {columns} columns a point, {how}; --columns decides")
     text = f"{path}: 4 columns a point are assumed, {others} would fit as well; --columns decides"
-    return _USUAL_COLUMNS, Note(text, is_doubt=True) if others and content else None
+    return columns, Note(text, is_doubt=True) if inferred is None and others and content else None
 
 
 def _is_nclt(content: bytes) -> bool:
@@ -352,13 +321,12 @@ def check_size(path: str | Path, size: int, columns: int) -> None:
 def columns_of_drive(files: Iterable[Path], given: int | None = None) -> tuple[int, Note | None]:
     """Infers or compares the columns of raw files by the first one that can be read; KITTI's where none can."""
     for file in files:
-        try:
-            if file.suffix.lower() == ".bin" and (content := read_bytes(file)):
-                return find_columns(file, content, given)
-        except Float64Error:
-            raise
-        except InputError:  # named where it is read
-            continue
+        content = b""
+        # One that cannot be read is named when it is read.
+        with contextlib.suppress(InputError):
+            content = read_unpacked(file) if file.suffix.lower() == ".bin" else b""
+        if content:
+            return find_columns(file, content, given)
     return given or _USUAL_COLUMNS, None
 
 
@@ -366,16 +334,18 @@ def _are_doubles(values: NDArray[np.float32]) -> bool:
     """Returns True for coordinates in float64, whose lower halves are bits without a meaning."""
     halves = values[: len(values) // 2 * 2]
     doubles = halves.view("<f8")
-    is_there, (least, most) = doubles != 0, _USUAL_SIZES
-    with np.errstate(invalid="ignore"):
-        sizes = [np.abs(numbers[is_there]) for numbers in (doubles, halves[::2])]
-        shares = [((least < each) & (each < most)).sum() / max(len(each), 1) for each in sizes]
-    return bool(shares[0] >= _LEAST_DOUBLES and shares[1] <= _MOST_HALVES)
+
+    def usual_share(numbers: NDArray[np.floating]) -> float:
+        with np.errstate(invalid="ignore"):
+            sizes = np.abs(numbers[doubles != 0])
+            return float(((sizes > 1e-4) & (sizes < 1e5)).sum() / max(len(sizes), 1))
+
+    return usual_share(doubles) >= 0.95 and usual_share(halves[::2]) <= 0.7
 
 
 def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     """Finds the layout of the largest mutual information of column and value; None where no layout stands out."""
-    num_bins = min(_MOST_BINS, len(values) // (_LEAST_PER_BIN * max(_COLUMN_COUNTS)))
+    num_bins = min(64, len(values) // (50 * max(_COLUMN_COUNTS)))
     if num_bins < 4:
         return None
     with np.errstate(invalid="ignore"):
@@ -383,9 +353,11 @@ def _columns_by_values(values: NDArray[np.float32]) -> int | None:
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, num_bins + 1)[1:-1]))
     bins = np.searchsorted(edges, finite, side="right")
     bits = {n: _information_bits(bins, n, len(edges) + 1) for n in _COLUMN_COUNTS}
-    layouts = [n for n in _COLUMN_COUNTS if n not in (6, 8) or bits[n] >= _DOUBLED_RATIO * bits[n // 2]]
+    # Six and eight columns repeat the order of three and four, so their information must be larger by this ratio.
+    layouts = [n for n in _COLUMN_COUNTS if n not in (6, 8) or bits[n] >= 1.1 * bits[n // 2]]
     best, second, *_ = sorted(layouts, key=lambda n: -bits[n])
-    return best if bits[best] >= max(_LEAST_BITS, _LEAST_RATIO * bits[second]) else None
+    # The best layout stands out by its bits, and by their ratio to the next one.
+    return best if bits[best] >= max(0.05, 1.3 * bits[second]) else None
 
 
 def _information_bits(bins: NDArray[np.int64], columns: int, num_bins: int) -> float:

@@ -21,7 +21,6 @@ _LAYOUTS = (
     "x y theta, TUM (stamp tx ty tz qx qy qz qw), EuRoC (with its line of names), KITTI (12 numbers a row), or .npy of "
     "(n, 3), (n, 3, 3) or (n, 4, 4)"
 )
-_LARGEST_TILT_DEG = 10.0
 # Names of the columns of quaternions that begin with their real part, as of EuRoC: q_RS_w, q_RS_x or qw, qx.
 _IS_W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b", re.IGNORECASE)
 _W_FIRST_COLUMNS = [0, 1, 2, 3, 5, 6, 7, 4]
@@ -85,11 +84,11 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         InputError: see `read_poses`; or a wrong count, a different unit, or poses that leave the plane.
     """
     path = Path(path)
-    if path.suffix.lower() != ".npy":
-        comments = " ".join(line for line in read_lines(path) if line.strip().startswith("#"))
-        named = re.search(r"(?:\bunit |\bx_)(px|m)\b", comments)
-        stated = unit if named is None else named.group(1)
-        require(stated == unit, path, f"poses in {stated}, the scans are in {unit}", f"give poses in {unit}")
+    text = (
+        "" if path.suffix.lower() == ".npy" else " ".join(line for line in read_lines(path) if line.strip()[:1] == "#")
+    )
+    stated = re.findall(r"(?:\bunit |\bx_)(px|m)\b", text)[:1] or [unit]
+    require(stated == [unit], path, f"poses in {stated[0]}, the scans are in {unit}", f"give poses in {unit}")
     poses, _ = _read(path)
     found = f"{counted(len(poses), 'pose')} for {num_scans} scans"
     require(len(poses) == num_scans, path, found, "give one pose a scan, in the scans' order")
@@ -97,7 +96,7 @@ def read_planar_poses(path: str | Path, num_scans: int, unit: Unit) -> FloatArra
         return poses
     tilt = np.rad2deg(np.arccos(np.clip(poses[:, 2, 2], -1, 1)))
     found = f"pose {tilt.argmax()} is tilted by {tilt.max():.0f} degrees"
-    require(tilt.max() <= _LARGEST_TILT_DEG, path, found, "give poses of an upright sensor, z up (not of a camera)")
+    require(tilt.max() <= 10.0, path, found, "give poses of an upright sensor, z up (not of a camera)")
     return np.column_stack([poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
 
 
@@ -283,30 +282,23 @@ def _read(path: Path) -> tuple[FloatArray, FloatArray | None]:
             values = values[:, _W_FIRST_COLUMNS]
     if values.shape[1:] == (3, 3):
         return se2.from_matrix(check_poses(values, path)), None
-    if values.shape[1:] == (4, 4):
-        values = values.reshape(-1, 16)
+    values = values.reshape(-1, 16) if values.shape[1:] == (4, 4) else values
     width = values.shape[1] if values.ndim == 2 else 0
     found = f"rows of {width} columns" if width else "no array of poses"
     require(width in (3, 8, 12, 16) and len(values) > 0, path, found, f"give {_LAYOUTS}")
-    if width == 8:
-        return _from_tum(values, path), values[:, 0]
-    return (check_poses(values, path) if width == 3 else from_rows(values[:, :12], path)), None
-
-
-def _from_tum(rows: FloatArray, path: Path) -> FloatArray:
+    if width != 8:
+        return check_poses(values, path) if width == 3 else from_rows(values[:, :12], path), None
     from scipy.spatial.transform import Rotation
 
-    check_poses(rows, path)
-    is_unit = (np.abs(np.linalg.norm(np.clip(rows[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all()
+    check_poses(values, path)
+    is_unit = (np.abs(np.linalg.norm(np.clip(values[:, 4:], -2, 2), axis=1) - 1) <= 0.01).all()
     require(is_unit, path, "quaternions of another length than 1", "write TUM rows: stamp tx ty tz qx qy qz qw")
-    return homogeneous(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
+    return homogeneous(Rotation.from_quat(values[:, 4:]).as_matrix(), values[:, 1:4]), values[:, 0]
 
 
 def _as_matrices(poses: ArrayLike) -> FloatArray:
     """Converts (n, 3) or (n, 4, 4) to (n, 4, 4)."""
     values = np.asarray(poses, np.float64)
-    if not (values.ndim == 2 and values.shape[1] == 3) and values.shape[1:] != (4, 4):
-        raise ValueError(f"poses must be (n, 3) or (n, 4, 4), got {values.shape}")
-    if not np.isfinite(values).all():
-        raise ValueError("poses must be finite")
+    if values.shape[1:] not in ((3,), (4, 4)) or not np.isfinite(values).all():
+        raise ValueError(f"poses must be (n, 3) or (n, 4, 4) and finite, got {values.shape}")
     return planar_to_homogeneous(values) if values.ndim == 2 else values

@@ -15,18 +15,12 @@ from dpmjax.io.poses import StampedPoses, interpolate_poses, read_poses
 from dpmjax.io.scan_names import last_numbers, stamps_in_names
 from dpmjax.sequences import FloatArray, InputError, Note, Relations, counted, require
 
-# Bounds of the tolerance between the time of a scan and the nearest pose, half the step of the poses, s.
-_LARGEST_TOLERANCE_S, _SMALLEST_TOLERANCE_S = 0.1, 0.001
 # Stamps since 1970 and steps of stamps from 0, of which these are the smallest, in nano-, micro- and milliseconds.
 _UNITS = ((1e9, 1e17, 3e6), (1e6, 1e14, 3e3), (1e3, 1e11, 8.0))
 # Nanoseconds since 1970 are below this for three thousand years.
 _LARGEST_STAMP = 1e20
-# A lidar moves along its x axis, a camera along its z axis: least share of the squared distance, and least distance, m.
-_CAMERA_SHARE, _CAMERA_WAY_M = 0.8, 2.0
 # Axes of a camera that looks along x of the lidar: x right, y down, z forward.
 _T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-# Largest height, roll and pitch of relations in the plane, metres and radians.
-_FLAT = 1e-3
 
 
 def match_rows(rows: NDArray[Any], files: Sequence[Path], path: Path) -> NDArray[Any]:
@@ -84,19 +78,20 @@ def scan_times(homes: Sequence[Path], files: Sequence[Path]) -> tuple[FloatArray
     Returns:
         (n,) s or None, and a note where times.txt does not fit.
     """
-    stamps, notes = stamps_in_names(files), []
-    for path in [home / "times.txt" for home in homes if (home / "times.txt").is_file()][:1]:
-        try:
+    stamps, notes = stamps_in_names(files), tuple[Note, ...]()
+    path = next((home / "times.txt" for home in homes if (home / "times.txt").is_file()), None)
+    try:
+        if path is not None:
             table = read_table(path)
             # A column that numbers the rows from 0 or 1 is no time.
             numbers = [np.arange(len(table)) + first for first in (0, 1)]
             columns = (column for column in table.T if not any(np.array_equal(column, each) for each in numbers))
-            stamps = match_rows(next(columns, table[:, 0]), files, path)
-            require(_are_times(stamps), path, "rows that are no times", "give seconds")
-        except InputError as error:
-            stamps = stamps_in_names(files)
-            notes = [Note(f"{path}: {error.found}; these times are not used", is_doubt=True)]
-    return None if stamps is None else to_seconds(stamps), tuple(notes)
+            read = match_rows(next(columns, table[:, 0]), files, path)
+            require(_are_times(read), path, "rows that are no times", "give seconds")
+            stamps = read
+    except InputError as error:
+        notes = (Note(f"{path}: {error.found}; these times are not used", is_doubt=True),)
+    return None if stamps is None else to_seconds(stamps), notes
 
 
 def match_reference(
@@ -120,9 +115,7 @@ def match_reference(
     Raises:
         InputError: no times to match by, and another number of poses than of scans.
     """
-    count, stamps = len(found.poses), found.stamps
-    if stamps is not None and not _are_times(stamps):
-        stamps = None
+    stamps = found.stamps if found.stamps is not None and _are_times(found.stamps) else None
     if stamps is not None and _are_numbers(stamps, times, num_scans):
         T = np.full((num_scans, 4, 4), np.nan)
         T[stamps.astype(np.int64)] = found.poses
@@ -134,9 +127,9 @@ def match_reference(
             return T, (matching_note(path, f"time, tolerance {tolerance_s:.3g} s", T),)
         reason, is_doubt = "no scan has the time of a pose", True
     advice = "give a TUM file and times.txt with one time a scan, or one pose a scan"
-    require(count == num_scans, path, f"{counted(count, 'pose')} for {num_scans} scans, and {reason}", advice)
-    note = Note(f"{path}: {reason}; poses are matched by their order", is_doubt=True)
-    return found.poses, (note,) if is_doubt else ()
+    text = f"{counted(len(found.poses), 'pose')} for {num_scans} scans, and {reason}"
+    require(len(found.poses) == num_scans, path, text, advice)
+    return found.poses, (Note(f"{path}: {reason}; poses are matched by their order", True),) if is_doubt else ()
 
 
 def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
@@ -151,13 +144,11 @@ def camera_note(T_world_lidar: FloatArray, source: str | Path) -> Note | None:
     """
     T = T_world_lidar[np.isfinite(T_world_lidar).all(axis=(1, 2))]
     steps = np.einsum("nji,nj->ni", T[:-1, :3, :3], np.diff(T[:, :3, 3], axis=0))
-    with np.errstate(over="ignore"):
-        squares = (steps**2).sum(axis=0)
-        way_m = float(np.linalg.norm(steps, axis=1).sum())
-    if not _CAMERA_WAY_M <= way_m < np.inf or not np.isfinite(squares.sum()):
-        return None
-    share = float(squares[2] / squares.sum())
-    if share < _CAMERA_SHARE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        way_m, squares = float(np.linalg.norm(steps, axis=1).sum()), (steps**2).sum(axis=0)
+        share = float(squares[2] / max(squares.sum(), 1e-30))
+    # A lidar moves along its x axis, a camera along its z axis.
+    if not 2.0 <= way_m < np.inf or not share >= 0.8:
         return None
     found = f"the poses move along their own z axis ({share:.0%} of the way), as a camera does, not a lidar"
     advice = "their rotations are off by 90 degrees; give poses of the lidar, or a calib.txt with Tr beside them"
@@ -206,7 +197,7 @@ def _are_times(stamps: FloatArray) -> bool:
 def _are_numbers(stamps: FloatArray, times: FloatArray | None, num_scans: int) -> bool:
     """Returns True if stamps are numbers of scans: integers up to the last scan, and no times of the scans."""
     is_whole = bool((stamps == np.round(stamps)).all() and len(np.unique(stamps)) == len(stamps))
-    if not is_whole or stamps.min() < 0 or stamps.max() >= num_scans or len(stamps) < 1:
+    if not is_whole or stamps.min() < 0 or stamps.max() >= num_scans:
         return False
     if times is None:
         return True
@@ -219,7 +210,7 @@ def _by_time(stamps: FloatArray, poses: FloatArray, times: FloatArray) -> tuple[
     """Interpolates poses at the times of the scans, NaN where no pose is near; and returns the tolerance."""
     stamps, first = np.unique(stamps, return_index=True)
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    tolerance_s = max(min(0.5 * step, _LARGEST_TOLERANCE_S), _SMALLEST_TOLERANCE_S)
+    tolerance_s = max(min(0.5 * step, 0.1), 0.001)
     after = np.clip(np.searchsorted(stamps, times), 1, max(len(stamps) - 1, 1))
     nearest = np.minimum(np.abs(times - stamps[after - 1]), np.abs(times - stamps[np.minimum(after, len(stamps) - 1)]))
     # Times since 1970 in nanoseconds are good to 256 ns.
@@ -257,10 +248,7 @@ def read_relations(path: str | Path) -> Relations:
         InputError: the file is missing, has another number of columns, holds words that are no numbers, or relations
             that leave the plane.
     """
-    table = read_table(path)
-    is_good = table.shape[1] == 8 and bool(np.isfinite(table).all())
-    advice = "a line reads t1 t2 x y z roll pitch yaw: seconds, metres, radians"
-    require(is_good, path, f"rows of {table.shape[1]} numbers, or some not finite", advice)
-    is_flat = bool((np.abs(table[:, 4:7]) < _FLAT).all())
+    table = read_table(path, 8)  # t1 t2 x y z roll pitch yaw: seconds, metres, radians
+    is_flat = bool((np.abs(table[:, 4:7]) < 1e-3).all())
     require(is_flat, path, "relations with a height or a tilt", "give those of a planar log")
     return Relations(table[:, 0], table[:, 1], table[:, [2, 3, 7]])

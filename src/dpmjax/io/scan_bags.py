@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import logging
 import re
 import struct
@@ -22,27 +23,14 @@ from dpmjax.io.poses import interpolate_poses
 from dpmjax.sequences import FloatArray, LidarSequence, Note, ScanSequence, homogeneous, pad_scans, require
 
 _log = logging.getLogger(__name__)
-_LIVOX_CLOUDS = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-_CLOUDS = ("sensor_msgs/msg/PointCloud2", *_LIVOX_CLOUDS)
-_MULTI_ECHO_SCAN = "sensor_msgs/msg/MultiEchoLaserScan"
-_PLANAR_SCANS = ("sensor_msgs/msg/LaserScan", _MULTI_ECHO_SCAN)
+_CLOUDS = ("sensor_msgs/msg/PointCloud2", "livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+_PLANAR_SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 _ODOMETRY, _TRANSFORMS = ("nav_msgs/msg/Odometry",), ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_ADVICE = "copy the bag again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
-# Advice for bags without scans of the wanted kind, by the types that they have.
-_OTHER_KINDS = {
-    ("LaserScan", "MultiEchoLaserScan"): "planar scans are mapped by dpmjax map2d",
-    ("PointCloud2", "CustomMsg"): "clouds are mapped by dpmjax slam",
-    ("VelodyneScan", "PacketMsg", "VelodynePacket", "RslidarPacket", "UdpFrame", "HesaiScan", "PandarScan"): (
-        "raw packets are not read: play them through the driver and record its PointCloud2"
-    ),
-}
 # sensor_msgs/PointField: the numbers of its data types.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Frames whose motion against the robot is the result of a mapping, not odometry.
 _MAP_FRAMES = ("map", "world", "earth")
-# A stamp that steps back further than this, s, comes from a clock that was set, not from messages out of order.
-_OVERTAKING_S = 1.0
 # Odometry may end this long before or after a scan, s, for this share of the scans at least.
 _SLACK_S, _LEAST_SHARE = 0.2, 0.9
 _KINDS = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError)
@@ -75,23 +63,18 @@ def is_bag(path: Path) -> bool:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Lists the files of a bag; the folder itself where it has ROS 2's metadata.yaml."""
+    """Lists the files of a bag; the folder itself where it has ROS 2's metadata.yaml, and the files that it names."""
     if not path.is_dir():
         return [path]
     metadata = path / "metadata.yaml"
     text = metadata.read_text("utf-8", "replace") if metadata.is_file() else ""
     # Another program's metadata.yaml lies beside its scans; that of a renamed bag names files that are not there.
     is_bag_2 = "rosbag2_bagfile_information" in text
-    if is_bag_2 and not _missing_files(path, text):
+    named = re.findall(r"[^\s'\"\[\],]+\.(?:db3|mcap)\b", text)
+    if is_bag_2 and all((path / name).is_file() for name in named):
         return [path]
     parts = (sorted(path.glob(f"*{suffix}"), key=lambda file: natural_key(file.name)) for suffix in _SUFFIXES)
     return next((found for found in parts if found), [path] if is_bag_2 else [])
-
-
-def _missing_files(path: Path, metadata: str) -> list[str]:
-    """Lists the files that the metadata of a bag names and its folder lacks."""
-    named = re.findall(r"[^\s'\"\[\],]+\.(?:db3|mcap)\b", metadata)
-    return [name for name in named if not (path / name).is_file()]
 
 
 class _Bag:
@@ -122,24 +105,23 @@ class _Bag:
         """Finds the topics of these types that have messages."""
         return [name for name, (kind, count) in self.topics.items() if kind in kinds and count > 0]
 
-    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> tuple[str, str]:
-        """Chooses the topic of scans of these types, and its type: the one that the user names, else the only one."""
+    def choose(self, kinds: Collection[str], topic: str | None, what: str) -> str:
+        """Chooses the topic of scans of these types: the one that the user names, else the only one."""
         types = {name: kind.rpartition("/")[2] for name, (kind, _) in self.topics.items()}
         held = ", ".join(f"{name} ({kind})" for name, kind in types.items()) or "none"
         named = [name for name in types if topic is None or name.strip("/") == topic.strip("/")]
         found = f"no topic {topic}, it has {held}"
         require(topic is None or len(named) > 0, self.path, found, "name one of those with --topic")
-        fitting = [name for name in self.of_kinds(kinds) if name in named]
-        silent = [name for name in named if self.topics[name][0] in kinds and self.topics[name][1] == 0]
-        found = f"the topic {', '.join(silent)} has no message"
-        require(bool(fitting) or not silent, self.path, found, "record it again while the driver runs")
-        others = (advice for others, advice in _OTHER_KINDS.items() if {types[name] for name in named} & set(others))
+        wanted = [name for name in named if self.topics[name][0] in kinds]
         found = f"no {what}{'' if topic is None else f' in topic {topic}'}; its topics are {held}"
-        advice = next(others, "record LaserScan, PointCloud2 or Livox's CustomMsg")
-        require(len(fitting) > 0, self.path, found, advice)
+        advice = "dpmjax map2d reads LaserScan, dpmjax slam PointCloud2 and CustomMsg; raw packets need their driver"
+        require(len(wanted) > 0, self.path, found, advice)
+        fitting = [name for name in wanted if self.topics[name][1] > 0]
+        found = f"the topic {', '.join(wanted)} has no message"
+        require(len(fitting) > 0, self.path, found, "record it again while the driver runs")
         found = f"{len(fitting)} topics of {what}: {', '.join(fitting)}"
         require(len(fitting) == 1, self.path, found, "name one with --topic")
-        return fitting[0], self.topics[fitting[0]][0]
+        return fitting[0]
 
     def read(self, topic: str, place: _Place) -> Any:
         """Reads a message at one of the `places` of its topic."""
@@ -147,10 +129,6 @@ class _Bag:
             found = list(self._messages(topic, start=place.recorded_ns, stop=place.recorded_ns + 1))
             connection, _, content = found[place.number]
             return self._reader.deserialize(content, connection.msgtype)
-
-    def messages(self, topic: str) -> Iterator[Any]:
-        """Reads all messages of a topic in the order of the recording."""
-        return (message for _, message in self.recorded(topic))
 
     def recorded(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Reads the times of the recording, s, and the messages of a topic, in the order of the recording."""
@@ -161,43 +139,46 @@ class _Bag:
     def _messages(self, topic: str, **times: int) -> Iterator[Any]:
         return self._reader.messages([each for each in self._reader.connections if each.topic == topic], **times)
 
-    def places(self, topic: str) -> tuple[list[_Place], str | None]:
+    def places(self, topic: str) -> tuple[list[_Place], tuple[Note, ...]]:
         """Finds the messages of a topic, which begin with a header, in the order of the times of their headers.
 
         The times of the recording are taken if a header has no time, or if a clock was set back.
 
         Returns:
-            The places, and the fault of the headers' times, if any.
+            The places, and a note on the fault of the headers' times, if any.
         """
         places: list[_Place] = []
         with self._lock, _refusing_bag(self.path):
-            seen: dict[int, int] = {}
+            seen: collections.Counter[int] = collections.Counter()
             for _, recorded_ns, content in self._messages(topic):
-                number = seen.get(recorded_ns, 0)
-                seen[recorded_ns] = number + 1
                 # The time of the header follows a number (ROS 1), or the encoding (ROS 2).
                 order = ">" if self._reader.is2 and content[1] == 0 else "<"
                 seconds, nanoseconds = struct.unpack_from(f"{order}II", content, 4)
-                places.append(_Place(seconds * 10**9 + nanoseconds, recorded_ns, number))
-        fault = _fault_of_stamps(np.array([1e-9 * place.stamp_ns for place in places]))
-        if fault is not None:
+                places.append(_Place(seconds * 10**9 + nanoseconds, recorded_ns, seen[recorded_ns]))
+                seen[recorded_ns] += 1
+        notes = _fault_of_stamps(np.array([1e-9 * place.stamp_ns for place in places]), self.path)
+        if notes:
             places = [place._replace(stamp_ns=place.recorded_ns) for place in places]
-        return sorted(places), fault
+        return sorted(places), notes
 
 
-def _fault_of_stamps(stamps: FloatArray) -> str | None:
-    """Returns why the times (n,) of headers, s, give no order; messages that overtook each other are no fault."""
-    if len(stamps) and stamps.min() <= 0:
-        return "a header without a time"
+def _fault_of_stamps(stamps: FloatArray, path: Path) -> tuple[Note, ...]:
+    """Tells why the times (n,) of headers, s, give no order; messages that overtook each other are no fault."""
     back = np.diff(stamps, prepend=stamps[:1])
-    if len(stamps) and back.min() < -_OVERTAKING_S:
-        return f"the stamps step back by {-back.min():.3g} s at message {int(back.argmin())}"
-    return None
+    if len(stamps) and stamps.min() <= 0:
+        fault = "a header without a time"
+    # A stamp that steps back by more than a second comes from a clock that was set, not from messages out of order.
+    elif len(stamps) and back.min() < -1.0:
+        fault = f"the stamps step back by {-back.min():.3g} s at message {int(back.argmin())}"
+    else:
+        return ()
+    return (Note(f"{path}: {fault}; the order of the recording is used", is_doubt=True),)
 
 
 def _refusing_bag(path: Path) -> Any:
     """Turns all errors of rosbags on damaged bags into an `InputError`."""
-    return refusing(path, "cannot be read as a bag of ROS ({kind}: {error})", _ADVICE, (Exception,))
+    advice = "copy the bag again, or repair it (rosbag reindex, ros2 bag reindex, mcap recover)"
+    return refusing(path, "cannot be read as a bag of ROS ({kind}: {error})", advice, (Exception,))
 
 
 def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
@@ -218,27 +199,26 @@ def read_scan_bag(path: Path, topic: str | None = None) -> ScanSequence:
         InputError: a damaged bag, no topic of planar scans, or several.
     """
     bag = _Bag(path)
-    chosen, kind = bag.choose(_PLANAR_SCANS, topic, "planar scans")
+    chosen = bag.choose(_PLANAR_SCANS, topic, "planar scans")
     with refusing(path, "a broken message ({error})", "record the topic again", _KINDS):
         messages = [
-            (_stamp_of(message), recorded_s, message.header.frame_id.strip("/"), _ends_of(message, kind))
+            (_stamp_of(message), recorded_s, message.header.frame_id.strip("/"), _ends_of(message))
             for recorded_s, message in bag.recorded(chosen)
         ]
         stamps, recorded, frames, scans = zip(*messages, strict=True)
-        fault = _fault_of_stamps(np.array(stamps))
-        order = np.argsort(stamps if fault is None else recorded, kind="stable")
-        times = np.array(stamps if fault is None else recorded)[order]
-        T_odom_laser, is_upside_down, notes = _odometry(bag, frames[order[0]], times, by_recording=fault is not None)
-        if fault is not None:
-            notes = (Note(f"{path}: {fault}; the order of the recording is used", is_doubt=True), *notes)
+        notes = _fault_of_stamps(np.array(stamps), path)
+        times = np.array(recorded if notes else stamps)
+        order = np.argsort(times, kind="stable")
+        T_odom_laser, is_upside_down, found = _odometry(bag, frames[order[0]], times[order], by_recording=bool(notes))
     points, mask = pad_scans([scans[index] for index in order])
     if is_upside_down:
         points = points * np.array([1, -1], np.float32)
     odometry = None if T_odom_laser is None else se2.from_matrix(T_odom_laser[:, [[0], [1], [3]], [0, 1, 3]])
-    return ScanSequence(path.resolve().stem, points, mask, "m", None, odometry, times, notes)
+    name = path.resolve().stem
+    return ScanSequence(name, points, mask, "m", None, odometry, times[order], (*notes, *found))
 
 
-def _ends_of(message: Any, kind: str) -> FloatArray:
+def _ends_of(message: Any) -> FloatArray:
     """Computes the end points (b, 2) of a planar scan, of several echoes the first.
 
     NaN stands for a range below `range_min`, of `range_max` or more, or not finite.
@@ -249,11 +229,9 @@ def _ends_of(message: Any, kind: str) -> FloatArray:
     Raises:
         ValueError: angles that are not finite.
     """
-    if kind == _MULTI_ECHO_SCAN:
-        echoes = [np.asarray(echo.echoes, np.float64)[:1] for echo in message.ranges]
-        ranges = np.array([echo[0] if len(echo) else np.nan for echo in echoes], np.float64)
-    else:
-        ranges = np.array(message.ranges, np.float64)
+    # Of a MultiEchoLaserScan, each beam has a list of echoes.
+    firsts = [np.append(each.echoes, np.nan)[0] if hasattr(each, "echoes") else each for each in message.ranges]
+    ranges = np.array(firsts, np.float64)
     with np.errstate(invalid="ignore"):
         is_echo = np.isfinite(ranges) & (ranges > 0) & (ranges >= message.range_min)
         if message.range_max > message.range_min:
@@ -278,26 +256,27 @@ def _pose_of(position: Any, orientation: Any) -> FloatArray:
     return homogeneous(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
 
 
-def _motion_of(parent: str, rows: list[tuple[float, FloatArray]]) -> _Motion:
-    times, first = np.unique([time for time, _ in rows], return_index=True)
-    return _Motion(parent, times, np.array([rows[i][1] for i in first]))
-
-
-def _transforms(bag: _Bag, *, by_recording: bool) -> dict[str, _Motion]:
-    """Reads the motion of each frame in its parent, from /tf and /tf_static; of several parents, that of the most."""
+def _motions(bag: _Bag, topics: list[str], *, by_recording: bool) -> dict[str, _Motion]:
+    """Reads the motion of each frame in its parent by transforms or odometry; of several parents, that of the most."""
     rows: dict[tuple[str, str], list[tuple[float, FloatArray]]] = {}
-    for topic in bag.of_kinds(_TRANSFORMS):
+    for topic in topics:
         for recorded_s, message in bag.recorded(topic):
-            for each in message.transforms:
-                T = _pose_of(each.transform.translation, each.transform.rotation)
+            for each in getattr(message, "transforms", [message]):
+                if hasattr(each, "transform"):
+                    T = _pose_of(each.transform.translation, each.transform.rotation)
+                else:
+                    T = _pose_of(each.pose.pose.position, each.pose.pose.orientation)
                 ends = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
                 rows.setdefault(ends, []).append((recorded_s if by_recording else _stamp_of(each), T))
-    ordered = sorted(rows.items(), key=lambda entry: len(entry[1]))
-    return {child: _motion_of(parent, found) for (parent, child), found in ordered}
+    motions = {}
+    for (parent, child), found in sorted(rows.items(), key=lambda entry: len(entry[1])):
+        times, first = np.unique([time for time, _ in found], return_index=True)
+        motions[child] = _Motion(parent, times, np.array([found[i][1] for i in first]))
+    return motions
 
 
 def _odometry(
-    bag: _Bag, frame: str, times: FloatArray, *, by_recording: bool = False
+    bag: _Bag, frame: str, times: FloatArray, *, by_recording: bool
 ) -> tuple[FloatArray | None, bool, tuple[Note, ...]]:
     """Computes the odometry of the laser: the motion of the robot after the chain of constant transforms to the laser.
 
@@ -305,32 +284,27 @@ def _odometry(
         T_odom_laser at the times of the scans, None where the bag has no odometry; True where the laser is upside down;
         and notes.
     """
-    motions, T_top_laser, top = _transforms(bag, by_recording=by_recording), np.eye(4), frame
+    motions = _motions(bag, bag.of_kinds(_TRANSFORMS), by_recording=by_recording)
+    T_top_laser, top = np.eye(4), frame
     for _ in range(len(motions)):  # transforms may form a circle
         if top in motions and motions[top].is_constant and motions[top].parent not in _MAP_FRAMES:
             T_top_laser, top = motions[top].T_parent_child[0] @ T_top_laser, motions[top].parent
     topics, moving = bag.of_kinds(_ODOMETRY), motions.get(top)
     above = motions.get(moving.parent) if moving else None
     is_chain = above is not None and not above.is_constant and above.parent not in _MAP_FRAMES
+    what, is_upside_down = f"odometry of the transforms to {frame}", bool(T_top_laser[2, 2] < 0)
     if len(topics) == 1 and not is_chain:
         what = f"odometry of {topics[0]}"
-        poses = [
-            (recorded_s if by_recording else _stamp_of(message), message.pose.pose)
-            for recorded_s, message in bag.recorded(topics[0])
-        ]
-        found = _motion_of("odom", [(stamp, _pose_of(pose.position, pose.orientation)) for stamp, pose in poses])
-    elif moving is not None and not (is_chain or moving.is_constant or moving.parent in _MAP_FRAMES):
-        found, what = moving, f"odometry of the transforms to {frame}"
-    else:
-        text = (
-            f"{bag.path}: no odometry, of {len(topics)} topics ({', '.join(topics)}) and moving transforms to {frame}"
-        )
-        return None, bool(T_top_laser[2, 2] < 0), (Note(text, is_doubt=True),) if topics or is_chain else ()
-    is_near = (times >= found.times[0] - _SLACK_S) & (times <= found.times[-1] + _SLACK_S)
-    if len(found.times) < 2 or is_near.mean() < _LEAST_SHARE:
+        *_, moving = _motions(bag, topics, by_recording=by_recording).values()
+    elif moving is None or is_chain or moving.is_constant or moving.parent in _MAP_FRAMES:
+        found = f"no odometry, of {len(topics)} topics ({', '.join(topics)}) and moving transforms to {frame}"
+        notes = (Note(f"{bag.path}: {found}", is_doubt=True),) if topics or is_chain else ()
+        return None, is_upside_down, notes
+    is_near = (times >= moving.times[0] - _SLACK_S) & (times <= moving.times[-1] + _SLACK_S)
+    if len(moving.times) < 2 or is_near.mean() < _LEAST_SHARE:
         text = f"{bag.path}: the {what} is not of the times of the scans; it is not used"
-        return None, bool(T_top_laser[2, 2] < 0), (Note(text, is_doubt=True),)
-    T = np.asarray(interpolate_poses(found.times, found.T_parent_child, times) @ T_top_laser)
+        return None, is_upside_down, (Note(text, is_doubt=True),)
+    T = np.asarray(interpolate_poses(moving.times, moving.T_parent_child, times) @ T_top_laser)
     return T, bool(np.median(T[:, 2, 2]) < 0), (Note(f"{bag.path}: {what}"),)
 
 
@@ -350,25 +324,24 @@ def open_lidar_bag(path: Path, topic: str | None = None) -> LidarSequence:
         InputError: a damaged bag, or no topic of clouds, or several.
     """
     bag = _Bag(path)
-    chosen, kind = bag.choose(_CLOUDS, topic, "point clouds")
-    places, fault = bag.places(chosen)
-    notes = () if fault is None else (Note(f"{path}: {fault}; the order of the recording is used", is_doubt=True),)
+    chosen = bag.choose(_CLOUDS, topic, "point clouds")
+    places, notes = bag.places(chosen)
     times = np.array([place.stamp_ns for place in places], np.float64) * 1e-9
     sources = tuple(f"{path} {chosen} {index}" for index in range(len(places)))
 
     def read(index: int) -> TimedCloud:
         message = bag.read(chosen, places[index])
         with refusing(sources[index], "a broken message ({error})", "record the topic again", _KINDS):
-            cloud = _cloud_of(message, kind)
+            cloud = _cloud_of(message)
         return check_scan(cloud, sources[index])
 
     name = path.resolve().stem
     return LidarSequence(name, sources, lambda i: read(i).points, None, times, lambda i: read(i).times, notes)
 
 
-def _cloud_of(message: Any, kind: str) -> TimedCloud:
+def _cloud_of(message: Any) -> TimedCloud:
     """Reads the points of a PointCloud2 (any order and type of fields, padding), or of Livox's CustomMsg."""
-    if kind in _LIVOX_CLOUDS:
+    if hasattr(message, "points"):
         rows = [(point.x, point.y, point.z, point.offset_time) for point in message.points]
         table = np.array(rows, np.float64).reshape(-1, 4)
         return TimedCloud(to_float32(table[:, :3]), table[:, 3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,15 +16,8 @@ from dpmjax.sequences import FloatArray, Note, require
 POSE_FILES = ("poses_lidar.txt", "poses_lidar.npy", "poses.txt", "poses.npy", "trajectory.txt", "trajectory_tum.txt",
               "trajectory.npy", "gt_poses.txt", "groundtruth.txt", "groundtruth.csv", "poses.csv")  # fmt: skip
 _NUMBER = re.compile(r"\d+(?:\.\d+)?|\.\d+")
-# A number of that many digits is a time stamp: seconds since 1970, or a smaller unit.
-_STAMP_DIGITS = 10
 # Seconds since 1970 with nanoseconds as a number of their own.
 _SPLIT_STAMP = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})$")
-# Least ratio of the spreads of the steps of stamps of which one reading is wrong.
-_LEAST_SPREAD_RATIO = 2.0
-_LEAST_NUMBERED = 3
-# Number of listed kinds of names.
-_NUM_KINDS = 4
 
 
 def scan_files(folder: Path) -> list[Path]:
@@ -43,7 +35,7 @@ def scan_files(folder: Path) -> list[Path]:
 
 
 def folder_note(folder: Path) -> Note | None:
-    """Names files that are not read, of rarer endings or such as map.pcd, and scans whose names are of several kinds.
+    """Names files that are not read, of rarer endings, or such as map.pcd.
 
     Args:
         folder: folder of the scans.
@@ -53,17 +45,11 @@ def folder_note(folder: Path) -> Note | None:
     """
     most = _files_of_one_ending(folder, SCAN_SUFFIXES)
     strays, doubts = strays_among(most), []
-    read = {file.suffix.lower() for file in most}
     if strays:
         doubts.append(f"{strays[0].name} is no scan, as its name has no number; {len(strays)} such left out")
-    kinds = collections.Counter(_NUMBER.sub("*", _stem_of(file)) for file in most if file not in strays)
-    counts = [f"{count} {kind}" for kind, count in sorted(kinds.items()) if count > 1]
-    if len(counts) > 1:
-        listed = ", ".join(counts[:_NUM_KINDS])
-        doubts.append(f"names of {len(counts)} kinds, {listed}; give each lidar, and each drive, its own folder")
     for suffix in SCAN_SUFFIXES:
         others = _files_of_one_ending(folder, (suffix,))
-        if others and suffix not in read:
+        if others and not {*others} & {*most}:
             doubts.append(f"{len(others)} {suffix} left out beside {len(most)} {most[0].suffix}")
     return Note(f"{folder}: {'; '.join(doubts)}", is_doubt=True) if doubts else None
 
@@ -86,7 +72,6 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
 
     A number with a point is a decimal where the digits after the point differ in count and none of the longer ones ends
     in 0, as programs print them. Otherwise, both sides of the point are counted on their own, as of 1.9 and 1.10.
-    Seconds and nanoseconds without leading zeros are counted so too: their steps are even only in this way.
 
     Args:
         files: files in any order.
@@ -94,12 +79,10 @@ def sort_scans(files: Sequence[Path]) -> list[Path]:
     Returns:
         The files in order.
     """
-    numbers = [_NUMBER.findall(_stem_of(file)) for file in files]
-    fractions = [piece.partition(".")[2] for found in numbers for piece in found if "." in piece]
-    is_decimal = len({len(fraction) for fraction in fractions}) > 1 and not any(
-        len(fraction) > 1 and fraction.endswith("0") for fraction in fractions
-    )
-    if is_decimal and _counted_stamps([found[-1] if found else "" for found in numbers]) is None:
+    pieces = (piece for file in files for piece in _NUMBER.findall(_stem_of(file)))
+    fractions = {piece.partition(".")[2] for piece in pieces if "." in piece}
+    are_printed = not any(len(fraction) > 1 and fraction.endswith("0") for fraction in fractions)
+    if len({len(fraction) for fraction in fractions}) > 1 and are_printed:
         return sorted(files, key=lambda file: natural_key(_stem_of(file), _NUMBER.pattern))
     return sorted(files, key=lambda file: natural_key(file.name))
 
@@ -115,7 +98,7 @@ def strays_among(files: Sequence[Path]) -> list[Path]:
     """
     plain = [file for file in files if not re.search(r"\d", _stem_of(file))]
     num_numbered = len(files) - len(plain)
-    return plain if num_numbered >= max(_LEAST_NUMBERED, len(plain) + 1) else []
+    return plain if num_numbered >= max(3, len(plain) + 1) else []
 
 
 def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
@@ -131,29 +114,11 @@ def stamps_in_names(files: Sequence[Path]) -> FloatArray | None:
     """
     found = [_NUMBER.findall(_SPLIT_STAMP.sub(r"\1.\2", _stem_of(file))) for file in files]
     last = [numbers[-1] if numbers else "" for numbers in found]
-    if not last or not all("." in number or _STAMP_DIGITS <= len(number) < 20 for number in last):
+    # A number of ten digits is a time stamp: seconds since 1970, or a smaller unit.
+    if not last or not all("." in number or 10 <= len(number) < 20 for number in last):
         return None
-    counted = _counted_stamps(last)
-    stamps = np.array(last, np.float64) if counted is None else counted
+    stamps = np.array(last, np.float64)
     return stamps if bool((np.diff(stamps) > 0).all()) else None
-
-
-def _counted_stamps(numbers: Sequence[str]) -> FloatArray | None:
-    """Reads stamps whose nanoseconds have no leading zeros, so that 5.7 is 5 s and 7 ns.
-
-    Returns:
-        (n,) s; None where these are no such stamps, or where their steps are no more even than those of decimals.
-    """
-    pairs = [number.split(".") for number in numbers]
-    is_stamp = all(len(pair) == 2 and len(pair[0]) >= _STAMP_DIGITS for pair in pairs)
-    if len(pairs) < _LEAST_NUMBERED or not is_stamp:
-        return None
-    digits = max(len(fraction) for _, fraction in pairs)
-    readings = np.array(
-        [[f"{seconds}.{part.zfill(digits)}", f"{seconds}.{part}"] for seconds, part in pairs], np.float64
-    )
-    spread, spread_of_decimals = np.diff(np.sort(readings, axis=0), axis=0).std(axis=0)
-    return readings[:, 0] if _LEAST_SPREAD_RATIO * spread < spread_of_decimals else None
 
 
 def last_numbers(files: Sequence[Path]) -> list[int]:
@@ -168,7 +133,10 @@ def last_numbers(files: Sequence[Path]) -> list[int]:
     Raises:
         InputError: a name has no number, or one that is too large.
     """
-    found = [re.findall(r"[0-9]+", _stem_of(file))[-1:] for file in files]
-    bad = next((file for file, number in zip(files, found, strict=True) if not number or int(number[0]) > 2**62), None)
-    require(bad is None, bad or "", "a file name without a number of a scan", "keep the names of the data set")
-    return [int(number) for (number,) in found]
+    numbers = []
+    for file in files:
+        found = re.findall(r"[0-9]+", _stem_of(file))
+        is_good = bool(found) and int(found[-1]) <= 2**62
+        require(is_good, file, "a file name without a number of a scan", "keep the names of the data set")
+        numbers.append(int(found[-1]))
+    return numbers

@@ -20,14 +20,11 @@ from .poses import relative_pose_error as relative_pose_error
 from .poses import rotation_angle as rotation_angle
 from .sequences import corrected_ate as corrected_ate
 from .sequences import depth_errors as depth_errors
-from .sequences import distances_to_reference as distances_to_reference
 from .sequences import planar_errors as planar_errors
 from .sequences import reference_doubt as reference_doubt
 from .sequences import trajectory_errors as trajectory_errors
-from .statistics import Proportion as Proportion
 from .statistics import area_under_curve as area_under_curve
 from .statistics import brier_score as brier_score
 from .statistics import expected_calibration_error as expected_calibration_error
 from .statistics import mcnemar_p_value as mcnemar_p_value
 from .statistics import position_bound as position_bound
-from .statistics import wilson_interval as wilson_interval

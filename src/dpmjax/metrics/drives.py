@@ -15,9 +15,6 @@ from dpmjax.sequences import Relations
 from dpmjax.types import AnyArray
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-_OPPOSITE_COSINE = -0.5
-# Largest difference between the times of a scan and of a relation.
-_SAME_TIME_S = 0.005
 
 
 class SegmentError(NamedTuple):
@@ -105,21 +102,18 @@ def relation_errors(
         The errors.
 
     Raises:
-        ValueError: if no relation has its scans, or if the lengths differ.
+        ValueError: if no relation has its scans.
     """
-    if len(times) != len(poses):
-        raise ValueError(f"poses: expected {len(times)}, one for each time, got {len(poses)}")
     order = np.argsort(times, kind="stable")
-    rows, is_used = [], np.ones(len(relations.times_from), bool)
-    for wanted in (relations.times_from, relations.times_to):
-        after = np.clip(np.searchsorted(times[order], wanted), 1, max(len(times) - 1, 1))
-        pair = order[np.minimum(np.stack([after - 1, after]), len(times) - 1)]
-        nearest = np.take_along_axis(pair, np.abs(times[pair] - wanted).argmin(axis=0)[None], axis=0)[0]
-        is_used &= np.abs(times[nearest] - wanted) <= _SAME_TIME_S
-        rows.append(nearest)
+    # A scan belongs to the times that are nearer to it than to its neighbours.
+    middles = (times[order][1:] + times[order][:-1]) / 2
+    ends = (relations.times_from, relations.times_to)
+    first, second = (order[np.searchsorted(middles, wanted)] for wanted in ends)
+    off_s = [np.abs(times[rows] - wanted) for rows, wanted in zip((first, second), ends, strict=True)]
+    is_used = np.asarray(np.max(off_s, axis=0) <= 0.005)
     if not is_used.any():
         raise ValueError("relations: expected times of the scans, no relation has both of its scans")
-    found = se2.relative(poses[rows[0]], poses[rows[1]])[is_used]
+    found = se2.relative(poses[first], poses[second])[is_used]
     error = np.asarray(se2.relative(relations.T_from_to[is_used], found), np.float64)
     return RelationErrors(np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(se2.wrap_angle(error[:, 2]))), is_used)
 
@@ -175,7 +169,7 @@ def find_revisits(
         earlier = near[path[near] <= path[scan] - min_path_m]
         if len(earlier):
             nearest = earlier[np.argmin(np.linalg.norm(positions[earlier] - positions[scan], axis=1))]
-            is_revisit[scan], is_opposite[scan] = True, forward[scan] @ forward[nearest] < _OPPOSITE_COSINE
+            is_revisit[scan], is_opposite[scan] = True, forward[scan] @ forward[nearest] < -0.5  # cosine of 120 degrees
     return Revisits(is_revisit, is_opposite)
 
 

@@ -2,7 +2,7 @@
 
 Lengths keep their unit; angles are radians. Poses are `T_world_scan`, (n, d+1, d+1) with d = 2 or 3.
 NumPy arrays give float64 results. If one array is a JAX array, the result is a JAX array of its dtype, and the function
-is traceable: `jit`, `vmap`, `grad` with a finite gradient everywhere. The recall takes NumPy arrays only.
+is traceable: `jit`, `vmap`, `grad` with a finite gradient everywhere. The recall and `align_poses` work in NumPy only.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def align_rigid(
 
 def align_poses(
     T_estimated: Float[AnyArray, "n 4 4"], T_reference: Float[AnyArray, "n 4 4"], *, lever: float
-) -> Float[AnyArray, "4 4"]:
+) -> Float[np.ndarray, "4 4"]:
     """Computes the rigid motion, without scale, that brings estimated poses closest to the reference ones.
 
     The positions and the ends of levers along the axes of each pose are aligned. So positions on one line leave no
@@ -97,13 +97,10 @@ def align_poses(
     Raises:
         ValueError: the shapes differ, or a number is not finite.
     """
-    xp = namespace_of(T_estimated, T_reference)
-    poses = checked_poses(xp, T_estimated=T_estimated, T_reference=T_reference)
-    first_estimated, first_reference = (T[:1, :3, 3] for T in poses)
-    arms = (lever * xp.concatenate([-xp.eye(3), xp.eye(3)])).astype(poses[0].dtype)
-    ends = [_transform(_moved(T, -T[:1, :3, 3]), xp.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses]
-    aligned = align_rigid(*ends)
-    return _moved(aligned, (first_reference - matmul(first_estimated, aligned[:3, :3].T))[0])
+    poses = checked_poses(T_estimated=T_estimated, T_reference=T_reference)
+    arms = lever * np.concatenate([-np.eye(3), np.eye(3)])
+    ends = (_transform(T, np.broadcast_to(arms, (len(T), 6, 3))).reshape(-1, 3) for T in poses)
+    return np.asarray(align_rigid(*ends))
 
 
 def absolute_trajectory_error(

@@ -18,14 +18,10 @@ from dpmjax.metrics.poses import (
 )
 from dpmjax.sequences import DepthSequence, FloatArray, LidarSequence, ScanSequence
 
-# Least number of common scans of a recording and its corrected log.
-_MIN_COMMON = 10
 # Typical ranges that a radian equals in the alignment of cameras, for positions on a line.
 _LEVER = 0.1
 # Largest ratio of the lengths of trajectory and reference, and the least length that is compared, metres.
 _MAX_LENGTH_RATIO, _MIN_WAY_M = 30.0, 1.0
-# Share of the error of the reference, below which the error of its inverse makes the reference doubtful.
-_INVERTED_SHARE = 0.2
 
 
 def planar_errors(sequence: ScanSequence, poses: FloatArray) -> dict[str, float]:
@@ -38,17 +34,16 @@ def planar_errors(sequence: ScanSequence, poses: FloatArray) -> dict[str, float]
     Returns:
         The numbers by name; empty without a reference.
     """
-    reference = sequence.reference_poses
+    reference, unit = sequence.reference_poses, sequence.unit
     if reference is None:
         return {}
     matrices = geometry.se2.to_matrix(poses), geometry.se2.to_matrix(reference)
-    distance = point_distance(sequence.points, sequence.mask, *matrices)
     T_reference_world = np.asarray(align_rigid(poses[:, :2], reference[:, :2]))
     off = poses[:, :2] @ T_reference_world[:2, :2].T + T_reference_world[:2, 2] - reference[:, :2]
     return {
-        f"ate_{sequence.unit}": float(absolute_trajectory_error(poses[:, :2], reference[:, :2])),
-        f"worst_scan_{sequence.unit}": float(np.hypot(*off.T).max()),
-        f"point_distance_{sequence.unit}": float(distance),
+        f"ate_{unit}": float(absolute_trajectory_error(poses[:, :2], reference[:, :2])),
+        f"worst_scan_{unit}": float(np.hypot(*off.T).max()),
+        f"point_distance_{unit}": float(point_distance(sequence.points, sequence.mask, *matrices)),
     }
 
 
@@ -69,9 +64,8 @@ def corrected_ate(times: FloatArray, poses: FloatArray, corrected: ScanSequence)
     if corrected.reference_poses is None or corrected.times is None:
         raise ValueError(f"{corrected.name}: has no corrected poses with times")
     _, mine, theirs = np.intersect1d(np.round(times, 3), np.round(corrected.times, 3), return_indices=True)
-    if len(mine) < _MIN_COMMON:
-        found = f"{len(mine)} scans have the time of a scan of the recording, not {_MIN_COMMON}"
-        raise ValueError(f"{corrected.name}: {found}")
+    if len(mine) < 10:
+        raise ValueError(f"{corrected.name}: {len(mine)} scans have the time of a scan of the recording, not 10")
     return float(absolute_trajectory_error(poses[mine, :2], corrected.reference_poses[theirs, :2]))
 
 
@@ -91,16 +85,15 @@ def depth_errors(sequence: DepthSequence, T_world_camera: FloatArray) -> dict[st
     count = len(sequence)
     points, mask = sequence.points.reshape(count, -1, 3), sequence.mask.reshape(count, -1)
     lever = _LEVER * geometry.typical_range(points, mask)
-    T_reference_world = np.asarray(align_poses(T_world_camera, reference, lever=lever))
-    aligned = T_reference_world @ T_world_camera
+    aligned = align_poses(T_world_camera, reference, lever=lever) @ T_world_camera
     off = np.einsum("nij,nbj->nbi", aligned[:, :3, :3] - reference[:, :3, :3], points)
     off += aligned[:, None, :3, 3] - reference[:, None, :3, 3]
-    turns = [Rotation.from_matrix(T[:, :3, :3]) for T in (T_world_camera, reference)]
-    steps = [turn[:-1].inv() * turn[1:] for turn in turns]
+    moved, true = (Rotation.from_matrix(T[:, :3, :3]) for T in (T_world_camera, reference))
+    turn_errors = (true[:-1].inv() * true[1:]).inv() * (moved[:-1].inv() * moved[1:])
     return {
         "ate_m": float(absolute_trajectory_error(T_world_camera[:, :3, 3], reference[:, :3, 3])),
         "point_distance_m": float(np.linalg.norm(off, axis=-1)[mask].mean()),
-        "largest_turn_error_deg": float(np.degrees((steps[1].inv() * steps[0]).magnitude().max())),
+        "largest_turn_error_deg": float(np.degrees(turn_errors.magnitude().max())),
     }
 
 
@@ -112,8 +105,7 @@ def trajectory_errors(T_world_scan: FloatArray, reference: FloatArray | None, su
     T_world_scan, reference = T_world_scan[has_reference], reference[has_reference]
     if len(T_world_scan) < 2:
         return {}
-    relative = relative_pose_error(T_world_scan, reference)
-    segments = segment_error(T_world_scan, reference)
+    relative, segments = relative_pose_error(T_world_scan, reference), segment_error(T_world_scan, reference)
     return {
         f"ate{suffix}_m": float(absolute_trajectory_error(T_world_scan[:, :3, 3], reference[:, :3, 3])),
         f"rpe{suffix}_m": float(relative.translation_rmse),
@@ -135,19 +127,7 @@ def reference_doubt(T_world_scan: FloatArray, sequence: LidarSequence) -> str | 
         return f"the reference is {reference_m:.3g} m long, the trajectory {way_m:.3g} m: is the reference in metres?"
     references = reference, geometry.rigid.inverse(reference)
     given, inverted = (relative_pose_error(T, poses).translation_rmse for poses in references)
-    if inverted < _INVERTED_SHARE * given:
+    if inverted < 0.2 * given:
         errors = f"RPE {given:.3g} m; with each pose inverted it would be {inverted:.3g} m"
         return f"{errors}: does the reference map the world to the lidar, not the lidar to the world?"
     return None
-
-
-def distances_to_reference(T_world_scan: FloatArray, reference: FloatArray | None) -> FloatArray | None:
-    """Returns the distance of each scan to the reference after the best rigid alignment; NaN for scans without one."""
-    if reference is None:
-        return None
-    has_reference = np.isfinite(reference.reshape(-1, 16)).all(axis=1)
-    if not has_reference.any():
-        return None
-    T = align_rigid(T_world_scan[has_reference, :3, 3], reference[has_reference, :3, 3])
-    moved = T_world_scan[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
-    return np.asarray(np.linalg.norm(moved - reference[:, :3, 3], axis=1))

@@ -1,64 +1,14 @@
-"""Statistics: intervals and comparisons of shares, quality of probabilities, the Cramér-Rao bound of positions."""
+"""Statistics: comparisons of shares, quality of probabilities, the Cramér-Rao bound of positions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.types import AnyArray
-
-# Beams whose range changes faster than this jump between obstacles.
-_STEEPEST = 10.0
-# Half steps of the numeric derivatives of ranges by x and y, half a pixel in a world of pixels, and by the heading.
-_HALF_STEPS = (0.5, 0.5, 1e-3)
-# Number of bins of probabilities.
-_NUM_BINS = 10
-
-
-class Proportion(NamedTuple):
-    """A share with its confidence interval.
-
-    Attributes:
-        share: right answers divided by all answers; NaN without any answer.
-        low: lower end of the interval.
-        high: upper end of the interval.
-    """
-
-    share: float
-    low: float
-    high: float
-
-
-def wilson_interval(num_right: int, num_all: int, *, confidence: float = 0.95) -> Proportion:
-    """Returns a share with Wilson's score interval (Wilson 1927, "Probable Inference", eq. 4).
-
-    The interval stays within 0 and 1, and has a positive width also where none or all of the answers are right.
-
-    Args:
-        num_right: number of right answers.
-        num_all: number of answers; without any, the share is NaN and the interval is 0 to 1.
-        confidence: probability that the interval covers the true share.
-
-    Returns:
-        The share and its interval.
-
-    Raises:
-        ValueError: the numbers are not 0 <= num_right <= num_all, or the confidence is not between 0 and 1.
-    """
-    from scipy import stats
-
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence: expected a number between 0 and 1, got {confidence}")
-    if num_all == 0:
-        return Proportion(np.nan, 0.0, 1.0)
-    if not 0 <= num_right <= num_all:
-        raise ValueError(f"num_right: expected 0 to {num_all}, got {num_right}")
-    low, high = stats.binomtest(num_right, num_all).proportion_ci(confidence, method="wilson")
-    return Proportion(num_right / num_all, float(low), float(high))
 
 
 def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray, " n"]) -> float:
@@ -73,15 +23,10 @@ def mcnemar_p_value(is_right_a: Bool[AnyArray, " n"], is_right_b: Bool[AnyArray,
 
     Returns:
         Probability, two-sided, that two equally good methods differ at least as much; 1 where no answer differs.
-
-    Raises:
-        ValueError: the shapes are not the same (n,).
     """
     from scipy import stats
 
     a, b = np.asarray(is_right_a, bool), np.asarray(is_right_b, bool)
-    if a.ndim != 1 or a.shape != b.shape:
-        raise ValueError(f"expected two arrays of the same shape (n,), got {a.shape} and {b.shape}")
     num_differ = int((a != b).sum())
     return float(stats.binomtest(int((a & ~b).sum()), num_differ).pvalue) if num_differ else 1.0
 
@@ -99,12 +44,10 @@ def area_under_curve(score: Float[AnyArray, " n"], is_positive: Bool[AnyArray, "
     from scipy import stats
 
     scores, labels = np.asarray(score, np.float64), np.asarray(is_positive, bool)
-    positive, negative = scores[labels], scores[~labels]
-    if min(len(positive), len(negative)) == 0:
-        return float("nan")
+    num_pairs = int(labels.sum() * (~labels).sum())
     # Mann and Whitney's U counts the pairs in which the positive example scores higher.
-    num_pairs = len(positive) * len(negative)
-    return float(stats.mannwhitneyu(positive, negative, method="asymptotic").statistic / num_pairs)
+    u = stats.mannwhitneyu(scores[labels], scores[~labels], method="asymptotic").statistic if num_pairs else np.nan
+    return float(u / max(num_pairs, 1))
 
 
 def brier_score(probability: Float[AnyArray, " n"], is_true: Bool[AnyArray, " n"]) -> float:
@@ -133,8 +76,7 @@ def expected_calibration_error(probability: Float[AnyArray, " n"], is_true: Bool
         calibrated forecast; NaN without events.
     """
     probabilities, labels = np.asarray(probability, np.float64), np.asarray(is_true, np.float64)
-    bins = np.minimum((probabilities * _NUM_BINS).astype(int), _NUM_BINS - 1)
-    gaps = np.bincount(bins, probabilities - labels, _NUM_BINS)
+    gaps = np.bincount(np.minimum((probabilities * 10).astype(int), 9), probabilities - labels)
     return float(np.abs(gaps).sum() / len(labels)) if len(labels) else float("nan")
 
 
@@ -156,15 +98,16 @@ def position_bound(
         (n,) root of the summed variances of x and y; infinite where the scan leaves a direction open.
     """
     at = np.asarray(poses, np.float64).reshape(-1, 3)
-    steps = np.diag(_HALF_STEPS)
+    # Half a pixel in a world of pixels, and a thousandth of a radian.
+    steps = np.diag([0.5, 0.5, 1e-3])
     jacobian = np.stack([(cast_ranges(at + d) - cast_ranges(at - d)) / (2.0 * d.sum()) for d in steps], axis=-1)
-    # One radian of heading moves the end of a beam by the length of the beam.
+    # Beams whose range changes faster than ten times the motion of their end jump between obstacles; a radian of
+    # heading moves the end of a beam by the length of the beam.
     ranges = cast_ranges(at)
     steepness = np.abs(jacobian) / np.stack([np.ones_like(ranges), np.ones_like(ranges), ranges], axis=-1)
-    used = jacobian * (steepness < _STEEPEST).all(axis=-1, keepdims=True)
+    used = jacobian * (steepness < 10.0).all(axis=-1, keepdims=True)
     information = np.einsum("nbi,nbj->nij", used, used) / range_noise**2
     bound = np.full(len(at), np.inf)
     is_held = np.linalg.eigvalsh(information)[:, 0] > 1e-9 / range_noise**2
-    covariance = np.linalg.inv(information[is_held])
-    bound[is_held] = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+    bound[is_held] = np.sqrt(np.trace(np.linalg.inv(information[is_held])[:, :2, :2], axis1=1, axis2=2))
     return bound

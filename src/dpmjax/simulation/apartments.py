@@ -24,15 +24,10 @@ _KINDS, _KIND_SHARES = ("cupboard", "table", "picture", "shelf", "bench"), (0.26
 _Box = tuple[list[float], list[float], float]  # centre, half sizes, yaw
 # DeepMapping section 4.2: distance of places, angle between views, share of the steps that are moves instead of turns.
 _GRID_M, _TURN_DEG, _MOVE_SHARE = 0.3, 30.0, 0.5
-# Share of the turns with the opposite sign of the turn before.
-_REVERSAL_SHARE = 0.2
 
 _CLEARANCE_M, _FREE_CLEARANCE_M = 0.2, 0.1  # Places keep these distances from walls and furniture; after jitter.
-_FARTHEST_M = 6.0  # Deeper pixels are masked.
 # Walks that move and turn at once: share of the steps with a move, and with a turn; standard deviations.
 _BOTH_SHARE, _JITTER_M, _JITTER_DEG = 0.8, 0.05, 5.0
-
-_MAX_WALKS = 1000
 
 
 @dataclass(frozen=True)
@@ -140,16 +135,7 @@ def _place_furniture(rng: np.random.Generator, size: tuple[float, float], doorwa
         yaw = np.pi / 2
     if np.linalg.norm(place - [wall_x, door_z]) < _DOOR_M + 0.3 and kind != "picture":
         return []
-    return _build_furniture(rng, kind, place, (width, depth, yaw))
-
-
-def _build_furniture(
-    rng: np.random.Generator, kind: str, place: FloatArray, footprint: tuple[float, float, float]
-) -> list[_Box]:
-    """Builds the boxes of a piece; the footprint is width, depth and yaw."""
     floor, ceiling = _CAMERA_HEIGHT_M, _CAMERA_HEIGHT_M - _ROOM_HEIGHT_M
-    width, depth, yaw = footprint
-    x, z = place
     if kind == "cupboard":
         height = rng.uniform(0.7, 2.1)
         parts = [(floor - height / 2, [width / 2, height / 2, depth / 2])]
@@ -164,7 +150,7 @@ def _build_furniture(
         parts = [(floor - 0.22, [width / 2, 0.22, depth / 2]), (floor - back / 2, [width / 2, back / 2, 0.05])]
     else:
         parts = [(floor - 0.74, [width / 2 + 0.2, 0.03, depth / 2 + 0.15]), (floor - 0.37, [0.1, 0.37, 0.1])]
-    return [([x, y, z], half, yaw) for y, half in parts]
+    return [([place[0], y, place[1]], half, yaw) for y, half in parts]
 
 
 @jax.jit
@@ -271,7 +257,7 @@ def simulate_depth_sequence(
     boxes = (np.pad(home.centres, ((0, spare), (0, 0))), np.pad(home.half_sizes, ((0, spare), (0, 0))))
     cast = jax.vmap(cast_depth, in_axes=(0, None, None, None, None))
     depth = np.asarray(cast(T_world_camera, rays, *boxes, np.pad(home.yaws, (0, spare))), np.float64)
-    mask = np.isfinite(depth) & (depth <= _FARTHEST_M) & (depth > 0.05)
+    mask = np.isfinite(depth) & (depth <= 6.0) & (depth > 0.05)
     depth = np.where(mask, depth, 0.0)
     depth += config.depth_noise_m * depth**2 * rng.standard_normal(depth.shape)
     mask &= rng.random(depth.shape) >= config.dropout_share * (depth / 3.0) ** 2
@@ -281,7 +267,7 @@ def simulate_depth_sequence(
 
 def _wide_walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.random.Generator) -> FloatArray:
     """Draws walks until one is wide enough."""
-    for _ in range(_MAX_WALKS):
+    for _ in range(1000):
         poses = _walk(home, num_views, config, rng)
         spread_m = np.sqrt(np.mean(np.sum((poses[:, :2] - poses[:, :2].mean(axis=0)) ** 2, axis=1)))
         if spread_m >= config.min_spread_m:
@@ -305,15 +291,14 @@ def _walk(home: Apartment, num_views: int, config: DepthWalkConfig, rng: np.rand
         neighbours = at + np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         inside = ((neighbours >= 0) & (neighbours < is_free.shape)).all(1)
         reachable = [place for place in neighbours[inside] if is_free[tuple(place)]]
-        if config.steps == "one":
-            does_move = bool(reachable) and rng.random() < _MOVE_SHARE
-            does_turn = not does_move
-        else:
-            does_move, does_turn = bool(reachable) and rng.random() < _BOTH_SHARE, rng.random() < _BOTH_SHARE
+        share = _MOVE_SHARE if config.steps == "one" else _BOTH_SHARE
+        does_move = bool(reachable) and rng.random() < share
+        does_turn = not does_move if config.steps == "one" else rng.random() < share
         if does_move:
             at = reachable[rng.integers(len(reachable))]
         if does_turn:
-            turn_sign = -turn_sign if rng.random() < _REVERSAL_SHARE else turn_sign
+            # Every fifth turn changes its sign.
+            turn_sign = -turn_sign if rng.random() < 0.2 else turn_sign
             view += turn_sign
     drawn = np.array(poses)
     if config.steps == "one":

@@ -18,11 +18,6 @@ from dpmjax.simulation.town.primitives import CELL_M, Ground, RoadUsers, TownPri
 _Put = Callable[[Collection, np.random.Generator, Place], None]
 KINDS = ("office", "hall", "flat", "corridor", "tunnel", "garage", "stairs")
 _THICKNESS_M = 0.12
-_DOOR_M = 2.1  # Height of a door.
-_CLEARANCE_M = 0.45  # Nothing stands nearer than this to the route.
-_PILLAR_CLEARANCE_M = 0.2
-_MARGIN_M = 20.0
-_BUILDING_STREAM = 8160
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,7 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
         ValueError: a negative seed.
     """
     require_value(seed >= 0, "seed", "zero or more", seed)
-    rng = np.random.default_rng([_BUILDING_STREAM, seed])
+    rng = np.random.default_rng([8160, seed])
     plan = make_plan(rng, config.kind)
     route = make_route(rng, plan, config.route_length_m)
     into = Collection()
@@ -93,14 +88,11 @@ def make_building(seed: int, config: BuildingConfig = BuildingConfig()) -> Build
             _furniture(into, rng, room, route, is_hall=config.kind == "hall")
     none, lanes = jnp.zeros(64), jnp.zeros(64, jnp.int32)
     nobody = RoadUsers(jnp.zeros((2, 64, 3)), jnp.ones(2), lanes, none, none, none, jnp.zeros((64, 3)), none > 0)
-    whole = TownPrimitives(*into.packed(), _floor(plan), nobody)
-    return Building(f"{config.kind}-{seed}", plan, route, whole)
-
-
-def _floor(plan: Plan) -> Ground:
-    low = np.min([room.low for room in plan.rooms], axis=0) - _MARGIN_M
+    low = np.min([room.low for room in plan.rooms], axis=0) - 20.0
     heights = np.tile(plan.floor_at(low[0] + CELL_M * np.arange(256)), (256, 1))
-    return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
+    floor = Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(low, jnp.float32), jnp.float32(CELL_M))
+    whole = TownPrimitives(*into.packed(), floor, nobody)
+    return Building(f"{config.kind}-{seed}", plan, route, whole)
 
 
 def _place(x: float, y: float, heading: float = 0.0) -> Place:
@@ -117,7 +109,8 @@ def _walls(into: Collection, rng: np.random.Generator, room: Room, doors: list[D
             start, across = room.low[1 - axis], at + 0.5 * inwards * _THICKNESS_M
             for middle, width in cuts:
                 _wall(into, axis, across, (start, middle - 0.5 * width), (-0.5, room.height), depth)
-                _wall(into, axis, across, (middle - 0.5 * width, middle + 0.5 * width), (_DOOR_M, room.height), 0.0)
+                # Doors are 2.1 m high.
+                _wall(into, axis, across, (middle - 0.5 * width, middle + 0.5 * width), (2.1, room.height), 0.0)
                 start = middle + 0.5 * width
             _wall(into, axis, across, (start, room.high[1 - axis]), (-0.5, room.height), depth)
 
@@ -156,7 +149,7 @@ def _fittings(into: Collection, rng: np.random.Generator, room: Room, route: Flo
                 continue
             place = _place(x + rng.normal(0, jitter), y)
             beside = np.abs(route - [place.x, place.y]) - [0.5 * wide, 0.5 * deep]
-            if np.max(beside, axis=1).min() > _PILLAR_CLEARANCE_M:
+            if np.max(beside, axis=1).min() > 0.2:
                 put_box(into, place, (wide, deep), (0.0, high))
     for _ in range(rng.poisson(0.04 * room.size[0])):
         y = float(rng.choice([room.low[1] + 0.45, room.high[1] - 0.45]))
@@ -225,7 +218,8 @@ def _put_if_free(
     part = Collection()
     puts[int(rng.integers(len(puts)))](part, rng, _place(spot[0][0], spot[0][1], spot[1]))
     rows = np.array([*part.boxes, *part.cylinders, *part.spheroids])
-    reach = np.hypot(rows[:, 3], rows[:, 4]) + _CLEARANCE_M
+    # Nothing stands nearer than 0.45 m to the route.
+    reach = np.hypot(rows[:, 3], rows[:, 4]) + 0.45
     apart = np.linalg.norm(rows[:, None, :2] - route[None, ::3], axis=-1).min(1)
     if (apart > reach).all():
         into.boxes += part.boxes

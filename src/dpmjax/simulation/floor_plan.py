@@ -10,8 +10,6 @@ from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town.streets import resample, smooth
 
 _STEP_M = 0.1
-_CORNER_M = 0.25
-_DOORSTEP_M = 0.8
 
 
 @dataclass(frozen=True)
@@ -183,11 +181,11 @@ def make_route(rng: np.random.Generator, plan: Plan, length: float) -> FloatArra
         number, door = others[rng.integers(len(others))]
         last, there = number, door.rooms[0] if door.rooms[1] == here else door.rooms[1]
         towards = np.sign(np.mean([plan.rooms[there].low, plan.rooms[there].high], axis=0) - door.place)
-        step = _DOORSTEP_M * towards * (np.arange(2) == door.axis)
+        step = 0.8 * towards * (np.arange(2) == door.axis)
         points += [np.array(door.place) - step, np.array(door.place) + step, *_round(rng, plan.rooms[there])]
         here = there
     path = resample(np.array(points), _STEP_M)
-    return resample(smooth(path, _CORNER_M / _STEP_M, is_closed=False), _STEP_M)
+    return resample(smooth(path, 0.25 / _STEP_M, is_closed=False), _STEP_M)
 
 
 def _round(rng: np.random.Generator, room: Room) -> list[FloatArray]:

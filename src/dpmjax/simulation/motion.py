@@ -16,17 +16,9 @@ from dpmjax.simulation.town.streets import arc_lengths, at_way, lane_of, on_path
 
 _WHEELBASE_M = 2.7
 _TRACK_M = 1.6
-_SHAKE_DEG = 0.25  # Standard deviation of fast roll and pitch.
-_SWAY_M = 0.15  # Standard deviation of the distance to the middle of the lane.
 _TURN_S = 0.1
-_DRIVE_STREAM, _WALK_STREAM = 8151, 8161
 _LOOK_AHEAD_M = 0.8
-_STEPS_PER_S = 1.8
-_SINK = 2.5  # Ratio of slow changes of the height to those of a step.
 _SPEED_M_S = 1.0
-# For a person and for a robot: standard deviation of the angle between the sensor's x and the direction of motion,
-# degrees, and vertical amplitude of a step, m.
-_PERSON, _ROBOT = (25.0, 0.03), (3.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -100,7 +92,7 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     Returns:
         The drive. A drive once round a closed route ends one step before the place where it began.
     """
-    rng = np.random.default_rng([_DRIVE_STREAM, seed])
+    rng = np.random.default_rng([8151, seed])
     lane = lane_of(town.streets, is_reversed=config.is_reversed)
     whole = arc_lengths(lane)[-1]
     is_closed = town.streets.is_closed
@@ -112,7 +104,8 @@ def drive(town: Town, config: DriveConfig = DriveConfig(), *, seed: int = 0) -> 
     # Of unit variance, and changing over tens of metres.
     phases, waves = rng.uniform(0, 2 * np.pi, 3), 2 * np.pi / np.array([31.0, 53.0, 97.0])
     sway = np.sqrt(2 / 3) * np.sin(way[:, None] * waves + phases).sum(1)
-    places = at_way(lane, way) + (_SWAY_M * sway)[:, None] * left
+    # The car keeps to the middle of its lane within 0.15 m.
+    places = at_way(lane, way) + (0.15 * sway)[:, None] * left
     return TimedPoses(_poses(town, places, along, left, config, rng), times)
 
 
@@ -144,7 +137,8 @@ def _poses(
 ) -> FloatArray:
     """Computes sensor poses with pitch and roll from the ground under the axles, and small vibrations."""
     height = town.terrain.height_at
-    shake = np.radians(_SHAKE_DEG) * rng.normal(size=(2, len(places)))
+    # Fast roll and pitch.
+    shake = np.radians(0.25) * rng.normal(size=(2, len(places)))
     half = 0.5 * _WHEELBASE_M
     climb = (height(places + half * along) - height(places - half * along)) / _WHEELBASE_M + shake[0]
     bank = (height(places + 0.5 * _TRACK_M * left) - height(places - 0.5 * _TRACK_M * left)) / _TRACK_M + shake[1]
@@ -191,8 +185,9 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     Returns:
         Poses and times; z is up, and the floor begins at z = 0.
     """
-    rng = np.random.default_rng([_WALK_STREAM, seed])
-    route, (look_deg, bob_m) = building.route, _ROBOT if config.is_robot else _PERSON
+    rng = np.random.default_rng([8161, seed])
+    # A robot looks ahead and rolls; a person looks around and bobs by the amplitude of a step.
+    route, (look_deg, bob_m) = building.route, (3.0, 0.0) if config.is_robot else (25.0, 0.03)
     times = np.arange(0.0, arc_lengths(route)[-1] / _SPEED_M_S, 1.0 / config.rate_hz)
     way = times * _SPEED_M_S
     # People begin to turn before they reach a corner.
@@ -201,7 +196,8 @@ def walk(building: Building, config: WalkConfig = WalkConfig(), *, seed: int = 0
     yaw = np.arctan2(facing[:, 1], facing[:, 0]) + np.radians(look_deg) * _slow_sway(rng, times)
     tilt = np.radians(config.tilt_deg) * np.column_stack([_slow_sway(rng, times), _slow_sway(rng, times)])
     turns = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix()
-    places, steps = at_way(route, way), np.sin(2 * np.pi * _STEPS_PER_S * times) + _SINK * _slow_sway(rng, times)
+    # A person takes 1.8 steps a second, and sinks and rises slowly by 2.5 times as much.
+    places, steps = at_way(route, way), np.sin(2 * np.pi * 1.8 * times) + 2.5 * _slow_sway(rng, times)
     heights = building.plan.floor_at(places[:, 0]) + config.height_m + bob_m * steps
     return TimedPoses(homogeneous(turns, np.column_stack([places, heights])), times)
 

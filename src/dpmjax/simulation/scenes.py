@@ -20,7 +20,6 @@ from dpmjax.simulation.town.kinds import KINDS as OUTDOOR_KINDS
 from dpmjax.simulation.town.make import Town, TownConfig, make_town
 from dpmjax.simulation.town.scan import HDL32E, HDL64E, OS1_64, OS1_128, PANDAR64, SOLID_STATE, VLP16, LidarSensor
 
-_SCENE_STREAM = 8170
 _Entry = TypeVar("_Entry")
 _ROUTES = ("loop", "there_and_back", "wander")
 
@@ -127,7 +126,7 @@ def draw_scene(seed: int, mixture: SceneMixture = SceneMixture()) -> Scene:
         ValueError: a negative seed.
     """
     require_value(seed >= 0, "seed", "zero or more", seed)
-    rng = np.random.default_rng([_SCENE_STREAM, seed])
+    rng = np.random.default_rng([8170, seed])
     kind, sensor = _choice(rng, mixture.kinds), _choice(rng, mixture.sensors)
     # Also drawn outdoors, where the scale is 1, so that later draws of a seed are the same.
     scale = float(np.exp(rng.uniform(*np.log(mixture.indoor_scale if kind in INDOOR_KINDS else (1.0, 1.0)))))

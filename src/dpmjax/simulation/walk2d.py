@@ -1,4 +1,4 @@
-"""Walks of the robot and of people through a planar world, and scans on the way (DeepMapping section 4.1).
+"""Walks of the robot through a planar world, and scans on the way (DeepMapping section 4.1).
 
 The lidar has a view of 360 degrees, so the robot may move in any direction. Steps follow the route, and the heading
 turns by an independent uniform angle, so that the step statistics of the paper hold exactly.
@@ -20,11 +20,8 @@ from dpmjax.simulation.world2d import World, beam_angles, cast_scans, largest_re
 # this mean; steps are uniform between 0.6 and 1.4 of it.
 _MAX_ROTATION_DEG, _MEAN_STEP_PX = 10.0, 8.16
 _CLEARANCE_PX = 8.0  # No point of the path comes closer to an obstacle or to the border of the image.
-_LEG_PX = 260.0  # Wanted length of a leg to a new place; after two legs the robot comes home by another way.
 _CELL_PX = 8  # Raster of the route planner.
-_PLAN_MARGIN_PX = 8.0  # Additional clearance of routes.
 _LOOKAHEAD_PX = 36.0
-_PERSON_PX = 11.0  # Radius of a person; people nearer to the sensor than two of it are left out of the scan.
 
 
 def simulate_trajectory(world: World, num_poses: int, *, rng: np.random.Generator) -> FloatArray:
@@ -92,7 +89,7 @@ def _clearance(is_obstacle: BoolArray) -> FloatArray:
 def _plan_route(clearance: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:
     """Plans raster points (k, 2) of a route of at least the wanted length, every third leg back to its start."""
     coarse = clearance[_CELL_PX // 2 :: _CELL_PX, _CELL_PX // 2 :: _CELL_PX]
-    cells = np.argwhere(largest_region(coarse >= _CLEARANCE_PX + _PLAN_MARGIN_PX))
+    cells = np.argwhere(largest_region(coarse >= _CLEARANCE_PX + 8.0))
     if len(cells) < 2:
         raise ValueError("world is too narrow to move in: no connected free space with the wanted clearance")
     centres = (cells[:, ::-1].astype(np.float64) + 0.5) * _CELL_PX
@@ -136,7 +133,8 @@ def _shortest_paths(
 
 def _choose_goal(cost: FloatArray, visits: FloatArray, rng: np.random.Generator) -> int:
     """Chooses the least visited of several cells about a leg away."""
-    off = np.abs(cost / (1.5 * _LEG_PX) - 1.0)
+    # After two legs of about 260 px the robot comes home by another way.
+    off = np.abs(cost / (1.5 * 260.0) - 1.0)
     near_enough = np.flatnonzero((off <= max(0.4, float(np.partition(off, 1)[1]))) & (cost > 0))
     options = rng.choice(near_enough, size=min(8, len(near_enough)), replace=False)
     return int(options[np.argmin(visits[options])])
@@ -190,46 +188,6 @@ def _is_clear(start: FloatArray, end: FloatArray, clearance: FloatArray) -> bool
     return bool((clearance[samples[:, 1], samples[:, 0]] >= _CLEARANCE_PX + 0.25).all())
 
 
-def simulate_people(world: World, num_scans: int, *, rng: np.random.Generator) -> FloatArray:
-    """Simulates the walks of the people of a world, with the speed and the rules of the robot.
-
-    Args:
-        world: world with a number of people.
-        num_scans: number of scans.
-        rng: source of all choices.
-
-    Returns:
-        (num_people, num_scans, 2) x, y in px in the frame of the world.
-    """
-    walks = [simulate_trajectory(world, num_scans, rng=stream)[:, :2] for stream in rng.spawn(world.num_people)]
-    return np.array(walks, np.float64).reshape(world.num_people, num_scans, 2)
-
-
-def stop_at_people(ranges: FloatArray, poses: FloatArray, angles: FloatArray, people: FloatArray) -> FloatArray:
-    """Shortens the beams that hit a person before the world.
-
-    Args:
-        ranges: (n, b) ranges in the world without people, px.
-        poses: (n, 3) x, y, heading of the sensor.
-        angles: (b,) angles of the beams in the sensor frame, radians.
-        people: (p, n, 2) centres of the people, px.
-
-    Returns:
-        (n, b) px.
-    """
-    heading = poses[:, 2:] + angles
-    beams = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    for centres in people:
-        to_person = centres - poses[:, :2]
-        along = np.einsum("nbk,nk->nb", beams, to_person)
-        distance = np.linalg.norm(to_person, axis=-1)[:, None]
-        # Squared half chord of the beam in the disc; negative without a hit.
-        half_chord = _PERSON_PX**2 - (distance**2 - along**2)
-        is_met = (half_chord > 0) & (along > 0) & (distance > 2.0 * _PERSON_PX)
-        ranges = np.where(is_met, np.minimum(ranges, along - np.sqrt(np.maximum(half_chord, 0.0))), ranges)
-    return ranges
-
-
 def scan_world(
     is_obstacle: BoolArray,
     poses: ArrayLike,
@@ -258,18 +216,12 @@ def scan_world(
         ValueError: a pose lies in an obstacle or outside of the image; or there is noise but no `rng`.
     """
     require_value(range_noise_px == 0 or rng is not None, "rng", "a generator for range_noise_px", rng)
-    ranges = cast_scans(is_obstacle, poses, num_beams=num_beams)
+    ranges, angles = cast_scans(is_obstacle, poses, num_beams=num_beams), beam_angles(num_beams)
     mask = np.ones(ranges.shape, bool) if max_range is None else ranges <= max_range
-    return np.where(mask[..., None], _measured_points(ranges, range_noise_px, rng), np.float32(0.0)), mask
-
-
-def _measured_points(ranges: FloatArray, range_noise_px: float, rng: np.random.Generator | None) -> NDArray[np.float32]:
-    """Computes beam end points (n, b, 2) in the sensor frame, with range noise."""
-    angles = beam_angles(ranges.shape[1])
     if rng is not None and range_noise_px > 0:
         ranges = np.maximum(ranges + rng.normal(0.0, range_noise_px, ranges.shape), 0.0)
-    points = ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return np.asarray(points, np.float32)
+    points = (ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)).astype(np.float32)
+    return np.where(mask[..., None], points, np.float32(0.0)), mask
 
 
 @runs_on_host("call it outside, and pass its arrays in")
@@ -284,10 +236,10 @@ def simulate_sequence(
 ) -> ScanSequence:
     """Simulates a drive through a planar world (DeepMapping section 4.1).
 
-    Walk, noise, odometry and people have separate random streams: a seed gives the same walk with and without noise.
+    Walk, noise and odometry have separate random streams: a seed gives the same walk with and without noise.
 
     Args:
-        world: index or name for `make_world`, or a world. The people of a world walk while it is scanned.
+        world: index or name for `make_world`, or a world.
         num_scans: number of scans; the paper has 128 and 256.
         num_beams: beams per scan over 360 degrees.
         range_noise_px: standard deviation of Gaussian noise on the ranges, px.
@@ -303,12 +255,11 @@ def simulate_sequence(
     require_value(num_scans >= 2, "num_scans", "at least 2", num_scans)
     scene = world if isinstance(world, World) else make_world(world)
     # The name is part of the seed, so that walks through two worlds are independent.
-    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(4))
-    walk_rng, noise_rng, odometry_rng, people_rng = map(np.random.default_rng, streams)
+    streams = ([seed, zlib.crc32(scene.name.encode()), stream] for stream in range(3))
+    walk_rng, noise_rng, odometry_rng = map(np.random.default_rng, streams)
     poses = simulate_trajectory(scene, num_scans, rng=walk_rng)
-    ranges = cast_scans(scene.is_obstacle, poses, num_beams=num_beams)
-    people = simulate_people(scene, num_scans, rng=people_rng)
-    ranges = stop_at_people(ranges, poses, beam_angles(num_beams), people)
-    points, mask = _measured_points(ranges, range_noise_px, noise_rng), np.ones(ranges.shape, bool)
+    points, mask = scan_world(
+        scene.is_obstacle, poses, num_beams=num_beams, range_noise_px=range_noise_px, rng=noise_rng
+    )
     odometry = simulate_odometry(poses, rng=odometry_rng) if with_odometry else None
     return ScanSequence(scene.name, points, mask, "px", reference_poses=poses, odometry_poses=odometry)

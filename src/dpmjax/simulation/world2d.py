@@ -2,9 +2,8 @@
 
 A world is made by its seed. The index selects one of three kinds in turn. Index 0 is an office (rooms by repeated
 division). Index 1 is a yard (free-standing blocks, open to the border of the image). Index 2 is a clinic (a corridor
-between two rows of rooms). All have round, square and triangular obstacles, so that no two places look alike. Two more
-kinds have names only. A grove has trees, bushes and rocks within the edge of a forest, but no straight wall. A crowd is
-an office with walking people.
+between two rows of rooms). All have round, square and triangular obstacles, so that no two places look alike. A further
+kind has a name only: a grove has trees, bushes and rocks within the edge of a forest, but no straight wall.
 
 Frame: pixel `is_obstacle[row, col]` fills the square [col, col + 1) x [row, row + 1). The x axis points right along the
 columns, y points up along the rows (row 0 is the lowest). So the world is right-handed, and a plot with the origin
@@ -31,8 +30,6 @@ _DOOR_PX = 72
 # Deviations of an outline as shares of its radius, two numbers a wave: two and more waves round the outline.
 _BLOB_WAVES = 0.3 / np.arange(2, 9)
 _EDGE_WAVES = 0.08 / np.arange(2, 60) ** 0.8
-# People in a crowd.
-_NUM_PEOPLE = 15
 
 _Painter = Callable[[BoolArray, FloatArray, FloatArray, float], None]
 
@@ -44,7 +41,6 @@ class World:
     Attributes:
         name: name for titles.
         is_obstacle: (h, w) bool, True where a pixel is solid; row 0 is the lowest.
-        num_people: people who walk about in it while a sequence of scans is taken.
 
     Raises:
         ValueError: another shape or dtype, or no free space.
@@ -52,7 +48,6 @@ class World:
 
     name: str
     is_obstacle: BoolArray = field(repr=False)
-    num_people: int = 0
 
     def __post_init__(self) -> None:
         if self.is_obstacle.ndim != 2 or self.is_obstacle.dtype != np.bool_:
@@ -83,7 +78,7 @@ def make_world(world: int | str) -> World:
 
     Args:
         world: 0, 1 and 2 are the three worlds of the demo; any other non-negative number is the seed of a further one
-            of the kind `world % 3`. Or a kind (office, yard, clinic, grove, crowd), alone or with a seed: "grove-7".
+            of the kind `world % 3`. Or a kind (office, yard, clinic, grove), alone or with a seed: "grove-7".
 
     Returns:
         The world; its free space is connected.
@@ -95,14 +90,15 @@ def make_world(world: int | str) -> World:
     name = f"{list(_KINDS)[world % 3]}-{world}" if isinstance(world, int) else world
     found = re.fullmatch(rf"({'|'.join(_KINDS)})(?:-(\d+))?", name)
     if found is None:
-        kinds = ", ".join(_KINDS)
-        raise ValueError(f"world: expected a number or one of {kinds}, with a seed as in grove-7; got {world!r}")
+        raise ValueError(
+            f"world: expected a number, or one of {', '.join(_KINDS)} with a seed (grove-7); got {world!r}"
+        )
     kind, index = found[1], int(found[2] or 0)
     rng = np.random.default_rng([2024, index])
     grid = np.zeros((SIZE_PX, SIZE_PX), bool)
     _KINDS[kind](grid, rng)
     # Free pixels that cannot be reached from the largest free space become solid.
-    return World(f"{kind}-{index}", ~largest_region(~grid), _NUM_PEOPLE if kind == "crowd" else 0)
+    return World(f"{kind}-{index}", ~largest_region(~grid))
 
 
 def _build_office(grid: BoolArray, rng: np.random.Generator) -> None:
@@ -246,7 +242,6 @@ _KINDS: dict[str, Callable[[BoolArray, np.random.Generator], None]] = {
     "yard": _build_yard,
     "clinic": _build_clinic,
     "grove": _build_grove,
-    "crowd": _build_office,
 }
 
 
@@ -304,30 +299,20 @@ def cast_rays(is_obstacle: BoolArray, origins: ArrayLike, angles: ArrayLike) -> 
 
     start = np.asarray(origins, np.float64).reshape(-1, 2)
     theta = np.asarray(angles, np.float64).reshape(-1)
-    _check_origins(is_obstacle, start)
+    is_inside = np.asarray(((start >= 0) & (start < is_obstacle.shape[::-1])).all(axis=1))
+    cell = np.floor(np.where(is_inside[:, None], start, 0)).astype(np.int64)
+    is_good = is_inside & ~is_obstacle[cell[:, 1], cell[:, 0]]
+    if not is_good.all():
+        raise ValueError(f"origins must lie in free space of the image, got {start[~is_good][0]}")
     # Chessboard distances to the nearest solid pixel, with a solid frame round the image.
     distance = distance_transform_cdt(~np.pad(is_obstacle, 1, constant_values=True), metric="chessboard")
     direction = np.stack([np.cos(theta), np.sin(theta)], axis=1)
-
-    cell = np.floor(start).astype(np.int64)
-    length = np.zeros(len(start))
-    active = np.arange(len(start))
+    length, active = np.zeros(len(start)), np.arange(len(start))
     while len(active):
         reach = distance[cell[active, 1] + 1, cell[active, 0] + 1].astype(np.int64)
         cell[active], length[active] = _leap(start[active], direction[active], cell[active], reach, length[active])
         active = active[distance[cell[active, 1] + 1, cell[active, 0] + 1] > 0]
     return length
-
-
-def _check_origins(is_obstacle: BoolArray, origins: FloatArray) -> None:
-    height, width = is_obstacle.shape
-    is_inside = ((origins >= 0) & (origins < [width, height])).all(axis=1)
-    if not is_inside.all():
-        raise ValueError(f"origins must lie in the {width} x {height} image, got {origins[~is_inside][0]}")
-    cell = np.floor(origins).astype(np.int64)
-    is_blocked = is_obstacle[cell[:, 1], cell[:, 0]]
-    if is_blocked.any():
-        raise ValueError(f"origins must lie in free space, got {origins[is_blocked][0]} inside an obstacle")
 
 
 def _leap(

@@ -20,7 +20,6 @@ from .scan_maps import from_above_figure as from_above_figure
 from .scan_maps import occupancy_figure as occupancy_figure
 from .scan_maps import registered_scans_figure as registered_scans_figure
 from .scan_pairs import RegisteredPair as RegisteredPair
-from .scan_pairs import matches_figure as matches_figure
 from .scan_pairs import registered_pairs_figure as registered_pairs_figure
 from .slam_maps import height_colors as height_colors
 from .slam_maps import height_map_figure as height_map_figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,10 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dpmjax.viz.figures import FRAME, INK, MUTED, PATH, WRONG
 
-_PHASE_COLORS = ("#eef2f7", "#fbf3e6", "#ecf5ee", "#f6eef6")
-_LEAST_RATIO_OF_LOG_AXIS = 10.0
 _NUM_BINS = 10
-_SOURCE, _VISITED, _DIRECT = "#30638e", "#2a9d6f", "#00a6c8"
 
 
 def curves_figure(
@@ -31,7 +27,7 @@ def curves_figure(
         x: (k,) numbers of steps, or seconds; never decreasing.
         curves: (k,) values by name.
         x_label: label of x.
-        phases: (k,) name of the phase of each value; phases are shaded and named.
+        phases: (k,) name of the phase of each value; each begins at a line with its name.
 
     Returns:
         The figure.
@@ -54,28 +50,20 @@ def curves_figure(
         axes.plot(at[is_known], known, color=PATH, lw=1, **style)
         if many:
             axes.plot(at[is_known], _smoothed(known), color=PATH, lw=1.6)
-        if len(known) and known.min() > 0.0 and known.max() > _LEAST_RATIO_OF_LOG_AXIS * known.min():
+        if len(known) and known.min() > 0.0 and known.max() > 10.0 * known.min():
             axes.set_yscale("log")
-            is_short = known.max() < _LEAST_RATIO_OF_LOG_AXIS**2 * known.min()
+            is_short = known.max() < 100.0 * known.min()
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,)))
             axes.yaxis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
         _label_axes(axes, x_label if axes is rows[-1] else "", name)
-        _shade_phases(axes, at, phases or [], is_named=axes is rows[0])
+        names = list(phases or [])
+        for k in (k for k in range(len(names)) if k == 0 or names[k] != names[k - 1]):
+            begin = at[max(k - 1, 0)]
+            axes.axvline(begin, color=FRAME, lw=1.5, zorder=1)
+            if axes is rows[0]:
+                place: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "xytext": (2, 4)}
+                axes.annotate(names[k], (begin, 1), fontsize=9, color=MUTED, **place)
     return figure
-
-
-def _shade_phases(axes: Axes, x: NDArray[np.float64], names: Sequence[str], *, is_named: bool) -> None:
-    """Shades runs of equal names; a name that would run into its left neighbour moves right of it."""
-    borders = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
-    taken_until = 0.0
-    for number, (first, last) in enumerate(itertools.pairwise(borders) if names else ()):
-        begin = x[max(0, first - 1)]
-        axes.axvspan(begin, x[last - 1], color=_PHASE_COLORS[number % len(_PHASE_COLORS)], lw=0, zorder=0)
-        if is_named:
-            start = max((begin - x[0]) / max(x[-1] - x[0], 1e-9), taken_until)
-            style: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "fontsize": 9, "color": MUTED}
-            axes.annotate(names[first], (start, 1), xytext=(2, 4), **style)
-            taken_until = start + 0.0135 * (len(names[first]) + 2)
 
 
 def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -153,9 +141,9 @@ def toy_figure(
     axes = figure.add_subplot()
     ends: dict[str, Any] = {"mec": "white", "ls": "none", "zorder": 6}
     axes.plot(x, loss, color=INK, lw=1.2, label="L(x)", zorder=2)
-    axes.plot(*map(np.asarray, converted), "--", color=_SOURCE, lw=1.4, label="L(f(z)), fitted f")
-    axes.plot(*map(np.asarray, visited), "*", color=_VISITED, ms=7, mew=0, alpha=0.5, label="x visited by the network")
-    axes.plot(*direct_end, marker="o", color=_DIRECT, ms=9, label="direct descent ends", **ends)
+    axes.plot(*map(np.asarray, converted), "--", color="#30638e", lw=1.4, label="L(f(z)), fitted f")
+    axes.plot(*map(np.asarray, visited), "*", color="#2a9d6f", ms=7, mew=0, alpha=0.5, label="x visited by the network")
+    axes.plot(*direct_end, marker="o", color="#00a6c8", ms=9, label="direct descent ends", **ends)
     axes.plot(network_end_z, network_end[1], marker="P", color=WRONG, ms=10, label="z* of the network", **ends)
     axes.plot(*network_end, marker="o", color=WRONG, ms=9, label="x* = f(z*)", **ends)
     _label_axes(axes, "x, or z for the dashed line", "L")

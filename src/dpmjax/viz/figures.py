@@ -6,7 +6,6 @@ import math
 import os
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,10 +26,6 @@ INK, MUTED, FRAME = "#1b1f24", "#6a737d", "#d6dadf"
 AGENTS = ("#2f6fb5", ODOMETRY, LOOP, WRONG, "#7b4fa3", "#0f8b8d", "#8d6b3f", "#c04a9b")
 # Inches: longer side of a panel by the number of columns; height of a line and width of a character.
 _SIDES_IN, _SMALL_SIDE_IN, _GAP_IN, _LINE_IN, _CHARACTER_IN = {1: 6.4, 2: 4.6, 3: 4.2}, 3.1, 0.15, 0.19, 0.068
-# A cell of a cloud is about two pixels wide, so that its colour can be seen; those of few points are larger.
-_CELLS_PER_IN, _LEAST_CELLS = 75, 60
-# Few far points must not determine the limits; a track that leaves the reference is cut at this share of its extent.
-_OUTER_SHARE, _SHARE_OUTSIDE, _MARGIN = 0.005, 0.5, 0.04
 
 
 class Points(NamedTuple):
@@ -169,7 +164,8 @@ def figure(
     for axes in grid[len(panels) :]:
         axes.remove()
     for axes, panel, text, each, size in zip(grid, panels, titles, limits, sizes_in, strict=False):
-        _draw_panel(axes, panel, each, round(_CELLS_PER_IN * size[0]))
+        # A cell of a cloud is about two pixels wide, so that its colour can be seen.
+        _draw_panel(axes, panel, each, round(75 * size[0]))
         axes.set_title(text, fontsize=9, color=INK, loc="left")
         frame_map(axes, each, unit)
     if title:
@@ -185,14 +181,8 @@ def figure(
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:
-    """Writes the figure as a PNG; the file appears whole or not at all."""
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.tmp")
-    try:
-        figure.savefig(unfinished, dpi=dpi, format="png", facecolor=figure.get_facecolor())
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    """Writes the figure as a PNG."""
+    figure.savefig(path, dpi=dpi, format="png", facecolor=figure.get_facecolor())
 
 
 def add_legend(drawn: Figure, entries: dict[str, Any], num_columns: int) -> None:
@@ -255,14 +245,15 @@ def _box(layers: Sequence[Layer]) -> np.ndarray:
         positions = positions.reshape(-1, positions.shape[-1])[:, :2]
         positions = positions[np.isfinite(positions).all(axis=1)]
         if len(positions):
-            share = _OUTER_SHARE if isinstance(layer, Points) else 0.0
+            # Few far points must not determine the limits.
+            share = 0.005 if isinstance(layer, Points) else 0.0
             corners.append(np.quantile(positions, [share, 1 - share], axis=0))
     return np.vstack([np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))]) if corners else np.zeros((2, 2))
 
 
 def _cut(positions: np.ndarray, box: np.ndarray) -> np.ndarray:
     """Returns the box of positions and box; positions farther beyond it than half its extent are cut."""
-    spare = _SHARE_OUTSIDE * float(np.ptp(box, axis=0).max())
+    spare = 0.5 * float(np.ptp(box, axis=0).max())
     everything = np.vstack([np.clip(positions, box[0] - spare, box[1] + spare), box])
     return np.vstack([everything.min(axis=0), everything.max(axis=0)])
 
@@ -270,7 +261,7 @@ def _cut(positions: np.ndarray, box: np.ndarray) -> np.ndarray:
 def _with_margin(box: np.ndarray) -> Limits:
     """Returns limits a little wider than a box; those of a straight road have a useful height too."""
     longer = float(np.ptp(box, axis=0).max()) or 1.0
-    spare = np.maximum(0.4 * longer - np.ptp(box, axis=0), 0.0) / 2.0 + _MARGIN * longer
+    spare = np.maximum(0.4 * longer - np.ptp(box, axis=0), 0.0) / 2.0 + 0.04 * longer
     (x_min, y_min), (x_max, y_max) = (box + np.stack([-spare, spare])).tolist()
     return Limits(x_min, x_max, y_min, y_max)
 
@@ -285,18 +276,17 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Any]:
     square: Any = {"marker": "s", "ms": 5, "ls": "none"}
     for panel in panels:
         if panel.reference is not None:
-            entries["reference"] = Line2D([], [], color=REFERENCE, lw=6)
-        clouds = [layer for layer in panel.layers if isinstance(layer, Points)]
+            entries["reference"] = {"color": REFERENCE, "lw": 6}
         for layer in panel.layers:
-            if layer.label and isinstance(layer, Points) and isinstance(layer.color, str):
-                entries[layer.label] = Line2D([], [], color=layer.color, **square)
-            elif layer.label and isinstance(layer, Track):
-                entries[layer.label] = Line2D([], [], **_style_of(layer))
-            elif layer.label and isinstance(layer, Edges) and len(layer.ends):
-                entries[layer.label] = Line2D([], [], color=layer.color, ls=layer.style, lw=1.0)
-        if len(clouds) > 1:
-            entries["points of two or more"] = Line2D([], [], color=INK, **square)
-    return entries
+            if isinstance(layer, Track):
+                entries[layer.label] = _style_of(layer)
+            elif isinstance(layer, Edges) and len(layer.ends):
+                entries[layer.label] = {"color": layer.color, "ls": layer.style, "lw": 1.0}
+            elif isinstance(layer, Points) and isinstance(layer.color, str):
+                entries[layer.label] = {"color": layer.color, **square}
+        if sum(isinstance(layer, Points) for layer in panel.layers) > 1:
+            entries["points of two or more"] = {"color": INK, **square}
+    return {label: Line2D([], [], **style) for label, style in entries.items() if label}
 
 
 def _style_of(track: Track) -> dict[str, Any]:
@@ -312,7 +302,7 @@ def _draw_panel(axes: Axes, panel: Panel, limits: Limits, num_columns: int) -> N
     clouds = [layer for layer in panel.layers if isinstance(layer, Points)]
     if clouds:
         num_points = sum(len(cloud.positions) for cloud in clouds)
-        num_columns = min(num_columns, max(_LEAST_CELLS, round(2 * num_points**0.5)))
+        num_columns = min(num_columns, max(60, round(2 * num_points**0.5)))
         show_raster(axes, _cells(clouds, limits, num_columns), limits)
     if panel.reference is not None:
         axes.plot(*panel.reference[:, :2].T, color=REFERENCE, lw=6, solid_capstyle="round", zorder=3)

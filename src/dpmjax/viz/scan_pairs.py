@@ -1,4 +1,4 @@
-"""Pictures of pairs of scans from above: both scans under motions, and matches between their points."""
+"""Pictures of pairs of scans from above, under motions."""
 
 from __future__ import annotations
 
@@ -7,17 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from dpmjax.viz.figures import INK, WRONG, Edges, Layer, Panel, Points, Track, figure
+from dpmjax.viz.figures import Layer, Panel, Points, Track, figure
 
 # These colours and black differ in lightness too, so that they differ in grey.
 SOURCE, TARGET = "#3a86c0", "#f0a840"
-_APART_M = 5.0
-# Points farther out than this share of them do not set the distance of two scans side by side.
-_SHOWN_SHARE = 0.995
-# Most lines of matches of one kind; hundreds would hide the scans.
-_MAX_LINES = 30
 
 
 class RegisteredPair(NamedTuple):
@@ -53,41 +48,6 @@ def registered_pairs_figure(pairs: Sequence[RegisteredPair]) -> Figure:
         for column, (label, T) in enumerate(pair.motions.items())
     ]
     return figure(panels, num_columns=max(len(pair.motions) for pair in pairs), is_shared=True)
-
-
-def matches_figure(
-    pair: RegisteredPair, source_matched: ArrayLike, target_matched: ArrayLike, is_right: ArrayLike
-) -> Figure:
-    """Draws two scans from above: side by side with lines between matches, and together by the estimated motion.
-
-    Lines of right matches are black, those of wrong ones red and dashed; at most 30 of each kind are drawn.
-
-    Args:
-        pair: both scans and the estimated motion.
-        source_matched: (k, 3) matched points of the source.
-        target_matched: (k, 3) matched points of the target, row for row.
-        is_right: (k,) True where the true motion maps the two points of a match onto each other.
-
-    Returns:
-        The figure.
-    """
-    a, b, starts, ends = (
-        np.asarray(x, np.float64)[:, :2] for x in (pair.source, pair.target, source_matched, target_matched)
-    )
-    right, ((label, T),) = np.asarray(is_right, bool), pair.motions.items()
-    end_of_a, start_of_b = (np.quantile(each[:, 0], q) for each, q in ((a, _SHOWN_SHARE), (b, 1 - _SHOWN_SHARE)))
-    apart = np.array([end_of_a - start_of_b + _APART_M, 0.0])
-    lines = np.stack([starts, ends + apart], axis=1)
-    layers: list[Layer] = [Points(a, SOURCE, pair.names[0]), Points(b + apart, TARGET, pair.names[1])]
-    layers += [_match_lines(lines[right], "right", INK, "-"), _match_lines(lines[~right], "wrong", WRONG, "--")]
-    return figure([Panel(pair.title, layers), Panel(label, _layers(pair, T))])
-
-
-def _match_lines(lines: NDArray[np.float64], kind: str, color: str, style: str) -> Edges:
-    label = f"{len(lines)} {kind} match" + "es" * (len(lines) != 1)
-    if len(lines) > _MAX_LINES:
-        label += f", {_MAX_LINES} drawn"
-    return Edges(np.random.default_rng(0).permutation(lines)[:_MAX_LINES], color, label, style)
 
 
 def _layers(pair: RegisteredPair, T_target_source: NDArray[np.float64]) -> list[Layer]:

@@ -12,12 +12,11 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dpmjax.sequences import counted
-from dpmjax.viz.figures import INK, LOOP, PATH, POINTS, WRONG, Bar, Edges, Layer, Panel, Points, Track, figure
+from dpmjax.viz.figures import INK, LOOP, PATH, POINTS, Bar, Edges, Layer, Panel, Points, Track, figure
 
 # Heights above the lidar that the colours of maps span.
 HEIGHTS_M = (-2.5, 5.5)
 # Length of an arrow as a share of the extent of the map.
-_ARROW_SHARE = 0.04
 _ROOF_M = 1.0
 
 
@@ -69,12 +68,7 @@ def height_map_figure(
 
 
 def localization_figure(
-    points_map: ArrayLike,
-    T_map_keyframe: ArrayLike,
-    T_map_scan: ArrayLike,
-    *,
-    is_wrong: ArrayLike | None = None,
-    title: str,
+    points_map: ArrayLike, T_map_keyframe: ArrayLike, T_map_scan: ArrayLike, *, title: str
 ) -> Figure:
     """Draws a map from above, the keyframes' positions, and the poses of the scans that were found as arrows.
 
@@ -82,7 +76,6 @@ def localization_figure(
         points_map: (n, 3) points of the map, metres.
         T_map_keyframe: (k, 4, 4) at least one.
         T_map_scan: (s, 4, 4) of the scans that were found.
-        is_wrong: (s,) scans that a reference puts elsewhere; None without a reference.
         title: title of the picture.
 
     Returns:
@@ -90,17 +83,13 @@ def localization_figure(
     """
     points, keyframes = np.asarray(points_map, float).reshape(-1, 3), np.asarray(T_map_keyframe, float)[:, :3, 3]
     T = np.asarray(T_map_scan, float).reshape(-1, 4, 4)
-    wrong = np.zeros(len(T), bool) if is_wrong is None else np.asarray(is_wrong, bool)
     shown = np.concatenate([points, keyframes])
-    length_m = _ARROW_SHARE * float(np.ptp(np.quantile(shown[:, :2], [0.005, 0.995], axis=0), axis=0).max())
+    length_m = 0.04 * float(np.ptp(np.quantile(shown[:, :2], [0.005, 0.995], axis=0), axis=0).max())
     ends = np.stack([T[:, :3, 3], T[:, :3, 3] + length_m * T[:, :3, 0]], axis=1)
     # Crosses are wider than the marks of scans: a keyframe under a scan is visible.
     layers: list[Layer] = [Points(points, POINTS), Track(keyframes, INK, counted(len(keyframes), "keyframe"), "x", 7)]
-    right = (~wrong, PATH, "o", "found (line: forward)")
-    for mask, color, marker, label in (right, (wrong, WRONG, "X", "found elsewhere than the reference")):
-        if mask.any():
-            layers += [Edges(ends[mask], color), Track(ends[mask, 0], color, f"{mask.sum()} {label}", marker, 6)]
-    return figure([Panel("", layers)], title=title)
+    found = f"{len(T)} found (line: forward)" if len(T) else ""
+    return figure([Panel("", [*layers, Edges(ends, PATH), Track(ends[:, 0], PATH, found, "o", 6)])], title=title)
 
 
 def height_colors(heights_m: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:

@@ -132,8 +132,7 @@ def model_from_arrays(arrays: dict[str, np.ndarray], config: ModelConfig, source
 
     shapes = keep_result("weights.model_shapes", config, trace)
     for name in sorted(shapes.keys() | arrays.keys()):
-        expected = shapes.get(name, "none")
-        found = arrays[name].shape if name in arrays else "none"
+        expected, found = shapes.get(name, "none"), getattr(arrays.get(name), "shape", "none")
         if expected != found:
             raise ValueError(f"{source}: parameter {name}: expected shape {expected}, got {found}")
     params = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items()}
@@ -147,10 +146,8 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a whole safetensors file ({error})") from error
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: a safetensors file, but not one of a dpmjax model")
-    if header.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"{path}: format version {header.get('format_version')}, this dpmjax reads {FORMAT_VERSION}")
+    if (header.get("format"), header.get("format_version")) != (FORMAT, FORMAT_VERSION):
+        raise ValueError(f"{path}: not a model of dpmjax in format version {FORMAT_VERSION}")
     return header, arrays
 
 

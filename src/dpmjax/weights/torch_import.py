@@ -1,8 +1,8 @@
 """The published PyTorch checkpoints of DeepPointMap, read without PyTorch and without running code of the file.
 
 A file that PyTorch saved is a ZIP archive of raw storages and one pickle that maps tensors to parts of storages. The
-pickle may name only tensors and dictionaries; anything else is refused. Files from before PyTorch 1.6 are no archives;
-those need PyTorch itself. Names of the tensors are mapped to ours, and their shapes give the configuration.
+pickle may name only tensors and dictionaries; anything else is refused. Names of the tensors are mapped to ours, and
+their shapes give the configuration.
 """
 
 from __future__ import annotations
@@ -41,14 +41,13 @@ ENCODER_NAMES = {
     rf"{_RESIDUAL}\.pw_conv\.1\.ln\.": rf"{_OUR_RESIDUAL}.expand_norm.",
     rf"{_RESIDUAL}\.pw_conv\.3\.": rf"{_OUR_RESIDUAL}.contract.",
     rf"{_RESIDUAL}\.pw_conv\.4\.ln\.": rf"{_OUR_RESIDUAL}.contract_norm.",
+    **{rf"upsampler\.(\d+)\.mlp\.{3 * i}\.": rf"propagation_\1.linear_{i}." for i in range(2)},
+    **{rf"upsampler\.(\d+)\.mlp\.{3 * i + 1}\.ln\.": rf"propagation_\1.norm_{i}." for i in range(2)},
 }
-for _layer in range(2):
-    ENCODER_NAMES[rf"upsampler\.(\d+)\.mlp\.{3 * _layer}\."] = rf"propagation_\1.linear_{_layer}."
-    ENCODER_NAMES[rf"upsampler\.(\d+)\.mlp\.{3 * _layer + 1}\.ln\."] = rf"propagation_\1.norm_{_layer}."
-
+_LAYER, _OUR_LAYER = r"descriptor_attention\.(\d+)", r"layer_\1"
 # Networks whose linear layers have the numbers 0, 2, 4 in the published files, and 0, 1, 2 here.
 _SEQUENCES = {
-    r"descriptor_attention\.(\d+)\.mlp": r"layer_\1.network",
+    rf"{_LAYER}\.mlp": rf"{_OUR_LAYER}.network",
     "similarity_head": "similarity_head",
     "coarse_pairing_head": "coarse_head",
     r"offset_head\.mlp": "offset_head",
@@ -57,11 +56,12 @@ _SEQUENCES = {
 }
 DECODER_NAMES = {
     r"projection\.": "projection.",
-    r"descriptor_attention\.(\d+)\.(self|cross)_attn\.in_proj_": r"layer_\1.\2_attention.in_",
-    r"descriptor_attention\.(\d+)\.(self|cross)_attn\.out_proj\.": r"layer_\1.\2_attention.out.",
-    r"descriptor_attention\.(\d+)\.norm1\.": r"layer_\1.self_norm.",
-    r"descriptor_attention\.(\d+)\.norm2\.": r"layer_\1.cross_norm.",
-    r"descriptor_attention\.(\d+)\.norm3\.": r"layer_\1.network_norm.",
+    rf"{_LAYER}\.(self|cross)_attn\.in_proj_": rf"{_OUR_LAYER}.\2_attention.in_",
+    rf"{_LAYER}\.(self|cross)_attn\.out_proj\.": rf"{_OUR_LAYER}.\2_attention.out.",
+    **{
+        rf"{_LAYER}\.norm{i}\.": rf"{_OUR_LAYER}.{name}_norm."
+        for i, name in ((1, "self"), (2, "cross"), (3, "network"))
+    },
     r"offset_head\.downsample\.": "offset_head.short_cut.",
     r"offset_head\.head\.": "offset_head.output.",
     **{rf"{theirs}\.{2 * i}\.": f"{ours}.linear_{i}." for theirs, ours in _SEQUENCES.items() for i in range(3)},
@@ -100,10 +100,8 @@ def import_torch_checkpoint(path: str | Path) -> Model:
         arrays |= {f"{part}.{name}": array for name, array in named.items()}
     try:
         config = _derived_config(arrays, *_sampling(path.with_name("config.json")))
-    except KeyError as error:
-        raise ValueError(f"{path}: lacks the tensor that becomes {error}") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: {'lacks the tensor ' * isinstance(error, KeyError)}{error}") from error
     return model_from_arrays(arrays, config, str(path))
 
 
@@ -161,7 +159,7 @@ def _derived_config(arrays: Tensors, stages: tuple[PyramidStage, ...], scale_m: 
 
 
 def read_torch_file(path: str | Path) -> Any:
-    """Reads what `torch.save` wrote.
+    """Reads what `torch.save` wrote, since PyTorch 1.6.
 
     Args:
         path: the file.
@@ -170,27 +168,17 @@ def read_torch_file(path: str | Path) -> Any:
         Dictionaries, lists and numbers, with NumPy arrays for tensors.
 
     Raises:
-        ValueError: if the file is broken or holds other objects; or if it has the format before PyTorch 1.6
-            and PyTorch is not installed.
+        ValueError: if the file is broken or holds other objects.
     """
-    path = Path(path)
-    if not zipfile.is_zipfile(path):
-        return _read_with_torch(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            return _read_archive(archive)
+            (content,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
+            root = content.removesuffix("data.pkl")
+            if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
+                raise ValueError("numbers are stored in big-endian order")
+            return _TensorUnpickler(archive, root).load()
     except Exception as error:  # a broken pickle raises anything at all
-        raise ValueError(f"{path}: not a PyTorch checkpoint that can be read ({error})") from error
-
-
-def _read_archive(archive: zipfile.ZipFile) -> Any:
-    pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
-    if len(pickles) != 1:
-        raise ValueError("no data.pkl in the archive")
-    root = pickles[0].removesuffix("data.pkl")
-    if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
-        raise ValueError("numbers are stored in big-endian order")
-    return _TensorUnpickler(archive, root).load()
+        raise ValueError(f"{path}: not a checkpoint of PyTorch 1.6 or later that can be read ({error})") from error
 
 
 class _TensorUnpickler(pickle.Unpickler):
@@ -229,28 +217,7 @@ def _tensor(storage: Any, offset: int, shape: tuple[int, ...], strides: tuple[in
     if not is_storage or len(shape) != len(strides) or min((offset, *shape, *strides)) < 0:
         raise pickle.UnpicklingError("a tensor that is not part of a storage")
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
-    if math.prod(shape) == 0:
-        return np.zeros(shape, storage.dtype)
-    if last >= storage.size:
+    if math.prod(shape) > 0 and last >= storage.size:
         raise pickle.UnpicklingError("a tensor that reaches beyond its storage")
     byte_strides = tuple(stride * storage.itemsize for stride in strides)
     return np.lib.stride_tricks.as_strided(storage[offset:], shape, byte_strides).copy()
-
-
-def _read_with_torch(path: Path) -> Any:
-    try:
-        import torch
-    except ImportError:
-        needed = "PyTorch is needed to read it: pip install dpmjax[torch]"
-        raise ValueError(f"{path}: no ZIP archive, so at best a checkpoint of PyTorch before 1.6; {needed}") from None
-    try:
-        return _as_numpy(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # a broken file raises anything at all
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: not a PyTorch checkpoint that can be read ({reason})") from error
-
-
-def _as_numpy(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _as_numpy(item) for key, item in value.items()}
-    return value.detach().float().numpy() if hasattr(value, "detach") else value

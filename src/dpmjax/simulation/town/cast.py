@@ -29,11 +29,7 @@ from dpmjax.simulation.town.primitives import (
     turn_back,
 )
 
-# Number of nearest boxes, cylinders and spheroids of a scan, and of those of one sector of the turn.
-_NUM_NEAR = (1024, 512, 2048)
-_NUM_IN_SECTOR = (96, 48, 160)
 # Side of the square of ground around the sensor; the heights of its border hold outside.
-_GROUND_M = 168
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 _KINDS: tuple[Cross, ...] = (cross_box, cross_cylinder, cross_spheroid)
 # A band of rays is tested against this number of bodies between two checks of the loop condition.
@@ -93,13 +89,15 @@ def near_world(
         Bodies and ground near the sensor, in the same shapes for every town.
     """
     boxes = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), town.boxes, traffic_boxes(town.traffic, start, time))
-    kinds = zip((boxes, town.cylinders, town.spheroids), _NUM_NEAR, strict=True)
+    # The nearest boxes, cylinders and spheroids of a scan.
+    kinds = zip((boxes, town.cylinders, town.spheroids), (1024, 512, 2048), strict=True)
     near = (_nearest_bodies(x._replace(centres=x.centres - start), number, max_range) for x, number in kinds)
     return NearWorld(tuple(near), _near_ground(town.ground, start))
 
 
 def _near_ground(ground: Ground, start: Float[Array, " 3"]) -> Ground:
-    count = round(_GROUND_M / CELL_M) + 1
+    # The heights of the border of the square hold outside.
+    count = round(168 / CELL_M) + 1
     heights = jnp.pad(ground.heights, [(0, max(count - size, 0)) for size in ground.heights.shape], mode="edge")
     corner = jnp.round((start[:2] - ground.origin) / ground.cell - 0.5 * count).astype(jnp.int32)
     corner = jnp.clip(corner, 0, jnp.array([heights.shape[1] - count, heights.shape[0] - count]))
@@ -240,9 +238,10 @@ def cast_turn(near: NearWorld, T_world_lidar: Float[Array, "4 4"], rays: Rays, *
     offsets = jnp.einsum("ij,sj->si", turn, rays.T_lidar_sector[:, :3, 3], precision=highest)
     directions = jnp.einsum("sij,sgcbj->sgcbi", turns, rays.directions, precision=highest)
     way = jnp.linalg.norm(offsets, axis=-1).max()
+    # Those of one sector of the turn.
     lists = tuple(
         _sector_lists(kind, T_world_lidar, rays.azimuths, capacity, way)
-        for kind, capacity in zip(near.kinds, _NUM_IN_SECTOR, strict=True)
+        for kind, capacity in zip(near.kinds, (96, 48, 160), strict=True)
     )
     repeated = jax.tree.map(lambda x: jnp.repeat(x, directions.shape[1], axis=0), (offsets, lists))
     directions, depths = (x.reshape(-1, *x.shape[2:]) for x in (directions, rays.depths))

@@ -19,10 +19,6 @@ from dpmjax.simulation.town.primitives import Bodies, Ground, turn_back
 
 # Replacement of zero components of directions: a thousandth of a millimetre at 100 m.
 _TINY = 1e-8
-# Ground: number of geometric steps of the search, and of refinements of the interval: millimetres at 20 m, less nearer.
-_NUM_STEPS = 28
-_NUM_REFINEMENTS = 3
-_NEAREST_M = 1.0
 # Facades: windows and doors lie behind the wall, so that scans constrain the position along a front.
 _STOREY_M, _SILL_M, _LINTEL_M = 2.9, 0.9, 2.2
 _THIN_M = 1e-6
@@ -195,7 +191,7 @@ def cross_ground(
     Returns:
         Distance, m; infinite where a ray stays above the ground.
     """
-    ways = jnp.asarray(np.append(0.0, np.geomspace(_NEAREST_M, max_range, _NUM_STEPS)), direction.dtype)
+    ways = jnp.asarray(np.append(0.0, np.geomspace(1.0, max_range, 28)), direction.dtype)
     level = jnp.maximum(jnp.linalg.norm(direction[..., :2], axis=-1), 1e-6)
     heading = (direction[..., :2] / level[..., None]).mean(-2)
     profile = ground_height(ground, start[:2] + ways[:, None] * heading[..., None, :])
@@ -214,7 +210,8 @@ def cross_ground(
         here = start[2] + slope * middle - ground_height(ground, start[:2] + middle[..., None] * along)
         return _narrow(carry, middle, here)
 
-    bracket = jax.lax.fori_loop(0, _NUM_REFINEMENTS, refine, (near, far, above, below))
+    # Three refinements leave millimetres at 20 m, less nearer.
+    bracket = jax.lax.fori_loop(0, 3, refine, (near, far, above, below))
     return jnp.where(is_met, _false_position(bracket, 0.0) / level, jnp.inf)
 
 

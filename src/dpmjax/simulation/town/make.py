@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, zoom
 
 from dpmjax.checks import require_fields, require_one_of, require_positive_fields, require_value
-from dpmjax.sequences import BoolArray, FloatArray
+from dpmjax.sequences import FloatArray
 from dpmjax.simulation.town import objects, primitives
 from dpmjax.simulation.town.kinds import KINDS, Kind, Quarter
 from dpmjax.simulation.town.objects import Collection, Place, Size, plant_bushes, plant_trees
@@ -18,16 +19,14 @@ from dpmjax.simulation.town.primitives import CELL_M, LANE_STEP_M, RoadUsers, To
 from dpmjax.simulation.town.streets import LANE_M, Streets, arc_lengths, make_streets, on_path, resample, streets_along
 from dpmjax.simulation.town.terrain import PAVEMENT_M, Plots, Terrain, make_terrain, with_equal_passes
 
-_SENSOR_HEIGHT_M = 1.73
 _MAX_COORDINATE_M = 1e5  # Beyond, float32 holds no centimetres.
-_WALKERS_PER_KM = 15.0  # For each kilometre of lane.
-_TOWN_STREAM = 8150
 # Least and largest half length, half width and half height.
 _CAR_M, _TRUCK_M = ((1.9, 2.5), (0.82, 0.95), (0.7, 0.9)), ((3.2, 6.5), (1.15, 1.27), (1.3, 1.8))
-_FREE_M = 4.2  # Least distance of parked cars from the middle of a street.
-_BORDERS = ("hedge", "wall", "fence")
-_FARTHEST_M = 65.0  # Largest distance of plants from the nearest kerb.
-_PATCH_M = 14.0
+
+
+# Adds an object at a place; and nearest and farthest distance from the kerb, size, and clearance of its kind.
+Put = Callable[[Collection, np.random.Generator, Place], None]
+Spot = tuple[Size, Size, float]
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
         ValueError: a negative seed, or a trajectory of another shape, shorter than 20 m or far from the origin.
     """
     require_value(seed >= 0, "seed", "zero or more", seed)
-    rng = np.random.default_rng([_TOWN_STREAM, seed])
+    rng = np.random.default_rng([8150, seed])
     support, kind = None, KINDS[config.kind]
     if trajectory is None:
         streets = make_streets(rng, config.route, config.route_length_m, config.block_m, kind.half_width)
@@ -102,7 +101,7 @@ def make_town(seed: int, config: TownConfig = TownConfig(), *, trajectory: Array
         within = f"positions within {_MAX_COORDINATE_M:g} m of the origin (subtract the first one)"
         require_value(farthest <= _MAX_COORDINATE_M, "trajectory", within, f"{farthest:g} m")
         streets = streets_along(positions[:, :2], rng)
-        support = with_equal_passes(positions) - [0.0, 0.0, _SENSOR_HEIGHT_M]
+        support = with_equal_passes(positions) - [0.0, 0.0, 1.73]
     terrain = make_terrain(rng, streets, support, kind)
     standing = _furnish(rng, streets, Plots(terrain), kind)
     ground = primitives.Ground(*(jnp.asarray(x, jnp.float32) for x in (terrain.heights, terrain.origin, CELL_M)))
@@ -133,9 +132,8 @@ def _users(
 ) -> list[tuple[float, ...]]:
     """Draws rows of the road users of a lane: lane, path length, speed, distance to the left, half sizes."""
 
-    def vehicle() -> tuple[float, float, float]:
-        length, width, height = _TRUCK_M if rng.random() < kind.trucks else _CAR_M
-        return rng.uniform(*length), rng.uniform(*width), rng.uniform(*height)
+    def vehicle() -> list[float]:
+        return [rng.uniform(*span) for span in (_TRUCK_M if rng.random() < kind.trucks else _CAR_M)]
 
     users: list[tuple[float, ...]] = [
         (lane, rng.uniform(0, length), rng.uniform(6, 13), -LANE_M, *vehicle())
@@ -147,7 +145,8 @@ def _users(
             size = vehicle()
             way = (way + 2 * size[0] + rng.uniform(1.5, 4.0)) % length
             users.append((lane, way, speed, -LANE_M, *size))
-    for _ in range(rng.poisson(_WALKERS_PER_KM * length / 1000) if kind.has_pavement else 0):
+    # Fifteen people walk on a kilometre.
+    for _ in range(rng.poisson(15.0 * length / 1000) if kind.has_pavement else 0):
         side = -half_width - rng.uniform(0.4, 1.8)
         way, speed = rng.uniform(0, length), rng.uniform(0.8, 1.8)
         users.append((lane, way, speed, side, 0.2, 0.25, rng.uniform(0.75, 0.93)))
@@ -173,11 +172,18 @@ class _Side:
         x, y = spot[0] - np.sin(heading) * left, spot[1] + np.cos(heading) * left
         return Place(x, y, float(self.plots.terrain.height_at(np.array([[x, y]]))[0]), heading)
 
+    def scatter(self, into: Collection, rng: np.random.Generator, mean: float, spot: Spot, put: Put) -> None:
+        """Adds objects at random places beside the street where the ground is free."""
+        (nearest, farthest), size, clear = spot
+        for _ in range(rng.poisson(mean)):
+            place = self.place(rng.uniform(0, self.length), rng.uniform(nearest, farthest))
+            if self.plots.claim(place, size, clear):
+                put(into, rng, place)
+
 
 def _furnish(rng: np.random.Generator, streets: Streets, plots: Plots, kind: Kind) -> Collection:
     """Builds all objects of the town; each new one occupies its part of the free ground."""
-    into = Collection()
-    sides = []
+    into, sides = Collection(), []
 
     def draw() -> Quarter:
         return kind.quarters[rng.choice(len(kind.quarters), p=kind.shares)]
@@ -214,11 +220,8 @@ def _bridges(into: Collection, rng: np.random.Generator, side: _Side) -> None:
 
 def _verge(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     """Adds bushes and tall grass along the kerb, and posts of a rail."""
-    step = side.kind.verge_step
-    for _ in range(rng.poisson(side.length / step) if step else 0):
-        place = side.place(rng.uniform(0, side.length), rng.uniform(1.3, 5.0))
-        if side.plots.claim(place, (0.8, 0.8), 0.9):
-            _put_bush(into, rng, place)
+    if side.kind.verge_step:
+        side.scatter(into, rng, side.length / side.kind.verge_step, ((1.3, 5.0), (0.8, 0.8), 0.9), _put_bush)
 
 
 def _roadside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
@@ -231,10 +234,7 @@ def _roadside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
             place = side.place(float(way), from_kerb)
             if side.plots.claim(place, (0.4, 0.4), 0.2):
                 objects.put_pole(into, place, radius, height)
-    for _ in range(rng.poisson(side.length / 90.0)):
-        place = side.place(rng.uniform(0, side.length), rng.uniform(0.6, 1.5))
-        if side.plots.claim(place, (0.8, 0.6), 0.3):
-            objects.put_sign(into, rng, place)
+    side.scatter(into, rng, side.length / 90.0, ((0.6, 1.5), (0.8, 0.6), 0.3), objects.put_sign)
 
 
 def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
@@ -264,7 +264,7 @@ def _houses(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         if setback > PAVEMENT_M + 1.4 and rng.random() < quarter.border_rate:
             border = side.place(middle + 0.5 * gap, PAVEMENT_M + 0.4)
             if side.plots.claim(border, (width + gap - 1.0, 0.4), PAVEMENT_M - 0.4):
-                objects.put_border(into, rng, border, width + gap - 0.4, str(rng.choice(_BORDERS)))
+                objects.put_border(into, rng, border, width + gap - 0.4, str(rng.choice(("hedge", "wall", "fence"))))
         _garden(into, rng, side, (way, width + gap), setback if has_house else setback + depth)
         way += width + gap
 
@@ -301,7 +301,8 @@ def _kerbside(into: Collection, rng: np.random.Generator, side: _Side) -> None:
     way, rate = float(rng.uniform(3, 9)), side.quarter.parked_rate * rng.uniform(0.4, 1.3)
     while way < side.length - 3:
         if rng.random() < rate:
-            from_kerb = max(-0.2, _FREE_M - side.half_width) + float(rng.normal(0, 0.12))
+            # Parked cars leave 4.2 m from the middle of the street.
+            from_kerb = max(-0.2, 4.2 - side.half_width) + float(rng.normal(0, 0.12))
             place = side.place(way, from_kerb)
             turned = Place(place.x, place.y, place.ground - 0.06, place.heading + np.pi + float(rng.normal(0, 0.02)))
             if side.plots.claim(turned, (4.8, 1.7), -1.6):
@@ -322,11 +323,8 @@ def _pavement(into: Collection, rng: np.random.Generator, side: _Side) -> None:
         place = side.place(float(way), 0.6)
         if side.plots.claim(place, (0.4, 0.4), 0.0):
             objects.put_pole(into, place, float(rng.uniform(0.06, 0.12)), float(rng.uniform(4.5, 8.0)))
-    for rate, put in ((40.0, objects.put_sign), (35.0, objects.put_person), (25.0, _put_cabinet)):
-        for _ in range(rng.poisson(side.length / rate)):
-            place = side.place(rng.uniform(0, side.length), rng.uniform(0.5, 1.9))
-            if side.plots.claim(place, (0.8, 0.6), 0.0):
-                put(into, rng, place)
+    for step, put in ((40.0, objects.put_sign), (35.0, objects.put_person), (25.0, _put_cabinet)):
+        side.scatter(into, rng, side.length / step, ((0.5, 1.9), (0.8, 0.6), 0.0), put)
 
 
 def _put_cabinet(into: Collection, rng: np.random.Generator, place: Place) -> None:
@@ -355,31 +353,19 @@ def _second_row(into: Collection, rng: np.random.Generator, side: _Side) -> None
 
 
 def _plant_land(into: Collection, rng: np.random.Generator, plots: Plots, kind: Kind) -> None:
-    """Adds plants on the free land outside of streets and plots, in patches."""
-    is_wooded = _patches(rng, plots.terrain.heights.shape, kind.woodland)
-    for density, clear in ((kind.trees_per_ha, 2.5), (kind.bushes_per_ha, 1.6)):
-        places = _scatter(rng, plots, density, is_wooded)
-        places = places[plots.are_free(places, clear)]
-        if clear == 2.5:
-            plant_trees(into, rng, _on_ground(plots, places), kind.tree_height, conifers=kind.conifers)
-        else:
-            plant_bushes(into, rng, _on_ground(plots, places))
-
-
-def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> BoolArray:
-    coarse = rng.normal(size=tuple(-(-size // 8) for size in shape))
-    field = gaussian_filter(coarse, _PATCH_M / (8 * CELL_M))
-    return zoom(field <= np.quantile(field, share), 8, order=0)[: shape[0], : shape[1]]
-
-
-def _scatter(rng: np.random.Generator, plots: Plots, per_ha: float, is_wooded: BoolArray) -> FloatArray:
-    """Draws positions (n, 2) in woods near streets."""
+    """Adds plants on the free land outside of streets and plots, in patches, up to 65 m from a kerb."""
     terrain = plots.terrain
-    size = CELL_M * (np.array(terrain.heights.shape)[::-1] - 1)
-    places = rng.uniform(0, 1, (rng.poisson(per_ha * size.prod() / 1e4), 2)) * size
-    column, row = np.round(places / CELL_M).astype(int).T
-    return terrain.origin + places[is_wooded[row, column] & (terrain.street_distance[row, column] < _FARTHEST_M)]
-
-
-def _on_ground(plots: Plots, places: FloatArray) -> FloatArray:
-    return np.column_stack([places, plots.terrain.height_at(places)]) if len(places) else np.zeros((0, 3))
+    shape = terrain.heights.shape
+    patches = gaussian_filter(rng.normal(size=tuple(-(-size // 8) for size in shape)), 14.0 / (8 * CELL_M))
+    is_wooded = zoom(patches <= np.quantile(patches, kind.woodland), 8, order=0)[: shape[0], : shape[1]]
+    size = CELL_M * (np.array(shape)[::-1] - 1)
+    for per_ha, clear in ((kind.trees_per_ha, 2.5), (kind.bushes_per_ha, 1.6)):
+        places = rng.uniform(0, 1, (rng.poisson(per_ha * size.prod() / 1e4), 2)) * size
+        column, row = np.round(places / CELL_M).astype(int).T
+        places = terrain.origin + places[is_wooded[row, column] & (terrain.street_distance[row, column] < 65.0)]
+        places = places[plots.are_free(places, clear)]
+        feet = np.column_stack([places, terrain.height_at(places)]) if len(places) else np.zeros((0, 3))
+        if clear == 2.5:
+            plant_trees(into, rng, feet, kind.tree_height, conifers=kind.conifers)
+        else:
+            plant_bushes(into, rng, feet)

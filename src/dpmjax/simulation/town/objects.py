@@ -16,7 +16,6 @@ from dpmjax.simulation.town.primitives import POLE, SOFT, SOLID, Bodies, pack_bo
 
 _SUNK_M = 1.0  # Houses and walls reach below the ground, which may slope.
 _NUM_TUFTS = 5
-_BASE = 0.15  # Most of a conifer's crown begins at this part of its height.
 Size = tuple[float, float]
 
 
@@ -269,7 +268,7 @@ def plant_trees(
     count = len(feet)
     tall, is_conifer = rng.uniform(*height, count), rng.random(count) < conifers
     radius = np.where(is_conifer, 0.13, rng.uniform(0.16, 0.3, count)) * tall
-    base = np.where(is_conifer, _BASE, rng.uniform(0.15, 0.4, count)) * tall
+    base = np.where(is_conifer, 0.15, rng.uniform(0.15, 0.4, count)) * tall
     thick = rng.uniform(0.012, 0.022, count) * tall
     zero = np.zeros(count)
     trunk = 0.5 * (base + tall)

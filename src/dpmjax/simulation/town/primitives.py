@@ -20,9 +20,6 @@ LANE_STEP_M = 2.0
 CELL_M = 0.5
 # Road users nearer to the sensor than this are left out, because the sensor's own car is there.
 _CLEARANCE_M = 4.0
-# Least and largest half length of cars. Shorter road users are people, longer ones are lorries: one box above the
-# street.
-_CAR_LENGTH_M = (0.5, 2.9)
 
 
 # Kinds of surfaces.
@@ -187,7 +184,8 @@ def traffic_boxes(traffic: RoadUsers, sensor: Float[Array, " 3"], time: Float[Ar
     left = jnp.stack([-heading[:, 1], heading[:, 0], jnp.zeros(len(heading))], axis=-1)
     foot = here + traffic.sides[:, None] * left
     is_free = ((foot[:, :2] - sensor[:2]) ** 2).sum(-1) > _CLEARANCE_M**2
-    low, high = _CAR_LENGTH_M
+    # Shorter road users are people, longer ones are lorries: one box above the street.
+    low, high = (0.5, 2.9)
     is_car = (traffic.half_sizes[:, 0] > low) & (traffic.half_sizes[:, 0] < high)
     # Body and cabin of a car divide the height above 0.25 m as 3 : 2.
     room = traffic.half_sizes[:, 2] - 0.125

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, PRNGKeyArray
-from numpy.typing import NDArray
 
 from dpmjax.checks import require_fields, require_shape, require_value
 from dpmjax.geometry import rigid
@@ -25,12 +24,6 @@ from dpmjax.types import AnyArray, PointCloud
 _REFLECTIVITY = np.array([0.0, 0.17, 0.35, 0.4, 0.35, 0.3], np.float32)
 # Roughness of each surface, for shutters, plaster and paintwork.
 _ROUGHNESS_M = np.array([0.0, 0.0, 0.025, 0.0, 0.01, 0.02], np.float32)
-_BIAS_STREAM = 8152
-_GLASS_RETURNS = 0.35
-# Largest number of sectors of a turn, and of bands of elevation of a sector.
-_MAX_SECTORS, _MAX_BANDS = 72, 2
-# Width of the transition at the range of half loss, in natural logarithms of range.
-_FADE = 0.18
 # Least and largest step in range that the length of a pulse can mix, m.
 _EDGE_M = (0.2, 2.5)
 
@@ -161,22 +154,14 @@ def _scan_near(near: NearWorld, pose: Array, twist: Array, *, key: PRNGKeyArray,
     directions = _by_beam(rays.directions, sensor)
     ranges = _mix_edges(_by_beam(hits.ranges, sensor), sensor, mix, part)
     rough = jnp.asarray(_ROUGHNESS_M)[_by_beam(hits.surfaces, sensor)]
-    ranges += jnp.sqrt(sensor.range_noise_m**2 + rough**2) * ndtri(noise) + _beam_bias(sensor)
-    is_back = (loss < probability) & _is_in_view(sensor)
-    mask = is_back & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
-    return PointCloud(points=jnp.where(mask[:, None], ranges[:, None] * directions, 0.0), mask=mask)
-
-
-def _beam_bias(sensor: LidarSensor) -> NDArray[np.float32]:
-    """Draws the constant error of the range of each ray, m; the same in every scan."""
-    biases = np.random.default_rng(_BIAS_STREAM).normal(size=len(sensor.elevations_deg))
-    return np.repeat(np.float32(sensor.beam_bias_m) * biases.astype(np.float32), sensor.num_azimuths)
-
-
-def _is_in_view(sensor: LidarSensor) -> NDArray[np.bool_]:
-    """Returns True for the rays within the view."""
+    # The constant range error of each beam is the same in every scan.
+    biases = np.random.default_rng(8152).normal(size=len(sensor.elevations_deg)).astype(np.float32)
+    bias = np.repeat(np.float32(sensor.beam_bias_m) * biases, sensor.num_azimuths)
+    ranges += jnp.sqrt(sensor.range_noise_m**2 + rough**2) * ndtri(noise) + bias
     azimuths_deg = 180 - 360 / sensor.num_azimuths * (np.arange(sensor.num_azimuths) + 0.5)
-    return np.tile(np.abs(azimuths_deg) <= 0.5 * sensor.view_deg, len(sensor.elevations_deg))
+    is_in_view = np.tile(np.abs(azimuths_deg) <= 0.5 * sensor.view_deg, len(sensor.elevations_deg))
+    mask = (loss < probability) & is_in_view & (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
+    return PointCloud(points=jnp.where(mask[:, None], ranges[:, None] * directions, 0.0), mask=mask)
 
 
 def _mix_edges(ranges: Float[Array, " b"], sensor: LidarSensor, choice: Array, part: Array) -> Float[Array, " b"]:
@@ -199,7 +184,10 @@ def make_rays(sensor: LidarSensor, phase: Float[Array, ""], motion: Float[Array,
     Returns:
         The rays, in the sensor frame.
     """
-    (num_sectors, num_bands), num_beams = _ray_shape(sensor), len(sensor.elevations_deg)
+    num_beams = len(sensor.elevations_deg)
+    # Sectors of whole columns, and bands of whole beams.
+    num_sectors = max(count for count in range(1, 73) if sensor.num_azimuths % count == 0)
+    num_bands = 2 if num_beams % 2 == 0 else 1
     step = 2 * np.pi / sensor.num_azimuths
     # Clockwise from straight behind.
     columns = (np.pi - step * (np.arange(sensor.num_azimuths) + 0.5)).astype(np.float32)
@@ -217,13 +205,6 @@ def make_rays(sensor: LidarSensor, phase: Float[Array, ""], motion: Float[Array,
     return Rays(rays, phase + jnp.asarray(columns.mean(axis=1)), jnp.zeros(rays.shape[:-1]), T_lidar_sector)
 
 
-def _ray_shape(sensor: LidarSensor) -> tuple[int, int]:
-    """Returns the largest number of sectors of whole columns, and of bands of whole beams."""
-    num_beams = len(sensor.elevations_deg)
-    sectors = max(count for count in range(1, _MAX_SECTORS + 1) if sensor.num_azimuths % count == 0)
-    return sectors, max(count for count in range(1, _MAX_BANDS + 1) if num_beams % count == 0)
-
-
 def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s g c b"]:
     """Computes the probability of a return of each ray; 0 without a hit."""
     # Half of the returns are lost at `half_loss_m`, scaled by the root of the reflectivity (the energy falls with the
@@ -233,8 +214,8 @@ def _return_probability(hits: Hits, sensor: LidarSensor) -> Float[Array, "s g c 
     half_loss = sensor.half_loss_m * jnp.sqrt(reflectivity / 0.2) * jnp.maximum(hits.cosines, 1e-4) ** 0.25
     excess = jnp.log(jnp.maximum(half_loss, 1e-3)) - jnp.log(jnp.minimum(hits.ranges, 1e6))
     is_hit = hits.surfaces != NOTHING
-    base = (1.0 - sensor.drop_rate) * jnp.where(hits.is_glass, _GLASS_RETURNS, 1.0)
-    return jnp.where(is_hit, base * jax.nn.sigmoid(excess / _FADE), 0.0)
+    base = (1.0 - sensor.drop_rate) * jnp.where(hits.is_glass, 0.35, 1.0)
+    return jnp.where(is_hit, base * jax.nn.sigmoid(excess / 0.18), 0.0)
 
 
 def _by_beam(values: Array, sensor: LidarSensor) -> Array:

@@ -20,12 +20,8 @@ from dpmjax.simulation.town.streets import Streets, arc_lengths, resample
 PAVEMENT_M = 2.2
 _MARGIN_M = 70.0
 _TILE = 256
-_KERB_M = 0.12
 # Largest distance of two passes of a place, least path length between them, and number of neighbours searched.
-_NEAR_M, _LEAST_WAY_M, _NUM_NEAR = 6.0, 30.0, 64
 _STEEPEST = 0.2
-# Weight of equal heights of two passes relative to a step; the passes lie up to half a metre apart along the path.
-_TIE_WEIGHT = 0.01
 
 
 @dataclass(frozen=True)
@@ -114,7 +110,7 @@ def _through(support: FloatArray, origin: FloatArray, shape: tuple[int, int]) ->
 def _cross_section(distance: FloatArray) -> FloatArray:
     """Computes the profile of a cambered street, a kerb, a pavement, and gardens a little higher."""
     camber = 0.02 * np.clip(-distance, 0, 5)
-    kerb = _KERB_M * np.clip((distance + 0.25) / 0.5, 0, 1)
+    kerb = 0.12 * np.clip((distance + 0.25) / 0.5, 0, 1)
     return camber + kerb + 0.15 * np.clip((distance - PAVEMENT_M) / 2.0, 0, 1)
 
 
@@ -199,7 +195,8 @@ def with_equal_passes(positions: FloatArray) -> FloatArray:
     pairs = _passes(positions[:, :2], arc_lengths(positions))
     steps = np.column_stack([np.arange(count - 1), np.arange(1, count)])
     ends = np.vstack([steps, pairs])
-    weights = np.repeat([1.0, _TIE_WEIGHT], [len(steps), len(pairs)])
+    # Two passes lie up to half a metre apart along the path, so their ties are weak.
+    weights = np.repeat([1.0, 0.01], [len(steps), len(pairs)])
     climbs = np.clip(np.diff(positions[:, 2]), -_STEEPEST, _STEEPEST)
     wanted = np.concatenate([climbs, np.zeros(len(pairs))])
     rows = np.repeat(np.arange(len(ends)), 2)
@@ -214,9 +211,9 @@ def with_equal_passes(positions: FloatArray) -> FloatArray:
 
 def _passes(places: FloatArray, way: FloatArray) -> np.ndarray:
     """Returns rows (m, 2) of each revisited position and of the nearest position of another pass."""
-    distances, rows = KDTree(places).query(places, min(_NUM_NEAR, len(places)), distance_upper_bound=_NEAR_M)
+    distances, rows = KDTree(places).query(places, min(64, len(places)), distance_upper_bound=6.0)
     is_found, rows = np.isfinite(distances), np.asarray(rows)
-    is_other = is_found & (np.abs(way[np.where(is_found, rows, 0)] - way[:, None]) > _LEAST_WAY_M)
+    is_other = is_found & (np.abs(way[np.where(is_found, rows, 0)] - way[:, None]) > 30.0)
     has_other = is_other.any(axis=1)
     first = is_other.argmax(axis=1)
     return np.column_stack([np.flatnonzero(has_other), rows[has_other, first[has_other]]])
