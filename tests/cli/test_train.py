@@ -16,7 +16,7 @@ import pytest
 from dpmjax.cli import train_preparation, train_run
 from dpmjax.cli.run import CHECKPOINTS, HISTORY
 from dpmjax.cli.train import TrainOptions, for_devices, training_settings
-from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
+from dpmjax.cli.train_run import Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
     Evaluation,
@@ -63,7 +63,7 @@ def train_both(folder: Path, *, stop_after: int = 99):
 
 
 def train(folder: Path, *, stop_after: int = 99, total_s: float = math.inf):
-    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=KINDS)
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL)
     records = Records(run_in(folder), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
@@ -123,17 +123,16 @@ def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(tmp_pa
     assert nothing == Selection(None, "the last step: no drive has held-out places")
     some = train_run.draw_selection(TRAINING, 4, [toy.drive, lambda: toy.drive(1)], "the drives")
     assert some.chosen_by == "the drives"
-    assert [pairs.kind for pairs in some.of_scans.pairs] == list(KINDS[:2])
-    assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 4
-    assert max(pairs.sources.max() for pairs in some.pairs.pairs) >= 24  # of the second drive
+    assert [len(rows) for rows in some.pairs.pairs.values()] == [4, 4]
+    assert max(rows.max() for rows in some.pairs.pairs.values()) >= 24  # of the second drive
 
 
 def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path, monkeypatch) -> None:
     r2 = np.array([0.75, 1.0, -0.25])
-    recalls = (registration_recall(np.eye(4)[None], np.eye(4)[None]),)
-    found = Evaluation(recalls, (), r2, toy.cloud(np.zeros((1, 3))))
+    recalls = {"near": registration_recall(np.eye(4)[None], np.eye(4)[None])}
+    found = Evaluation(recalls, {}, r2, toy.cloud(np.zeros((1, 3))))
     monkeypatch.setattr(train_run.dpm, "evaluate_registration", lambda model, pairs: found)
-    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL, kinds=KINDS[:1]), np.ones(())
+    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL), np.ones(())
     records = Records(run_in(tmp_path), TRAINING, Selection(nothing, "a toy"), seed=0)
     report = TrainingReport(one, ObjectiveTerms(one, one, one, one, np.ones((), int)), one, one)
     with records:
@@ -217,7 +216,7 @@ def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(t
     assert settings.learning_rate == pytest.approx(0.2 * training_settings(TrainOptions()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
-    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=KINDS)
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL)
     sets = Selection(pairs, "a toy")
     with Records(run_in(tmp_path), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax import deeppointmap, simulation
+from dpmjax import simulation
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK
 from dpmjax.cli.run_folder import load_json
 from dpmjax.deeppointmap import (
@@ -20,8 +20,9 @@ from dpmjax.deeppointmap import (
     Calibration,
     LogisticModel,
     MatchEvidence,
+    calibration,
 )
-from dpmjax.deeppointmap.scan_evaluation import StagedRegistration
+from dpmjax.deeppointmap.evaluation import StagedRegistration
 from experiments import dpm_calibrate
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
@@ -57,9 +58,9 @@ def kinds(monkeypatch) -> list[str | None]:
         return StagedRegistration(T, T, T, evidence, 0.5, 0.0)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(deeppointmap, "encode", lambda model, points, num_elements: points)
-    monkeypatch.setattr(deeppointmap, "register_in_stages", staged)
-    monkeypatch.setattr(deeppointmap, "register_clouds", lambda *_: motions[-1])
+    monkeypatch.setattr(calibration, "encode", lambda model, points, num_elements: points)
+    monkeypatch.setattr(calibration, "register_in_stages", staged)
+    monkeypatch.setattr(calibration, "register_clouds", lambda *_: motions[-1])
     return kinds
 
 

@@ -184,15 +184,11 @@ def fill_overlap(
 
     def work(drive: str) -> cli.Row:
         found = deeppointmap.evaluate_overlap(model, by_name[drive], num_pairs, seed=seed)
-        head = None if found.by_head is None else found._replace(probability=found.by_head)
-        return {
-            "num_pairs": len(found.is_overlap),
-            "has_revisits": found.has_revisits,
-            "auc": found.area_under_curve,
-            "brier": found.brier_score,
-            "auc_head": None if head is None else head.area_under_curve,
-            "brier_head": None if head is None else head.brier_score,
-        }
+        row: cli.Row = {"num_pairs": len(found.is_overlap), "has_revisits": found.has_revisits}
+        for name, probability in (("", found.probability), ("_head", found.by_head)):
+            for measure, rate in (("auc", metrics.area_under_curve), ("brier", metrics.brier_score)):
+                row[f"{measure}{name}"] = None if probability is None else rate(probability, found.is_overlap)
+        return row
 
     return cli.fill_table(run, [{"drive": name} for name in by_name], work, "overlap.csv")
 

@@ -63,8 +63,6 @@ class TrainOptions(RunOptions):
     is the only stage, the head of --weights is trained."""
     calibrate: bool = True
     """Fit the confidence and the overlap afterwards, on pairs of the data."""
-    without: tuple[Literal["offset-head", "coarse-loss", "curriculum", "occlusion"], ...] = ()
-    """Leave these parts out, to measure their benefit (the paper's Table 2). tiny and small have no offset head."""
     frame: Literal["lidar", "local"] | None = None
     """Frame of the encoder's features: the lidar, or the wall at each point. Without it, the preset decides."""
     steps: Annotated[int | None, arg(metavar="N"), cli.Bound(3)] = None
@@ -293,8 +291,6 @@ def training_settings(options: TrainOptions, first: deeppointmap.Model | None = 
     settings = replace(settings, curriculum=stages, sampling=replace(settings.sampling, num_scans=num_scans))
     if jax.default_backend() != "cpu":
         settings = replace(settings, scans_at_once=num_scans)
-    for part in options.without:
-        settings = deeppointmap.without(settings, part)
     return settings if options.steps is None else settings.with_steps(options.steps)
 
 
@@ -315,20 +311,19 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers
 
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> tuple[deeppointmap.Evaluation | None, Numbers]:
-    """Returns recall and errors of the trained network, and of the untrained one for pairs of scans alone."""
-    from dpmjax.cli.train_run import KIND_NAMES
+    """Returns recall and errors of the trained network, and of the untrained one."""
+    from dpmjax.cli.train_run import RECALLS
 
-    pairs, of_scans = records.selection.pairs, records.selection.of_scans
-    if pairs is None or of_scans is None:
+    pairs = records.selection.pairs
+    if pairs is None:
         return None, {}
-    models = {"": (trained.model, pairs), "_untrained": (records.untrained, of_scans)}
-    metrics: Numbers = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
+    models = {"": trained.model, "_untrained": records.untrained}
+    metrics: Numbers = {"num_held_out_pairs": len(next(iter(pairs.pairs.values())))}
     evaluations = {}
-    for suffix, (model, some) in tqdm(models.items(), desc="evaluate", unit=" networks", dynamic_ncols=True):
-        evaluation = evaluations[suffix] = deeppointmap.evaluate_registration(model, some)
-        near = evaluation.recalls[0]
-        of_kinds = zip(some.pairs, evaluation.recalls, strict=True)
-        metrics |= {f"{KIND_NAMES[of_kind.kind]}{suffix}": recall.recall for of_kind, recall in of_kinds}
+    for suffix, model in tqdm(models.items(), desc="evaluate", unit=" networks", dynamic_ncols=True):
+        evaluation = evaluations[suffix] = deeppointmap.evaluate_registration(model, pairs)
+        near, *_ = evaluation.recalls.values()
+        metrics |= {f"{RECALLS[band]}{suffix}": recall.recall for band, recall in evaluation.recalls.items()}
         metrics[f"translation_error_median{suffix}_m"] = float(np.median(near.translation_errors_m))
         metrics[f"rotation_error_median{suffix}_deg"] = float(np.median(near.rotation_errors_deg))
     return evaluations[""], metrics

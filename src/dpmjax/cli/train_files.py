@@ -70,10 +70,11 @@ def draw_curves(run: Run) -> None:
 
 def draw_matches(run: Run, evaluation: deeppointmap.Evaluation, pairs: deeppointmap.EvaluationPairs) -> None:
     """Draws matches.png: the held-out pair with the median error."""
-    errors, of_kind = evaluation.recalls[0].translation_errors_m, pairs.pairs[0]
+    band = next(iter(pairs.pairs))
+    errors = evaluation.recalls[band].translation_errors_m
     number = int(np.argsort(errors)[len(errors) // 2])
-    a, b = int(of_kind.sources[number, 0]), int(of_kind.targets[number, 0])
-    matches, T_true = evaluation.matches[0], pairs.true_motions(of_kind)[number]
+    a, b = pairs.pairs[band][number].tolist()
+    matches, T_true = evaluation.matches[band], pairs.true_motions(band)[number]
     is_inlier = matches.is_inlier[number]
     p = np.asarray(evaluation.clouds.positions[a])[matches.source_indices[number][is_inlier]]
     q = np.asarray(evaluation.clouds.positions[b])[matches.target_indices[number][is_inlier]]

@@ -22,40 +22,30 @@ from dpmjax.sequences import LidarSequence
 
 # Largest number of scans of an evaluation, all drives together.
 MAX_EVALUATED_SCANS = 96
-KINDS = (dpm.PairKind(2.0, 10.0), dpm.PairKind(10.0, 20.0), dpm.PairKind(2.0, 10.0, 4), dpm.PairKind(10.0, 20.0, 4))
-"""Pairs of scans, near and far, which choose the model; pairs of maps of four scans, which the last model registers."""
-
-KIND_NAMES = dict(zip(KINDS, ("recall", "recall_far", "recall_maps", "recall_maps_far"), strict=True))
 OVERLAP_STAGE = "overlap"
 BEST_CHECKPOINTS, OVERLAP_CHECKPOINTS = "checkpoints_best", "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
 SHOWN = ("loss", "pairing", "offset", "top1_accuracy", "score")
 MEASURES = (*SHOWN, "coarse", "gradient_norm", "learning_rate")
-RECALLS = ("recall", "recall_far")
+# Names of the recalls of the pairs that choose the model.
+RECALLS = {"near": "recall", "middle": "recall_far"}
 OVERLAP_MEASURES = ("overlap_loss", "overlap_accuracy")
 # Coefficients of determination of predicted offsets, on the pairs that choose the model; empty without an offset head.
 OFFSETS = ("offset_r2_normal", "offset_r2_along", "offset_r2_up")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS, *OFFSETS, *OVERLAP_MEASURES)
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS.values(), *OFFSETS, *OVERLAP_MEASURES)
 
 
 class Selection(NamedTuple):
     """Pairs that choose the model.
 
     Attributes:
-        pairs: pairs of scans and of maps. None if no drive has held-out places; then the last model is kept.
+        pairs: pairs of scans. None if no drive has held-out places; then the last model is kept.
         chosen_by: a name of the pairs, for `metrics.json`.
     """
 
     pairs: dpm.EvaluationPairs | None
     chosen_by: str
-
-    @property
-    def of_scans(self) -> dpm.EvaluationPairs | None:
-        """The pairs of scans alone, which are measured during the training."""
-        if self.pairs is None:
-            return None
-        return self.pairs._replace(pairs=tuple(some for some in self.pairs.pairs if some.kind.num_scans == 1))
 
 
 def part_of_drive(source: cli.Source, part: Literal["training", "held_out"]) -> LidarSequence:
@@ -91,7 +81,7 @@ def draw_selection(
             drive, max_scans = source(), max(2, MAX_EVALUATED_SCANS // len(drives))
             yield drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
 
-    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model, kinds=KINDS)
+    pairs = dpm.draw_evaluation_pairs(opened(), max(1, num_pairs // len(drives)), settings.model)
     if not pairs.pairs:
         return Selection(None, "the last step: no drive has held-out places")
     return Selection(pairs, chosen_by)
@@ -139,7 +129,7 @@ class Records:
         self.earlier_s = max((float(row["run_s"]) for row in earlier), default=0.0)
         total = int(self.start.state.end) if "registration" in settings.stages else 0
         self._bar = tqdm(total=total, initial=first, desc="train", unit=" steps", dynamic_ncols=True)
-        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS, *OFFSETS), math.nan)
+        self._last_saved, self._recalls = time.perf_counter(), dict.fromkeys((*RECALLS.values(), *OFFSETS), math.nan)
         self.run_s, self._pace_s = self.earlier_s, math.nan
         self.seed, self._seen = seed, set[Layout]()
         if total:
@@ -147,14 +137,13 @@ class Records:
 
     def evaluate(self, model: dpm.Model) -> float:
         """Returns the mean recall of the pairs of scans that choose the model, and measures their offsets."""
-        pairs = self.selection.of_scans
+        pairs = self.selection.pairs
         if pairs is None:
             return math.nan
         found = dpm.evaluate_registration(model, pairs)
-        named = zip(pairs.pairs, found.recalls, strict=True)
-        self._recalls |= {KIND_NAMES[some.kind]: recall.recall for some, recall in named}
+        self._recalls |= {RECALLS[band]: recall.recall for band, recall in found.recalls.items()}
         self._recalls |= dict(zip(OFFSETS, found.offset_r2.tolist(), strict=True))
-        return float(np.mean([recall.recall for recall in found.recalls]))
+        return float(np.mean([recall.recall for recall in found.recalls.values()]))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint every few minutes."""
@@ -209,9 +198,8 @@ class Records:
                     self._overlap_checkpoints.save(record.step, state)
                     self._last_saved = time.perf_counter()
 
-            hooks = dpm.OverlapHooks(on_report, stop)
-            start = self.overlap_start
-            model, state = dpm.train_overlap(store, trained.model, self._settings, seed=seed, start=start, hooks=hooks)
+            hooks: dict[str, Any] = {"on_report": on_report, "stop": stop, "start": self.overlap_start}
+            model, state = dpm.train_overlap(store, trained.model, self._settings, seed=seed, **hooks)
         self._overlap_checkpoints.save(int(state.step), state)
         stopped_by = 0 if int(state.step) >= total else stop()
         return trained._replace(model=model, overlap=state, stopped_by=stopped_by)

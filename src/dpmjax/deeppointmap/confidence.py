@@ -247,44 +247,22 @@ def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f
     return np.asarray(expit(np.asarray(features, np.float64) @ np.asarray(model.weights) + model.bias))
 
 
-def fit_logistic(
-    names: tuple[str, ...],
-    features: Float[np.ndarray, "n f"],
-    is_right: Bool[np.ndarray, " n"],
-    shares: Float[np.ndarray, " n"] | float = 1.0,
-) -> LogisticModel:
-    """Fits a logistic model by maximum likelihood, with a small ridge on standardised weights.
-
-    Args:
-        names: names of the features.
-        features: features of held-out registrations.
-        is_right: True for right registrations.
-        shares: factors of the probability, in (0, 1], as of places that look alike in `calibrated_probability`.
-
-    Returns:
-        The model; its probability times the share is the fitted probability.
-
-    Raises:
-        ValueError: if all are right, or none.
-    """
-    weights, bias = fit_weights(features, is_right, shares)
-    return LogisticModel(names, tuple(map(float, weights)), bias)
-
-
 def fit_weights(
     features: Float[np.ndarray, "n f"],
     is_right: Bool[np.ndarray, " n"],
     shares: Float[np.ndarray, " n"] | float = 1.0,
-) -> tuple[Float[np.ndarray, " f"], float]:
-    """Fits the weights and the constant of a logistic model; see `fit_logistic`.
+) -> tuple[tuple[float, ...], float]:
+    """Fits the weights and the constant of a logistic model by maximum likelihood.
+
+    A small ridge on the standardised weights keeps them finite.
 
     Args:
-        features: features of examples.
-        is_right: True for right examples.
-        shares: factors of the probability.
+        features: features of held-out registrations.
+        is_right: True for right ones.
+        shares: factors of the probability, in (0, 1], as of places that look alike in `calibrated_probability`.
 
     Returns:
-        Weights and constant.
+        Weights and constant; the probability of the model times the share is the fitted probability.
 
     Raises:
         ValueError: if all are right, or none.
@@ -307,7 +285,7 @@ def fit_weights(
 
     found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
-    return weights, float(found[-1] - weights @ mean)
+    return tuple(weights.tolist()), float(found[-1] - weights @ mean)
 
 
 def with_confidence(match: Registration, evidence: MatchEvidence, calibration: Calibration | None) -> Registration:

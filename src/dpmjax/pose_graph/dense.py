@@ -42,6 +42,7 @@ class DenseSolution(NamedTuple):
     converged: Bool[Array, ""]
 
 
+@partial(jax.jit, static_argnames="num_steps")
 def solve_dense(
     poses: Float[AnyArray, "n *s"],
     edges: Edges,
@@ -80,14 +81,10 @@ def solve_dense(
     require_count("num_steps", num_steps)
     start, edges = as_arrays(poses, edges, edge_mask)
     fixed = jnp.arange(len(poses)) == 0 if is_fixed is None else as_mask("is_fixed", is_fixed, (len(poses),))
-    found = _solve_dense(start, edges, fixed, num_steps=num_steps)
-    return found._replace(poses=jnp.where(joined_nodes(start, edges), found.poses, as_float("poses", poses)))
-
-
-@partial(jax.jit, static_argnames="num_steps")
-def _solve_dense(poses: Array, edges: Edges, is_fixed: Array, *, num_steps: int) -> DenseSolution:
-    found, converged = _solve(num_steps, poses, edges, is_fixed)
-    return DenseSolution(found, normal_blocks(found, edges)[0].sum(), converged > 0)
+    found, converged = _solve(num_steps, start, edges, fixed)
+    chi2 = normal_blocks(found, edges)[0].sum()
+    poses = jnp.where(joined_nodes(start, edges), found, as_float("poses", poses))
+    return DenseSolution(poses, chi2, converged > 0)
 
 
 class _State(NamedTuple):

@@ -23,6 +23,7 @@ from dpmjax.pose_graph.graph import TANGENT_SIZE, Edges
 from dpmjax.types import AnyArray
 
 
+@jax.jit
 def residuals(
     poses: Float[AnyArray, "n *s"], edges: Edges, edge_mask: Bool[AnyArray, " e"] | None = None
 ) -> Float[Array, "e d"]:
@@ -48,12 +49,7 @@ def residuals(
     >>> residuals(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.75]]), edges).tolist()
     [[0.0, 0.0, 0.25]]
     """
-    return _residuals(*as_arrays(poses, edges, edge_mask))
-
-
-@jax.jit
-def _residuals(poses: Float[Array, "n *s"], edges: Edges) -> Float[Array, "e d"]:
-    return _log(_differences(poses, edges)[0])
+    return _log(_differences(*as_arrays(poses, edges, edge_mask))[0])
 
 
 def as_arrays(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -254,36 +254,6 @@ class TrainingConfig:
         if self.num_epochs is None:
             return self
         return self.with_steps(math.ceil(self.num_epochs * num_scans / num_samples))
-
-
-# Parts that DeepPointMap's Table 2 leaves out.
-TrainingPart = Literal["offset-head", "coarse-loss", "curriculum", "occlusion"]
-
-
-def without(config: TrainingConfig, part: TrainingPart) -> TrainingConfig:
-    """Leaves a part of the training out (DeepPointMap Table 2).
-
-    Args:
-        config: settings of training.
-        part: "curriculum" trains with the largest groups from the first step on.
-
-    Returns:
-        A new configuration with the same number of steps.
-
-    Raises:
-        ValueError: an unknown part.
-    """
-    require_one_of("part", part, get_args(TrainingPart))
-    if part == "offset-head":
-        decoder = replace(config.model.decoder, predicts_offsets=False)
-        objective = replace(config.objective, offset_weight=0.0)
-        return replace(config, model=replace(config.model, decoder=decoder), objective=objective)
-    if part == "coarse-loss":
-        return replace(config, objective=replace(config.objective, coarse_weight=0.0))
-    if part == "curriculum":
-        largest = max(stage.max_group for stage in config.curriculum)
-        return replace(config, curriculum=(CurriculumStage(largest, config.num_steps),))
-    return replace(config, augment=replace(config.augment, sector_probability=0.0, box_probability=0.0))
 
 
 def training_preset(name: Preset) -> TrainingConfig:

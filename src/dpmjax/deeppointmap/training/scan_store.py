@@ -105,15 +105,12 @@ class ScanStore:
         return pyramids[number, variant]
 
 
-def prepare_drives(
-    drives: Sequence[LidarSequence], config: TrainingConfig, *, folder: Path | None = None, seed: int = 0
-) -> ScanStore:
+def prepare_drives(drives: Sequence[LidarSequence], config: TrainingConfig, *, seed: int = 0) -> ScanStore:
     """Prepares the scans of all drives, in order.
 
     Args:
         drives: drives with poses.
         config: settings of training.
-        folder: folder of prepared scans for later calls; None keeps them in memory.
         seed: seed of the variants.
 
     Returns:
@@ -130,7 +127,7 @@ def prepare_drives(
     prepared = []
     for number, drive in enumerate(drives):
         LOGGER.info("prepares %s, %d scans, drive %d of %d", drive.name, len(drive), number + 1, len(drives))
-        prepared.append(prepare_drive(drive.take(drive.has_reference), config, folder=folder, seed=seed))
+        prepared.append(prepare_drive(drive.take(drive.has_reference), config, seed=seed))
     return ScanStore(prepared)
 
 
