@@ -175,9 +175,9 @@ def test_the_best_of_equal_models_is_the_later() -> None:
 
 @pytest.mark.slow
 def test_batches_made_ahead_are_those_made_alone() -> None:
-    with SampleMaker(toy.store(), TRAINING, seed=0) as maker:
-        for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
-            toy.assert_trees_equal(batch, maker(step))
+    maker = SampleMaker(toy.store(), TRAINING, seed=0)
+    for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
+        toy.assert_trees_equal(batch, maker(step))
 
 
 def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:

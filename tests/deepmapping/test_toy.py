@@ -58,14 +58,6 @@ def test_both_forms_start_alike_and_the_first_network_step_is_descent_on_all_of_
     assert run.state.params.z != start.z
 
 
-def test_seeds_are_starts_and_none_is_dropped() -> None:
-    run = fit(toy_problem(DIRECT), None, key=KEY, num_starts=5)
-    assert run.poses.shape == (5,)
-    assert run.report.terms.shape == (5, 20)
-    alone = fit(toy_problem(DIRECT), None, key=jax.random.split(KEY, 5)[3])
-    np.testing.assert_allclose(run.poses[3], alone.poses, **ACCUMULATED)
-
-
 def test_network_is_a_chain_of_linear_maps_and_elus() -> None:
     start = toy_problem(SHORT).init(SHORT, jax.random.key(1), None)
     layers = [start.net["params"][f"Dense_{k}"] for k in range(5)]

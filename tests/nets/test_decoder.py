@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, correlate, init_model, model_preset, overlap
-from dpmjax.deeppointmap.model import overlap_logit, predict_offsets, similarity_features
+from dpmjax.deeppointmap.model import decode, predict_offsets
 from dpmjax.nets import DecoderConfig, attention
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
@@ -78,7 +78,11 @@ def test_gradient_is_finite(num_valid: int) -> None:
 def loss_and_gradient(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> jax.Array:
     p, q = correlate(model, a, b)
     offsets = predict_offsets(model, p.features, q.features)
-    return jnp.sum(offsets**2) + jnp.sum(similarity_features(model, q) ** 2) + overlap_logit(model, p, q)
+    return (
+        jnp.sum(offsets**2)
+        + jnp.sum(decode(model, q.features, part="similarity_head") ** 2)
+        + decode(model, p, q, part="overlap_logit")
+    )
 
 
 def test_gradient_of_attention_in_chunks_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:

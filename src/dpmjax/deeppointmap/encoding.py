@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points, require_some, require_type, runs_on_host
+from dpmjax.checks import as_host_points, require_type, require_value, runs_on_host
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
@@ -76,7 +76,7 @@ def encode_scans(model: Model, scans: Sequence[RawScan] | Path, *, num_elements:
     """
     require_type("model", model, Model, "load_model")
     drive: Sequence[RawScan] = read_path(scans, "io.open_lidar_sequence")
-    require_some("scans", drive)
+    require_value(len(drive) > 0, "scans", "at least one", "none")
     pyramids = (pyramid_of_scan(points, model.config) for points in drive)
     return jax.tree.map(jnp.asarray, encode_pyramids(model, pyramids, num_elements=num_elements))
 

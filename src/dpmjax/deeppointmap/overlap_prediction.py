@@ -22,7 +22,7 @@ from dpmjax.checks import require_pairs, runs_on_host
 from dpmjax.deeppointmap.confidence import OverlapEvidence
 from dpmjax.deeppointmap.encoding import ScanOrCloud, descriptors_of, encode_scans
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
-from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
+from dpmjax.deeppointmap.model import Model, correlate, decode, descriptor_similarity, predict_offsets, unit_rows
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
@@ -196,7 +196,7 @@ def head_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Fl
         ValueError: if the head is not trained, or if the features have another width than the model.
     """
     require_overlap(replace(model, config=replace(model.config, overlap=None)))
-    return _probability(overlap_logit(model, *correlate(model, a, b)), a, b)
+    return _probability(decode(model, *correlate(model, a, b), part="overlap_logit"), a, b)
 
 
 def _probability(logit: Float[Array, ""], a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:

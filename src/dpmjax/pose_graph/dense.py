@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, require_count
-from dpmjax.geometry.implicit import solution_tangent
-from dpmjax.geometry.traced import with_axes_of
+from dpmjax.geometry.traced import solution_tangent, with_axes_of
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.pose_graph.residuals import as_arrays, joined_nodes, move, normal_blocks
 from dpmjax.types import AnyArray

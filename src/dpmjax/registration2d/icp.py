@@ -13,11 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, as_mask, as_points, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
-from dpmjax.geometry.implicit import solution_tangent
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
 from dpmjax.geometry.rigid import safe_sqrt
-from dpmjax.geometry.traced import is_usable, with_axes_of
+from dpmjax.geometry.traced import is_usable, solution_tangent, with_axes_of
 from dpmjax.types import AnyArray, with_short_repr
 
 _NORMAL_NEIGHBOURS = 6

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -267,10 +268,10 @@ def _run_steps(
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     speed, seen, stopped_by = Speed(), set[Layout](), 0
-    numbers = jax.process_index() * num_local + np.arange(num_local)
+    numbers = range(num_local * jax.process_index(), num_local * (jax.process_index() + 1))
     number, end = int(progress.state.step), int(progress.state.end)
-    with SampleMaker(store, config, seed=seed, numbers=numbers, num_in_step=jax.device_count()) as maker:
-        batches = maker.batches(number, max(end, config.num_steps))
+    maker = SampleMaker(store, config, seed, numbers=numbers, num_in_step=jax.device_count())
+    with closing(maker.batches(number, max(end, config.num_steps))) as batches:
         batch = next(batches) if number < end else None
         while batch is not None:
             stopped_by, left = map(int, from_first((int(hooks.stop()), hooks.steps_left(number))))
