@@ -257,7 +257,7 @@ def _poses(
     rows: Int[Array, " m"] | slice = _ALL,
 ) -> Float[Array, "m 4 4"]:
     """Computes the poses of these scans, by default of all (`Problem.poses`): T_start @ motion, in units of the fit."""
-    return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
+    return rigid.matmul(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
 
 
 def _depth_frame(scans: DepthScans, T: Float[Array, "n 4 4"]) -> MapFrame:

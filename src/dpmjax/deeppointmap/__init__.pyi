@@ -21,7 +21,6 @@ from .confidence import MatchEvidence as MatchEvidence
 from .confidence import calibrated_probability as calibrated_probability
 from .confidence import fit_weights as fit_weights
 from .confidence import logistic_probability as logistic_probability
-from .confidence import lookalike_share as lookalike_share
 from .encoding import encode as encode
 from .encoding import encode_scans as encode_scans
 from .encoding import pooled_vector as pooled_vector

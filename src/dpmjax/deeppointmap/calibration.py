@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
 from dpmjax import metrics
 from dpmjax.deeppointmap.confidence import (
@@ -26,7 +27,6 @@ from dpmjax.deeppointmap.confidence import (
     calibrated_probability,
     fit_weights,
     logistic_probability,
-    lookalike_share,
 )
 from dpmjax.deeppointmap.encoding import encode
 from dpmjax.deeppointmap.evaluation import (
@@ -315,7 +315,7 @@ def _gathered(rows: Sequence[Row], columns: Sequence[str], label: str, lookalike
     features = np.array([[row[name] for name in columns] for row in rows], float).reshape(-1, len(columns))
     place, is_right = (np.array([row.get(name, 0) for row in rows]) for name in ("place", label))
     gaps = np.array([row.get(lookalike_gap, np.inf) for row in rows], float)
-    return Examples(place, features, is_right.astype(bool), lookalike_share(gaps))
+    return Examples(place, features, is_right.astype(bool), expit(gaps))
 
 
 def rate_pair(calibration: Calibration, row: Row, *, of_clouds: bool) -> float:

@@ -217,21 +217,8 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
         probability = logistic_probability(calibration.of_elements, evidence.of_elements)
     else:
         probability = logistic_probability(calibration.of_clouds, evidence.of_clouds)
-    return float(lookalike_share(evidence.lookalike_gap) * probability)
-
-
-def lookalike_share(lookalike_gap: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Computes the share of the probability that a place keeps beside the best other one that looks alike.
-
-    One of two places under which the scans agree is right; the odds are those of their scores.
-
-    Args:
-        lookalike_gap: lead in log odds over the best other place.
-
-    Returns:
-        In [0, 1]; 1 for an infinite lead.
-    """
-    return np.asarray(expit(lookalike_gap))
+    # One of two places under which the scans agree is right; the odds are those of their scores.
+    return float(expit(evidence.lookalike_gap) * probability)
 
 
 def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:

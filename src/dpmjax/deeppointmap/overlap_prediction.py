@@ -33,7 +33,6 @@ from dpmjax.types import DescriptorCloud
 # Scans that are nearer to each other overlap.
 OVERLAP_M = 20.0
 
-MATCHING = MatchConfig(pair_ratio=1.0)
 # A quarter of the work of a registration: only the two best motions count.
 CONSENSUS = ConsensusConfig(num_seeds=48, num_rounds=3, num_motions=2)
 
@@ -231,7 +230,7 @@ def _best_motion(
 ) -> dict[str, Float[Array, ""]]:
     # The fields of `OverlapEvidence` that depend on the best motion.
     a, b = correlated
-    pairs = best_pairs(similarity, a.mask, b.mask, config=MATCHING)
+    pairs = best_pairs(similarity, a.mask, b.mask, config=MatchConfig(pair_ratio=1.0))
     rows, columns = pairs.source_indices, pairs.target_indices
     features_a, features_b = a.features[rows], b.features[columns]
     offsets = predict_offsets(model, features_a, features_b, directions_of(a)[rows])

@@ -22,7 +22,6 @@ from dpmjax.deeppointmap.confidence import (
     MAX_SCORE,
     MatchEvidence,
     gather_evidence,
-    lookalike_share,
     with_confidence,
 )
 from dpmjax.deeppointmap.encoding import (
@@ -407,7 +406,7 @@ def register_surfaces(source: RawScan, target: RawScan) -> ScanRegistration:
     agreement, surfaces = chosen.verification, (ends[0].surface, ends[1].surface)
     direction, sigma = weakest_direction(*surfaces, T, config.plane_radius_m)
     pairs = nearest_planes(*surfaces, T[None], config.plane_radius_m, config.num_samples).take(0)
-    confidence = float(expit(min(agreement.score, MAX_SCORE)) * lookalike_share(agreement.lookalike_gap))
+    confidence = float(expit(min(agreement.score, MAX_SCORE)) * expit(agreement.lookalike_gap))
     return ScanRegistration(
         T_target_source=T,
         confidence=min(confidence, CORRIDOR_CONFIDENCE) if agreement.num_slid else confidence,

@@ -148,7 +148,7 @@ def move(poses: Array, step: Float[Array, "n d"]) -> Array:
     Returns:
         `T_world_node`.
     """
-    return se2.compose(poses, step) if poses.ndim == 2 else rigid.compose(poses, rigid.exp(step))
+    return se2.compose(poses, step) if poses.ndim == 2 else rigid.matmul(poses, rigid.exp(step))
 
 
 def _differences(poses: Array, edges: Edges) -> tuple[Array, Array]:
@@ -159,7 +159,7 @@ def _differences(poses: Array, edges: Edges) -> tuple[Array, Array]:
 
 def _relative(target: Array, source: Array) -> Array:
     """Returns the poses of the sources in the frames of the targets."""
-    return se2.relative(target, source) if source.ndim == 2 else rigid.compose(rigid.inverse(target), source)
+    return se2.relative(target, source) if source.ndim == 2 else rigid.matmul(rigid.inverse(target), source)
 
 
 def _log(difference: Array) -> Float[Array, "e d"]:

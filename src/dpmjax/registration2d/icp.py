@@ -175,7 +175,7 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
         T, _, count = carry
         pairs = _find_pairs(source, target, normals, T)
         if metric == "plane":
-            T_new = rigid.compose(_step_to_planes(pairs, rigid.transform_points(T, centre)[0]), T)
+            T_new = rigid.matmul(_step_to_planes(pairs, rigid.transform_points(T, centre)[0]), T)
         else:
             T_new = jnp.where(pairs.weights.any(), weighted_svd(source.points, pairs.matched, pairs.weights), T)
         change = jnp.linalg.norm(rigid.transform_points(T_new, source.points) - pairs.points, axis=-1)
@@ -199,7 +199,7 @@ def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, A
     scales = jnp.where(jnp.arange(dim * (dim + 1) // 2) < dim, 1.0, of_angles).astype(T.dtype)
 
     def moved(step: Array) -> Array:
-        return rigid.compose(_about(scales * step, centre), T)
+        return rigid.matmul(_about(scales * step, centre), T)
 
     def balance(step: Array, source_points: Array, target_points: Array) -> Array:
         clouds = source._replace(points=source_points), target._replace(points=target_points)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -35,7 +36,6 @@ from dpmjax.deeppointmap.training.sampling import (
     ScanTable,
     arrange_groups,
     draw_groups,
-    stack,
 )
 from dpmjax.geometry.pyramid_storage import sampled_positions, stored_pyramids
 from dpmjax.scans.augment import random_motions_on_host
@@ -158,7 +158,9 @@ class SampleMaker:
         Returns:
             Samples of NumPy arrays, stacked.
         """
-        return stack([self._sample(step, number) for number in self.numbers])
+        samples = [self._sample(step, number) for number in self.numbers]
+        batch: RegistrationSample = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
+        return batch
 
     def batches(self, start: int, stop: int) -> Generator[RegistrationSample]:
         """Makes the batches of the steps from `start` to `stop - 1`, each some steps before it is needed.
