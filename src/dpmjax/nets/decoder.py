@@ -26,7 +26,6 @@ class DecoderConfig:
         model_channels: channels of a correlated descriptor; at least 6.
         num_layers: number of attention layers.
         num_heads: heads of each attention; divides `model_channels`.
-        shares_layers: True for the same weights in all layers, as in the paper; False for the published networks.
         is_crossed: True as in the published networks: positions are embedded, and descriptors attend to those of both
             clouds. With False they attend to the features of their own cloud alone, which describe the surroundings
             already. The result then depends on one cloud and not on positions, and training needs fewer steps.
@@ -37,7 +36,6 @@ class DecoderConfig:
     model_channels: int = 256
     num_layers: int = 3
     num_heads: int = 8
-    shares_layers: bool = False
     is_crossed: bool = True
     predicts_offsets: bool = True
 
@@ -149,8 +147,7 @@ class DescriptorDecoder(nn.Module):
         config = self.config
         channels = config.model_channels
         self.projection = linear(channels, "projection")
-        num_different = 1 if config.shares_layers else config.num_layers
-        self.layers = [AttentionLayer(config.num_heads, name=f"layer_{i}") for i in range(num_different)]
+        self.layers = [AttentionLayer(config.num_heads, name=f"layer_{i}") for i in range(config.num_layers)]
         self.similarity_head = TwoLayers(channels, channels)
         self.offset_head = OffsetHead(channels)
         self.overlap_head = OverlapHead(channels)
@@ -172,8 +169,8 @@ class DescriptorDecoder(nn.Module):
         if self.config.is_crossed:
             embeddings = embed_positions(jnp.concatenate([a.positions, b.positions]), self.config.model_channels)
         x = self.projection(jnp.concatenate([a.features, b.features]))
-        for i in range(self.config.num_layers):
-            x = self.layers[i % len(self.layers)](x, embeddings, masks)
+        for layer in self.layers:
+            x = layer(x, embeddings, masks)
         features_a, features_b = jnp.split(x, [a.mask.size])
         return _cleared(replace(a, features=features_a)), _cleared(replace(b, features=features_b))
 
