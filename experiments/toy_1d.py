@@ -64,7 +64,7 @@ def main(options: ToyOptions, run: cli.Run) -> cli.Row:
         {"initialization": one, "learning_rate": rate} for one in get_args(dm.Initialization) for rate in LEARNING_RATES
     ]
     summary = cli.summarize(cli.fill_table(run, cases, work), tuple(cases[0]), FORMS)
-    x_best, loss_best = dm.global_minimum()
+    x_best, loss_best = dm.GLOBAL_MINIMUM
     notes = [f"{name}: {share:.1%} at x = {x_best:.3f}, L = {loss_best:.3f}" for name, share in shares.items()]
     numbers = {"x_global": x_best, "loss_global": loss_best, "share_at_global_minimum": shares}
     return numbers | cli.write_summary(run, summary, *notes)
@@ -133,7 +133,7 @@ def choose_seed(network_x: np.ndarray, direct_x: np.ndarray) -> int:
 
 def is_at_minimum(x: np.ndarray) -> np.ndarray:
     """Returns True for ends at the global minimum."""
-    return np.abs(np.asarray(x, np.float64) - dm.global_minimum()[0]) < SAME_PLACE
+    return np.abs(np.asarray(x, np.float64) - dm.GLOBAL_MINIMUM[0]) < SAME_PLACE
 
 
 def share_at_minimum(x: np.ndarray) -> float:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_mask, as_points, require_count, require_shape
+from dpmjax.checks import as_float, as_mask, as_points, require_fields, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import motions_of_weights
 from dpmjax.geometry.traced import is_usable
@@ -51,8 +51,7 @@ class ConsensusConfig:
     num_motions: int = 24
 
     def __post_init__(self) -> None:
-        for name in ("num_seeds", "num_rounds", "num_motions"):
-            require_count(name, getattr(self, name))
+        require_fields(self, "num_seeds", "num_rounds", "num_motions", low=1)
 
 
 @flax.struct.dataclass

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_mask, as_points, require_count, require_positive, require_value
+from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive, require_value
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.geometry.traced import LARGEST_COORDINATE, is_usable
@@ -49,8 +49,7 @@ class PyramidStage:
     num_neighbours: int
 
     def __post_init__(self) -> None:
-        require_count("num_points", self.num_points)
-        require_count("num_neighbours", self.num_neighbours)
+        require_fields(self, "num_points", "num_neighbours", low=1)
         require_count("len(radii)", len(self.radii))
         for radius in self.radii:
             require_positive("radii", radius)

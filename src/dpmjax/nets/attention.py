@@ -74,13 +74,13 @@ def _attend_head(queries: jax.Array, keys: jax.Array, values: jax.Array, *, bias
 
     @jax.checkpoint
     def of_block(query: jax.Array) -> jax.Array:
-        logits = _product("cn,cm->nm", keys, query) + bias[:, None]
+        logits = jnp.einsum("cn,cm->nm", keys, query) + bias[:, None]
         # Finite even without any key, so that masked keys have a share of exactly zero.
         largest = jnp.max(lax.stop_gradient(logits), axis=0, initial=jnp.finfo(jnp.float32).min)
         shares = jnp.exp(logits - largest)
         total = jnp.sum(shares, axis=0)
         # Divided after the product: (c, m) numbers instead of (n, m).
-        return _product("cn,nm->cm", values, shares) / jnp.where(total > 0, total, 1)
+        return jnp.einsum("cn,nm->cm", values, shares) / jnp.where(total > 0, total, 1)
 
     return _one_after_the_other(of_block, queries)
 
@@ -90,10 +90,6 @@ def _one_after_the_other(function: Callable[..., jax.Array], *arrays: jax.Array)
     return lax.platform_dependent(
         *arrays, cpu=lambda *arrays: lax.map(lambda one: function(*one), arrays), default=jax.vmap(function)
     )
-
-
-def _product(subscripts: str, a: jax.Array, b: jax.Array) -> jax.Array:
-    return jnp.einsum(subscripts, a, b, preferred_element_type=jnp.float32)
 
 
 class PairAttention(nn.Module):

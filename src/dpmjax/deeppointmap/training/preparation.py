@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
+from dpmjax.deeppointmap.evaluation import true_poses
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig
 from dpmjax.geometry.pyramid_storage import record_type, store_pyramid
 from dpmjax.scans.augment import SPARSE_POINTS, AugmentConfig, augment_scan
@@ -91,9 +92,7 @@ def prepare_drive(drive: LidarSequence, config: TrainingConfig, *, seed: int = 0
     Raises:
         ValueError: if the drive has no poses.
     """
-    poses = drive.T_world_lidar
-    if poses is None:
-        raise ValueError("drives: expected a true pose for each scan, got a drive without poses")
+    poses = true_poses(drive)
     if config.num_variants == 0:
         return PreparedDrive(poses, drive, {})
     pyramids = np.zeros((len(drive), config.num_variants), _record_type(config))
