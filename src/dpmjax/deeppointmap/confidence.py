@@ -207,16 +207,13 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
     Returns:
         In [0, 1].
     """
-    if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
-        probability = logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans)
-        is_clear = evidence.of_weak_scans[WEAK_FEATURES.index("facing_gap_root")] >= math.sqrt(CLEAR_FACING_GAP)
+    kinds = ("of_weak_scans", "of_scans", "of_elements", "of_clouds")
+    fitting = (one for one in kinds if getattr(evidence, one) is not None and getattr(calibration, one) is not None)
+    kind = next(fitting)
+    probability = logistic_probability(getattr(calibration, kind), getattr(evidence, kind))
+    if kind == "of_weak_scans":
+        is_clear = getattr(evidence, kind)[WEAK_FEATURES.index("facing_gap_root")] >= math.sqrt(CLEAR_FACING_GAP)
         return float(probability if is_clear else np.minimum(probability, CORRIDOR_CONFIDENCE))
-    if evidence.of_scans is not None:
-        probability = logistic_probability(calibration.of_scans, evidence.of_scans)
-    elif evidence.of_elements is not None and calibration.of_elements is not None:
-        probability = logistic_probability(calibration.of_elements, evidence.of_elements)
-    else:
-        probability = logistic_probability(calibration.of_clouds, evidence.of_clouds)
     # One of two places under which the scans agree is right; the odds are those of their scores.
     return float(expit(evidence.lookalike_gap) * probability)
 
