@@ -63,10 +63,6 @@ SCANS_2D = Group("2-D scans", (
         "max_offset": ("scans", "higher if places are seen again soon; lower if neighbouring scans hardly overlap"),
         "scans_per_window": ("scans", "shorter windows if scans are far apart; None: one L-Net for the whole set"),
     }),
-    Section("RefinementConfig", "dpmjax.registration2d", "`refine(scans, poses, config)`", {
-        "radius": ("typical ranges", "how far apart neighbours in space may be"),
-        "loops": ("", "None: no search of loops"),
-    }),
 ))  # fmt: skip
 
 SCANS_3D = Group("3-D scans", (

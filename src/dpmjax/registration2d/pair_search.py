@@ -7,7 +7,6 @@ shifts of one turn. The views of both scans then refine the best poses on ever f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,19 +31,19 @@ APART = 0.12
 _CONTRADICTION_WEIGHT = 2.0
 
 
-@dataclass(frozen=True)
-class CorrelativeConfig:
+class CorrelativeConfig(NamedTuple):
     """Settings of the search. Lengths are in typical ranges of the scans.
 
     Attributes:
-        num_cells: number of cells along a side of the images; a scan fills the inner half, so that no shift wraps.
+        num_cells: number of cells along a side of the images, a multiple of 4 and of `block`. A scan fills the inner
+            half, so that no shift wraps.
         cell: side of a cell.
         num_turns: number of turns in a circle.
         num_peaks: number of shifts kept for each turn, from different blocks of cells.
         block: number of cells along a block.
         num_candidates: number of poses kept for each pair.
         num_levels: number of local grids. Each has half the spacing of the previous grid.
-        max_shift: largest shift; None: half the side of the images.
+        max_shift: largest shift, at most half the side of the images.
     """
 
     num_cells: int = 128
@@ -54,11 +53,7 @@ class CorrelativeConfig:
     block: int = 16
     num_candidates: int = 4
     num_levels: int = 4
-    max_shift: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.num_cells % self.block or self.num_cells % 4:
-            raise ValueError(f"num_cells: expected a multiple of 4 and of block {self.block}, got {self.num_cells}")
+    max_shift: float = np.inf
 
 
 class Candidates(NamedTuple):
@@ -206,8 +201,7 @@ def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, t
     seen = scans.views
     views = tuple(np.asarray(x) for x in (seen.surface, seen.near, seen.slant, seen.is_seen))
     distance = np.minimum(np.arange(size), size - np.arange(size)) * config.cell
-    limit = np.inf if config.max_shift is None else config.max_shift
-    outside = np.where(np.hypot(distance, distance[:, None]) > limit, -np.inf, 0.0).astype(np.float32)
+    outside = np.where(np.hypot(distance, distance[:, None]) > config.max_shift, -np.inf, 0.0).astype(np.float32)
     used, still = np.unique(target, return_inverse=True)
     targets = _spectra(tuple(x[used] for x in views), 0.0, cell, config)
     poses = np.zeros((len(source), config.num_turns, config.num_peaks, 3))

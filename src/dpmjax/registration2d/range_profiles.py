@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.geometry import se2
 from dpmjax.kept_programs import kept_jit
-from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, Tolerances, batches
-from dpmjax.registration2d.views import Views
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, Tolerances, Views, batches
 from dpmjax.types import AnyArray
 
 # Largest sine by which a visible surface is turned away from the viewer.

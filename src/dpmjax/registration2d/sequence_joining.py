@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.motion_prior import MotionPrior
 from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans, spread_evenly
 from dpmjax.registration2d.range_profiles import pair_scores, weak_steps
+from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Length of the submaps on either side of a weak step along the trajectory, typical ranges, so that both may see the end
@@ -99,7 +99,7 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
         sides += [side[se2.driven_lengths(poses[side]) <= _SIDE_LENGTH * unit] for side in (before[::-1], after)]
     centres = np.array([side[0] for side in sides])
     submaps, target = _merge_scans(sequence, centres, sides), 2 * np.arange(len(steps))
-    config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
+    config = config._replace(num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
     turns = np.abs(se2.wrap_angle(2 * np.pi * np.arange(config.num_turns) / config.num_turns)) < _MAX_TURN
     found = search_pairs(submaps, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
     for number, step in enumerate(steps):
@@ -178,7 +178,7 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
     if not len(later):
         return Hypotheses(later, earlier, np.zeros((0, 3)), np.zeros(0))
     turns = WallDirections(submaps.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
-    found = search_pairs(submaps.scans, later, earlier, replace(config, num_candidates=4), turns=turns)
+    found = search_pairs(submaps.scans, later, earlier, config._replace(num_candidates=4), turns=turns)
     votes = Hypotheses.of(found)
     votes = votes._replace(scores=pair_scores(submaps.scans, votes.source, votes.target, votes.poses))
     return votes.take(votes.scores > _LEAST_VOTE)
