@@ -22,7 +22,6 @@ from dpmjax.slam import (
     slam_preset,
     take_component,
 )
-from dpmjax.slam.agents import join_agents
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, scans_of
 
 CONFIG = SlamConfig()
@@ -151,14 +150,6 @@ def test_an_agent_alone_finds_what_it_finds_alone() -> None:
     assert result.component == (0,)
 
 
-def test_bytes_are_counted(joined) -> None:
-    for part, traffic in zip(PARTS, joined.traffic, strict=True):
-        # A scan of the truth is one point.
-        assert traffic.scan_bytes == 12 * len(list(part))
-        assert 0 < traffic.keyframe_scan_bytes < traffic.scan_bytes
-        assert traffic.keyframe_bytes > 0
-
-
 @pytest.mark.slow
 def test_maps_of_different_days_are_merged() -> None:
     methods = methods_of(TRUTH)
@@ -216,13 +207,11 @@ def test_bad_input_is_named(as_user) -> None:
     methods = methods_of(TRUTH)
     others = [methods_of(TRUTH, TruthMatcher(TRUTH, fingerprint=name)) for name in ("one", "other")]
     a, b = (run_slam(other, scans_of(range(10))).map for other in others)
-    extended = run_slam(methods, scans_of(range(3)), slam_map=run_slam(methods, scans_of(range(3))).map)
     for call, message in (
         (lambda: run_agents(methods, []), "sequences: expected"),
         (lambda: dpmjax.merge_maps(methods, a, b), "made with weights one, these are other"),
         (lambda: dpmjax.merge_maps(methods, a, a), "made with weights one, these are truth"),
         (lambda: dpmjax.merge_maps(methods, dpmjax.KeyframeMap()), "maps: expected at least two, got 1"),
-        (lambda: join_agents(methods, [extended]), "runs that began with an empty map"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -25,8 +25,7 @@ from dpmjax.slam import (
     slam_preset,
     step_slam,
 )
-from dpmjax.slam.descriptor_loops import find_loop_targets, verify_match
-from dpmjax.slam.descriptor_odometry import neighbours_of
+from dpmjax.slam.descriptors import find_loop_targets, neighbours_of, verify_match
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import Keyframe, MapEdge, add_keyframe, steps_from
 from dpmjax.slam.loops import Loop

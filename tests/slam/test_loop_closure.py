@@ -22,8 +22,7 @@ from dpmjax.slam.loop_closure import (
     nearest_pairs,
     search_again,
 )
-from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted, optimize_map
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 

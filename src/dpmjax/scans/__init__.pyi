@@ -15,7 +15,6 @@ from .lidar import measure_scan as measure_scan
 from .lidar import measured_elements as measured_elements
 from .pair_registration import PairEvidence as PairEvidence
 from .preprocess import PreprocessConfig as PreprocessConfig
-from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host
 from .surfaces import Surface as Surface
 from .surfaces import SurfaceConfig as SurfaceConfig

@@ -16,8 +16,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from dpmjax.checks import as_host_points, require_count, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.planes import fit_planes
-from dpmjax.scans.outliers import largest_spread
-from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.scans.preprocess import first_of_each_voxel, largest_spread
 from dpmjax.types import SurfaceElements
 
 # A normal needs this many neighbours, the point itself among them.
@@ -123,7 +122,7 @@ def surface_at(
         tree: the points, metres, in the frame of the lidar.
         rows: rows of the chosen points; those in the order of the scan are searched faster.
         config: neighbourhoods; range and density are those of the points.
-        weights: number of points that each chosen one stands for, to leave out outliers (`scans.outliers`) by the same
+        weights: number of points that each chosen one stands for, to leave out outliers (`largest_spread`) by the same
             neighbours; None to keep them.
 
     Returns:

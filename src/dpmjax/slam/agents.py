@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -30,22 +29,13 @@ from dpmjax.slam.keyframe_map import (
     take_keyframes,
     with_origin,
 )
-from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, optimize_map
 from dpmjax.slam.model_methods import as_methods, methods_for
-from dpmjax.slam.procedure import procedure_of
-from dpmjax.slam.system import SlamResult, place_scans, run_slam
+from dpmjax.slam.system import SlamResult, place_scans, procedure_of, run_slam
 from dpmjax.types import Pose, Poses, with_short_repr
-
-# Three float32 numbers.
-BYTES_A_POINT = 12
 
 # Callback for progress: number of compared keyframes, and number of all keyframes to compare.
 OnKeyframe = Callable[[int, int], None]
-
-
-def _ignore(_: int, __: int) -> None:
-    """Shows no progress."""
 
 
 @with_short_repr
@@ -66,22 +56,6 @@ class JoinedMaps(NamedTuple):
     loops: tuple[Loop, ...]
 
 
-class SentBytes(NamedTuple):
-    """Numbers of bytes: messages of an agent, and its raw points for comparison.
-
-    Attributes:
-        keyframe_bytes: keyframes: descriptors, surface elements, range images, poses, retrieval vectors.
-        descriptor_bytes: features of the descriptors, a part of `keyframe_bytes`.
-        keyframe_scan_bytes: the raw points of the same keyframes, three float32 numbers each.
-        scan_bytes: the raw points of all scans.
-    """
-
-    keyframe_bytes: int
-    descriptor_bytes: int
-    keyframe_scan_bytes: int
-    scan_bytes: int
-
-
 @with_short_repr
 class AgentsResult(NamedTuple):
     """Trajectories and maps of several agents.
@@ -93,14 +67,12 @@ class AgentsResult(NamedTuple):
             compared, within `measured_parts`.
         joined: all keyframes in one record, and the loops between agents.
         agents: result of each agent alone.
-        traffic: bytes that each agent sends.
     """
 
     T_world_scan: tuple[Poses, ...]
     component: tuple[int, ...]
     joined: JoinedMaps
     agents: tuple[SlamResult, ...]
-    traffic: tuple[SentBytes, ...]
 
 
 @with_short_repr
@@ -146,7 +118,7 @@ def run_agents(
         config: settings; None takes the defaults. Methods of your own carry theirs.
 
     Returns:
-        Trajectories, who has met whom, the joined graph, bytes sent.
+        Trajectories, who has met whom, the joined graph.
 
     Raises:
         ValueError: if there is no sequence, if a scan is not (n, 3), or if methods come with another configuration.
@@ -154,35 +126,14 @@ def run_agents(
     if not sequences:
         raise ValueError("sequences: expected the scans of at least one agent, got none")
     methods = as_methods(model, config)
-    return join_agents(methods, [run_slam(methods, scans) for scans in sequences])
-
-
-def join_agents(
-    methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe = _ignore
-) -> AgentsResult:
-    """Joins the maps of agents; this is the second half of `run_agents`.
-
-    Args:
-        methods: methods of all agents.
-        agents: at least one.
-        on_keyframe: callback for progress, while keyframes are compared.
-
-    Returns:
-        Trajectories, who has met whom, the joined graph, bytes sent.
-
-    Raises:
-        ValueError: if an agent extended an earlier map, or if a map was made by another matcher.
-    """
-    if any(agent.reports and agent.reports[0].scan != 0 for agent in agents):
-        raise ValueError("agents: expected runs that began with an empty map, got one that extended a map")
-    joined = join_maps(methods, [agent.map for agent in agents], on_keyframe=on_keyframe)
-    trajectories, traffic = _trajectories(joined, agents), tuple(map(_traffic, agents))
-    return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)
+    agents = tuple(run_slam(methods, scans) for scans in sequences)
+    joined = join_maps(methods, [agent.map for agent in agents])
+    return AgentsResult(_trajectories(joined, agents), joined.component_of_map, joined, agents)
 
 
 @runs_on_host("call it outside, and pass its result in")
 def merge_maps(
-    model: Model | SlamMethods, *maps: KeyframeMap | str | Path, on_keyframe: OnKeyframe = _ignore
+    model: Model | SlamMethods, *maps: KeyframeMap | str | Path, on_keyframe: OnKeyframe = lambda _num, _all: None
 ) -> MergedMaps:
     """Joins maps of different days or of different robots at the places that they share.
 
@@ -211,7 +162,9 @@ def merge_maps(
     return MergedMaps(tuple(merged), joined)
 
 
-def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = _ignore) -> JoinedMaps:
+def join_maps(
+    methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = lambda _num, _all: None
+) -> JoinedMaps:
     """Finds loops between maps, and optimises each group of joined maps as one graph.
 
     The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
@@ -286,21 +239,6 @@ def _in_own_frames(
     _, first_rows, component = np.unique(np.array(components)[map_of_row], return_index=True, return_inverse=True)
     T_new_old = [maps[map_of_row[row]].T_world_keyframe[0] @ rigid.inverse(T_old[row]) for row in first_rows]
     return np.reshape(T_new_old, (-1, 4, 4))[component] @ T_old
-
-
-def _traffic(agent: SlamResult) -> SentBytes:
-    scans = [keyframe.compact for keyframe in agent.map.keyframes]
-    scan_bytes = [BYTES_A_POINT * report.num_points for report in agent.reports]
-    return SentBytes(
-        keyframe_bytes=_num_bytes((scans, agent.map.vectors, agent.map.T_world_keyframe)),
-        descriptor_bytes=_num_bytes([(scan.features, scan.feature_steps, scan.directions) for scan in scans]),
-        keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in agent.map.keyframes),
-        scan_bytes=sum(scan_bytes),
-    )
-
-
-def _num_bytes(record: object) -> int:
-    return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(record))
 
 
 def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:

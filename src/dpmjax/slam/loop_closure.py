@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from dpmjax.scans.apart import apart
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
-from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, has_new_loops, with_match
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, has_new_loops, optimize_map, with_match
 
 # Upper bound of the radius (DeepPointMap: 100 m).
 MAX_RADIUS_M = 100.0
@@ -325,11 +325,8 @@ def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float
     """Returns the first rows without those within `spacing_m` of an earlier row of the same segment."""
     positions = slam_map.T_world_keyframe[rows, :3, 3]
     segments = np.array([slam_map.keyframes[row].segment for row in rows])
-    is_free: Bool[np.ndarray, " n"] = np.ones(len(rows), bool)
-    taken: list[int] = []
-    for number in range(len(rows)):
-        if is_free[number] and len(taken) < count:
-            taken.append(number)
-            distance: Float[np.ndarray, " n"] = np.linalg.norm(positions - positions[number], axis=1)
-            is_free &= (distance > spacing_m) | (segments != segments[number])
-    return rows[taken]
+
+    def is_near(one: int) -> Bool[np.ndarray, " n"]:
+        return (np.linalg.norm(positions - positions[one], axis=1) <= spacing_m) & (segments == segments[one])
+
+    return rows[apart(np.arange(len(rows), 0.0, -1.0), is_near, count)]

@@ -5,21 +5,18 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.align import ALL, AlignmentLevel, align_on_host
+from dpmjax.scans.apart import apart
 from dpmjax.scans.lidar import Scan, lidar_scan
 from dpmjax.scans.pairs import Pairs, nearest_planes
 from dpmjax.scans.surfaces import Surface, view_points
-from dpmjax.scans.weak_directions import (
-    plane_information,
-    with_least_covariance,
-    without_noise_along,
-)
+from dpmjax.scans.weak_directions import plane_information, with_least_covariance, without_noise_along
 from dpmjax.sequences import homogeneous
 from dpmjax.slam.interfaces import Alignment
 from dpmjax.slam.local_map import LocalMap
@@ -159,16 +156,14 @@ def _planes(local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int
 
 def _distinct(poses: Poses) -> Poses:
     """Returns the first poses that are apart from one another: starts of one valley end coarsely at one pose."""
-    kept = poses[:1]
-    for pose in poses[1:]:
-        if len(kept) == NUM_FINE:
-            break
-        apart_m = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
+
+    def is_near(one: int) -> Bool[np.ndarray, " s"]:
+        apart_m = np.linalg.norm(poses[:, :3, 3] - poses[one, :3, 3], axis=1)
         # The Frobenius norm of the difference of two rotations is the root of 2 times a small angle between them.
-        apart_rad = np.linalg.norm(kept[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(2)
-        if ((apart_m > SAME_M) | (apart_rad > SAME_RAD)).all():
-            kept = np.concatenate([kept, pose[None]])
-    return kept
+        apart_rad = np.linalg.norm(poses[:, :3, :3] - poses[one, :3, :3], axis=(1, 2)) / np.sqrt(2)
+        return (apart_m <= SAME_M) & (apart_rad <= SAME_RAD)
+
+    return poses[apart(np.arange(len(poses), 0.0, -1.0), is_near, NUM_FINE)]
 
 
 def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
