@@ -39,8 +39,6 @@ _NUM_LIKELY_TURNS, _NUM_KEYFRAME_TURNS = 3, 6
 # A sequence is registered like a set where more than this share of its steps is weak, or where the range noise is more
 # than this in typical ranges: a chain of steps drifts then.
 _MAX_WEAK, _MAX_NOISE = 0.25, 0.0225
-# Without an order, keyframes are chosen among this number of evenly spread scans.
-_MAX_ELIGIBLE = 1024
 # A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
 # if they match more than this share.
 _MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
@@ -94,7 +92,8 @@ def register_globally(scans: PlanarScans) -> Floats:
     if scans.is_ordered:
         keyframes = spread_evenly(len(scans), _MAX_KEYFRAMES)
     else:
-        eligible = spread_evenly(len(scans), _MAX_ELIGIBLE)
+        # Without an order, keyframes are chosen among this number of evenly spread scans.
+        eligible = spread_evenly(len(scans), 1024)
         keyframes = eligible[most_typical(walls.best_similarity(everyone, eligible), _MAX_KEYFRAMES)]
     task = _Task(scans, walls, keyframes)
     first, second = np.tril_indices(len(keyframes), k=-1)

@@ -25,7 +25,6 @@ _NORMAL_NEIGHBOURS = 6
 """Points that a normal is fitted to, as in the published DeepMapping program."""
 
 _MAX_ITERATIONS = 100
-_MAX_ROTATION_ERROR = 1e-3
 _MAX_DISTANCE = 1e4
 """Largest coordinate as a multiple of the extent of a cloud, of which float32 then holds a thousandth."""
 _OPEN_SHARE = 1e-5
@@ -146,7 +145,7 @@ def _require_motion(T_init: np.ndarray) -> None:
         raise ValueError("T_init: expected finite numbers, got NaN or infinity")
     R = T_init[:-1, :-1]
     last_row = np.abs(T_init[-1] - np.eye(len(T_init))[-1]).max()
-    if max(np.abs(R @ R.T - np.eye(len(R))).max(), last_row) > _MAX_ROTATION_ERROR or np.linalg.det(R) < 0:
+    if max(np.abs(R @ R.T - np.eye(len(R))).max(), last_row) > 1e-3 or np.linalg.det(R) < 0:
         raise ValueError("T_init: expected a rigid motion, got a matrix that scales, shears or reflects")
 
 
@@ -178,8 +177,8 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
         pairs = _find_pairs(source, target, normals, T)
         if metric == "plane":
             residuals = jnp.sum(pairs.apart * pairs.normals, axis=-1)
-            step, _ = step_to_planes(pairs.points, pairs.normals, residuals, pairs.weights)
-            T_new = rigid.compose(motion_about(step), T)
+            T_new = motion_about(step_to_planes(pairs.points, pairs.normals, residuals, pairs.weights))
+            T_new = rigid.compose(T_new, T)
         else:
             T_new = jnp.where(pairs.weights.any(), weighted_svd(source.points, pairs.matched, pairs.weights), T)
         change = jnp.linalg.norm(rigid.transform_points(T_new, source.points) - pairs.points, axis=-1)

@@ -23,8 +23,6 @@ from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarSca
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, held_steps, pose_steps, prior_steps, slide_steps
 
-# Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
-_ROUND_DISTANCES = 1.5e9
 # Gates and kernels of the rounds, and number of rounds after which the neighbours are chosen anew.
 _ROUNDS, _REFRESH = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14), 4
 # Gauss-Newton steps that restore unconstrained directions after the adjustment to lines, and torn steps.
@@ -35,10 +33,6 @@ _LOST_SCORE, _LEAST_WEIGHT = 0.25, 0.01
 # Two scans are aligned if they are at most this far apart, in typical ranges, and their headings differ by less than
 # this, radians: farther ones share few walls. Number of nearest scans of each scan.
 _RADIUS, _MAX_TURN, _NUM_NEAREST = 0.6, 2.0, 8
-# A pair of scans more steps apart may cross a torn step.
-_FEW_STEPS = 3
-# Pairs up to this number of steps apart that cross a slid step have slid with it.
-_FAR_STEPS = 20
 
 
 def align_all(scans: PlanarScans, poses: Floats, prior: StepPrior | None) -> Floats:
@@ -130,8 +124,9 @@ def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides) -> Floats:
     is_moved = slides.is_torn & (slides.scores > WEAK_SCORE)
     pairs = _fitting_pairs(scans, poses)
     crossed = np.append(0, np.cumsum(is_moved))
+    # Pairs up to this number of steps apart that cross a slid step have slid with it.
     # Scans that have collapsed onto each other hold each other there.
-    is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > _FAR_STEPS)
+    is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > 20)
     restored = np.where(is_moved[:, None], slides.moved(steps), steps)
     return _relax_steps(scans, poses, take_rows(pairs, is_kept), restored, np.maximum(slides.scores, _LEAST_WEIGHT))
 
@@ -193,7 +188,8 @@ def _choose_aligned(scans: PlanarScans, poses: Floats, prior: StepPrior | None) 
         return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), none)
     slides = slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
-    is_kept = (crossed[source] == crossed[target]) | (source - target > _FEW_STEPS)
+    # A pair of scans more steps apart may cross a torn step.
+    is_kept = (crossed[source] == crossed[target]) | (source - target > 3)
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
     across = np.eye(3) - slide_steps(scans, relative, pairs=(source, target)).open_directions(relative)
@@ -242,6 +238,7 @@ def _linearise(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: F
     """Linearises all pairs at these poses, gate and kernel."""
     source, target, across, _ = pairs
     relative = se2.relative(poses[target], poses[source])
-    stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
+    # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
+    stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / 1.5e9)))
     information, gradient = linearise_pairs(scans, source, target, relative, scale, stride=stride)
     return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)

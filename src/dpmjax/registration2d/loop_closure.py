@@ -30,8 +30,6 @@ _NEARBY = 0.15
 _MAX_RADIUS, _MIN_WAY = 2.25, 2.25
 # Largest number of candidates in a round.
 _MAX_CANDIDATES = 2000
-# A pair is matched again where its relative pose was corrected by more than `_NEARBY`, or by this turn.
-_MOVED_TURN = 0.15
 # Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
 # Least robust share of matched beams, and largest share of beams that contradict their partner scan.
@@ -41,8 +39,6 @@ _MIN_EIGENVALUE = 0.03
 # Least number of agreeing loops; largest number of scans between them; and the limits of agreement: translation in
 # typical ranges, radians.
 _MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
-# Weight of a step relative to a loop: number of loops that must contradict a step before the graph rejects it.
-_STEP_TRUST = 30.0
 # Number of searches, each from the corrected poses of the previous one. Error of a relative pose as a share of the
 # travelled distance: a larger one finds loops after more drift, among more candidates.
 _NUM_ROUNDS, _DRIFT = 3, 0.05
@@ -77,7 +73,8 @@ def correct_by_loops(scans: PlanarScans, poses: Floats, steps: Edges | None = No
     loops = take_rows(steps, np.zeros(0, np.int64))
     # The graph may reject a step with a weak score like a loop.
     is_weak = weak_steps(scans, poses, np.arange(len(poses)))
-    step_trust = np.where(is_weak, 1.0, _STEP_TRUST)
+    # Weight of a step relative to a loop: number of loops that must contradict a step before the graph rejects it.
+    step_trust = np.where(is_weak, 1.0, 30.0)
     found, weights, tried = loops, np.zeros(0), dict[tuple[int, int], Floats]()
     for _ in range(_NUM_ROUNDS):
         new = _untried(find_candidates(poses, scans.typical_range), poses, tried, scans.typical_range)
@@ -100,7 +97,8 @@ def _untried(pairs: Pairs, poses: Floats, tried: dict[tuple[int, int], Floats], 
     names = list(zip(source.tolist(), target.tolist(), strict=True))
     before = np.array([tried.get(name, np.full(3, np.inf)) for name in names]).reshape(-1, 3)
     with np.errstate(invalid="ignore"):
-        is_new = ~se2.is_within(predicted - before, _NEARBY * typical_range, _MOVED_TURN)
+        # A pair is matched again where its relative pose was corrected by more than `_NEARBY`, or by this turn.
+        is_new = ~se2.is_within(predicted - before, _NEARBY * typical_range, 0.15)
     tried.update((name, pose) for name, pose, new in zip(names, predicted, is_new, strict=True) if new)
     return source[is_new], target[is_new]
 

@@ -32,16 +32,10 @@ _AGREEMENT = (0.06, 0.1)
 _MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
 # Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 4.0
-# Weight of the matched beams of neighbours in time, where there is an order.
-_NEXT_WEIGHT = 4.0
 # Largest distance of scans that score each other, in typical ranges, and largest number of nearest scans that do.
 _RADIUS, _NUM_SCORERS = 1.2, 32
 # Poses times placed scans that are compared at a time: 8 MB a table.
 _BLOCK = 1 << 20
-# Number of maps, each grown from a different pair; the best one is kept.
-_NUM_SEEDS = 6
-# Rounds in which scans may change their pose.
-_NUM_REVISIONS = 3
 # Weakest connections at which a block is cut off, and poses that are tried for a block.
 _NUM_CUTS, _NUM_BLOCK_POSES = 6, 48
 
@@ -93,7 +87,8 @@ class PoseScorer(NamedTuple):
         # Without this, chance matches would favour poses with more overlap, such as one room on top of another.
         is_next = self.is_ordered & (np.abs(source - target) == 1)
         matched = np.maximum(views.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
-        matched *= np.where(is_next, _NEXT_WEIGHT, 1.0)
+        # Weight of the matched beams of neighbours in time, where there is an order.
+        matched *= np.where(is_next, 4.0, 1.0)
         contradicted = np.maximum(views.contradicted - self.noisy_share * views.visible, 0.0)
         return np.asarray(matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
 
@@ -175,7 +170,8 @@ def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
     used: set[int] = set()
     for row in np.argsort(-hypotheses.scores, kind="stable"):
         pair = {int(hypotheses.source[row]), int(hypotheses.target[row])}
-        if len(chosen) < _NUM_SEEDS and not pair & used:
+        # Number of maps, each grown from a different pair; the best one is kept.
+        if len(chosen) < 6 and not pair & used:
             chosen.append(int(row))
             used |= pair
     return chosen
@@ -207,7 +203,8 @@ def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
 
 def settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
     """Moves scans to better pose hypotheses until no scan moves or the limit of rounds is reached."""
-    for _ in range(_NUM_REVISIONS):
+    # Rounds in which scans may change their pose.
+    for _ in range(3):
         poses, num_moved = _revise(poses, hypotheses, scorer)
         if not num_moved:
             break

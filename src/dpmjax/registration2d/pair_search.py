@@ -23,8 +23,6 @@ from dpmjax.scans.apart import apart
 # Pairs that are searched at a time, and images that are transformed at a time: their spectra take 250 MB, and fit into
 # the cache.
 _SEARCH_BATCH, _IMAGES = 512, 16
-# Weight of a cell of free space relative to a cell of surface.
-_FREE_WEIGHT = 0.6
 # Least difference of two candidates of a pair: typical ranges, and radians.
 APART = 0.12
 # Number of matched beams that outweigh a contradicting one.
@@ -150,7 +148,8 @@ def _spectra(
         off = (distance - surface[rows].take(k, axis=1)) * slanted / np.float32(0.6 * cell)
         hit = np.exp(np.float32(-0.5) * off**2) * usable
         is_free = usable & (distance < near[rows].take(k, axis=1) - np.float32(cell) / slanted)
-        images = np.stack([hit, hit - np.float32(_FREE_WEIGHT) * is_free])
+        # Weight of a cell of free space relative to a cell of surface.
+        images = np.stack([hit, hit - np.float32(0.6) * is_free])
         spectra[:, rows] = scipy.fft.rfft2(images, s=(config.num_cells,) * 2)
     return spectra
 

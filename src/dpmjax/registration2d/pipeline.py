@@ -55,8 +55,6 @@ EngineOf = Callable[[Indices], Engine]
 
 # Up to this many scans without odometry are all registered.
 _MAX_WHOLE = 256
-# A fit is not refined if its map has a code length above this multiple of that of the refined initial poses.
-_LEAST_PROMISING = 1.15
 
 # Trajectories whose scans differ by less, in typical ranges and radians, have one refinement: it starts its search of
 # matching beams with three times this distance.
@@ -404,6 +402,7 @@ def _refined_candidates(run: _Run, candidates: dict[str, Floats]) -> dict[str, F
             continue  # its refinement would end at the same map
         scores = choose_trajectory(run.lines, {name: poses, **found}, prior=run.prior)[1]
         nats = [score.code_length for score in scores.values()]
-        if nats[0] <= _LEAST_PROMISING * nats[-1]:
+        # A fit is not refined if its map has a code length above this multiple of that of the refined initial poses.
+        if nats[0] <= 1.15 * nats[-1]:
             add_refined(name, poses)
     return found

@@ -33,23 +33,13 @@ Booleans = NDArray[np.bool_]
 # Rows (p,) of the sources and of the targets of pairs of scans.
 Pairs = tuple[Indices, Indices]
 
-# A run of beams counts as straight if it bends by less than this part of its length (0.03 degrees).
-_BEND = 5e-4
-# Approximate number of beams in the median of the noise: a sort of millions would take longer than all other steps.
-_NOISE_SAMPLES = 65536
 # Numbers of beams of the runs that compete.
 _WIDTHS = (3, 4, 8, 16, 32)
-# Number of bearings of fine views.
-_NUM_FINE_BEARINGS = 4096
 # Scans that lines are fitted to at a time, few enough for the cache.
 _BLOCK = 256
-# A bearing is not seen where the two beams around it are farther apart than this many times an even spread.
-_MAX_GAP = 2.5
 # Least cosine of the slant of a surface. Surfaces with a smaller cosine do not correct the range of a beam.
 _MIN_COSINE = 0.3
 _UNKNOWN_COSINE = 0.7
-# The number of scans is rounded up to a power of two, at least this, so that few programs compile.
-_LEAST_ROWS = 64
 
 
 class Tolerances(NamedTuple):
@@ -150,7 +140,8 @@ class PlanarScans:
     @cached_property
     def fine(self) -> PlanarScans:
         """The same scans with views for comparisons to a thousandth of the typical range, made once."""
-        return replace(self, num_bearings=_NUM_FINE_BEARINGS)
+        # Number of bearings of fine views.
+        return replace(self, num_bearings=4096)
 
     @property
     def num_on_line(self) -> Indices:
@@ -253,7 +244,8 @@ def range_noise(points: Float[np.ndarray, "n b 2"], mask: Bool[np.ndarray, "n b"
     """
     usable = mask[:, :-2] & mask[:, 1:-1] & mask[:, 2:]
     scan, beam = np.nonzero(usable)
-    stride = max(1, len(scan) // _NOISE_SAMPLES)
+    # Approximate number of beams in the median of the noise: a sort of millions would take longer than all other steps.
+    stride = max(1, len(scan) // 65536)
     before, here, after = (points[scan[::stride], beam[::stride] + k].astype(np.float64) for k in range(3))
     reach = np.linalg.norm(here, axis=-1)
     direction, chord = here / np.maximum(reach, 1e-12)[:, None], after - before
@@ -284,7 +276,8 @@ def _fit_lines(
         radius = np.hypot(half_difference, xy)
         along, across = half_sum + radius, np.maximum(half_sum - radius, 0.0)
         deviation, length = np.sqrt(across / (width - 2.0)), np.sqrt(along / width)
-        allowed = noise * (1.0 + 2.0 / width**0.5) + _BEND * length
+        # A run of beams counts as straight if it bends by less than this part of its length (0.03 degrees).
+        allowed = noise * (1.0 + 2.0 / width**0.5) + 5e-4 * length
         is_straight = (count == width) & (deviation <= allowed) & (along > 4.0 * across)
         found = np.stack([0.5 * np.arctan2(xy, half_difference), x / width, y / width])
         off = np.where(is_straight, np.maximum(deviation, noise) / np.sqrt(np.maximum(along, 1e-20)), np.inf)
@@ -332,10 +325,12 @@ def make_views(scans: PlanarScans, num_bearings: int) -> Views:
     surface = np.clip(along / np.where(np.abs(across) > 1e-9, across, 1.0), near, far)
     # Padding behind the last valid beam is no beam.
     num_beams = np.max(np.where(scans.mask, np.arange(1, angle.shape[1] + 1), 1), axis=1)[:, None]
-    is_seen = (gap < _MAX_GAP * 2 * np.pi / num_beams) & (count > 1)
+    # A bearing is not seen where the two beams around it are farther apart than this many times an even spread.
+    is_seen = (gap < 2.5 * 2 * np.pi / num_beams) & (count > 1)
     slant = np.minimum(slants[row, before], slants[row, after])
     arrays = points, scans.normals, scans.mask, surface, near, far, slant, is_seen
-    capacity = max(_LEAST_ROWS, 1 << (len(scans) - 1).bit_length())
+    # The number of scans is rounded up to a power of two, at least this, so that few programs compile.
+    capacity = max(64, 1 << (len(scans) - 1).bit_length())
     return Views(*(_padded(x, capacity) for x in arrays))
 
 

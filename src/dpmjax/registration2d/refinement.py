@@ -29,12 +29,8 @@ from dpmjax.types import ScanSet, with_short_repr
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
 # as a share of the beams, above the second one.
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
-# Largest number of repetitions of the alignment after torn steps are restored.
-_NUM_REPAIRS = 2
 # Slid steps are put back where the code length of the map falls by more than this share.
 _LEAST_GAIN = 0.005
-# Scans are adjusted to common lines above this range noise, in typical ranges.
-_MIN_NOISE = 1.5e-4
 # Shares of a refinement that are usually done after the steps, the loops and the joint alignment.
 _STEPS_SHARE, _LOOPS_SHARE, _ALIGNED_SHARE = 0.1, 0.4, 0.9
 
@@ -45,11 +41,9 @@ class Refined(NamedTuple):
 
     Attributes:
         poses: (n, 3) x, y, heading.
-        num_loops: number of loops in the kept trajectory.
     """
 
     poses: Floats
-    num_loops: int
 
     @property
     def T_world_scan(self) -> Floats:
@@ -87,7 +81,7 @@ def refine(
     """
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
     start = se2.as_poses("poses", poses, len(scans))
-    candidates, num_loops = {"start": start}, {"start": 0}
+    candidates = {"start": start}
     fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
     if prior is not None and not _is_sound(scans, start):
@@ -96,14 +90,13 @@ def refine(
             some = replace(scans.take(rows), is_ordered=True)
             fitting = refine(some, start[rows], prior=prior.through(rows), on_progress=on_progress)
             whole = interpolate(len(scans), rows, fitting.poses)
-            return fitting._replace(poses=_put_back(scans, fitting_steps, whole, prior))
+            return Refined(_put_back(scans, fitting_steps, whole, prior))
         # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
         steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range)).steps
         on_progress(_STEPS_SHARE)
         settled, slides = settle_steps(scans, steps, prior)
         edges = matched_steps(settled, slides)
-        candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), edges)
-        num_loops["loops"] = int((weights > 0.25).sum())
+        candidates["loops"] = correct_by_loops(scans, se2.chain(settled.poses), edges).poses
         fitting_steps = _better_steps(scans, fitting_steps, settled.poses)
     aligned: dict[str, Floats] = {}
     for name, candidate in candidates.items():
@@ -112,11 +105,12 @@ def refine(
     on_progress(_ALIGNED_SHARE)
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
-    if scans.noise > _MIN_NOISE * scans.typical_range:
+    # Scans are adjusted to common lines above this range noise, in typical ranges.
+    if scans.noise > 1.5e-4 * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
         best = adjusted if prior is None else restore_open(scans, best, adjusted, prior)
         best = best if prior is None else _put_back(scans, fitting_steps, best, prior)
-    return Refined(best, num_loops[kept])
+    return Refined(best)
 
 
 def _align(scans: PlanarScans, poses: Floats, steps: Floats, prior: StepPrior | None) -> Floats:
@@ -124,7 +118,8 @@ def _align(scans: PlanarScans, poses: Floats, steps: Floats, prior: StepPrior | 
     best = align_all(scans, poses, prior)
     if prior is None:
         return best
-    for _ in range(_NUM_REPAIRS):
+    # Largest number of repetitions of the alignment after torn steps are restored.
+    for _ in range(2):
         restored = restore_torn(scans, steps, best, prior)
         if restored is None:
             break

@@ -25,8 +25,6 @@ from dpmjax.registration2d.wall_directions import WallDirections
 _SIDE_LENGTH, _MAX_TURN, _MAX_SHIFT, _NUM_CELLS, _NUM_CANDIDATES = 2.0, 2.2, 1.6, 256, 24
 # Weight of the motion prior beside the agreement of two submaps, and beside the votes of loops.
 _PRIOR_WEIGHT, _LOOP_PRIOR_WEIGHT = 0.1, 0.3
-# Submaps lie a typical range apart, or farther if they were more than this.
-_MAX_SUBMAPS = 80
 # The largest distance of pairs of submaps is the sum of a constant, a share of the path length between them, and a
 # length for each weak step between them. Least path length between two submaps on either side of one weak step. Lengths
 # are in typical ranges. Number of likely turns that are searched.
@@ -124,7 +122,8 @@ def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
     """Makes submaps about a typical range apart, none across a weak step."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.scans.typical_range
     way = se2.driven_lengths(poses[rows])
-    spacing = max(unit, way[-1] / _MAX_SUBMAPS)
+    # Submaps lie a typical range apart, or farther if they were more than this.
+    spacing = max(unit, way[-1] / 80)
     middles, members = [], []
     for number in range(part[-1] + 1):
         own = np.flatnonzero(part == number)

@@ -1,6 +1,5 @@
 from .align import AlignedMotion as AlignedMotion
 from .align import AlignmentLevel as AlignmentLevel
-from .align import Prior as Prior
 from .align import align_on_host as align_on_host
 from .align import schedule_of as schedule_of
 from .augment import AugmentConfig as AugmentConfig

@@ -34,11 +34,6 @@ OUTLIER_SIGMAS = 3.0
 # Number of points whose neighbours are searched first, to estimate the limit: all points of a smaller scan. With fewer,
 # more points must be searched again.
 NUM_SPACED = 1024
-# Cells of half the limit; where more would be needed, the neighbours of all points are searched.
-MAX_CELLS = 1 << 22
-
-# Relative tolerance: rounding must not drop points that are all equally far from their neighbours.
-OUTLIER_SLACK = 1 + 1e-5
 
 
 @dataclass(frozen=True)
@@ -271,7 +266,8 @@ def largest_spread(spread: Float[np.ndarray, " k"], weights: Float[np.ndarray, "
         The limit, in the unit of the distances.
     """
     mean = np.average(spread, weights=weights)
-    return float(mean + OUTLIER_SIGMAS * np.sqrt(np.average((spread - mean) ** 2, weights=weights))) * OUTLIER_SLACK
+    # Relative tolerance: rounding must not drop points that are all equally far from their neighbours.
+    return float(mean + OUTLIER_SIGMAS * np.sqrt(np.average((spread - mean) ** 2, weights=weights))) * (1 + 1e-5)
 
 
 def _is_lonely(points: Float[np.ndarray, "n 3"], cell_m: float, num_neighbours: int) -> Bool[np.ndarray, " n"]:
@@ -280,7 +276,8 @@ def _is_lonely(points: Float[np.ndarray, "n 3"], cell_m: float, num_neighbours: 
     columns -= columns.min(axis=1, keepdims=True)
     columns /= max(cell_m, 1e-9)
     shape = columns.max(axis=1) + 3
-    if shape.prod() > MAX_CELLS:
+    # Cells of half the limit; where more would be needed, the neighbours of all points are searched.
+    if shape.prod() > (1 << 22):
         return np.ones(len(points), bool)
     x, y, z = columns.astype(np.int64) + 1  # the border is empty
     across = int(shape[1]), int(shape[2])

@@ -22,9 +22,6 @@ from dpmjax.types import SurfaceElements
 # A normal needs this many neighbours, the point itself among them.
 MIN_NEIGHBOURS = 4
 
-# Number of points whose neighbours measure the density of a scan.
-NUM_PROBED = 200
-
 # Least flatness of a point of a surface; foliage, wires and edges are less flat.
 MIN_FLATNESS = 0.1
 
@@ -194,7 +191,8 @@ def _normals(
     rows, distances = found
     if rows.shape[1] < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    farthest_m = np.median(distances[:: max(1, len(points) // NUM_PROBED), -1]) if len(points) else 0.0
+    # Number of points whose neighbours measure the density of a scan.
+    farthest_m = np.median(distances[:: max(1, len(points) // 200), -1]) if len(points) else 0.0
     is_near = distances < max(config.neighbour_radius_m, config.sparse_radius_share * farthest_m)
     columns, own = (np.ascontiguousarray(values.T, np.float32) for values in (searched, points))
     # Neighbour by neighbour in memory: sums over them are several times faster.

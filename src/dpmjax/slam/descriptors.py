@@ -33,7 +33,7 @@ from dpmjax.slam.keyframe_map import (
     steps_from,
     submap_of,
 )
-from dpmjax.slam.loops import DESCRIPTOR_INFORMATION, Loop, LoopState, LoopStatus, move_parts
+from dpmjax.slam.loops import DESCRIPTOR_INFORMATION, Loop, LoopState, LoopStatus, move_parts, path_since_loop_m
 from dpmjax.types import Information
 
 # Largest number of edges to a keyframe of a neighbourhood, and of keyframes in it.
@@ -305,17 +305,12 @@ def find_loop_targets(
     apart_m = np.linalg.norm(T_world[:, :2, 3] - T_world[row, :2, 3], axis=1)
     is_other = part != part[row]
     is_turned = np.array([turn_rad(T) >= NEAR_RAD for T in T_row_other])
-    is_away = (np.linalg.norm(T_row_other[:, :3, 3], axis=1) >= NEAR_M) & _is_rested(slam_map, loops, row)
+    is_away = (np.linalg.norm(T_row_other[:, :3, 3], axis=1) >= NEAR_M) & (
+        path_since_loop_m(slam_map, loops, row) >= NEAR_M
+    )
     is_far_along = (steps > NUM_NEAR_STEPS) | (is_turned & is_away)
     is_known = (apart_m <= RADIUS_M) & (steps > MIN_STEPS) & is_far_along
     return np.flatnonzero(is_allowed & (is_other | is_known))
-
-
-def _is_rested(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
-    """Returns True if the last accepted loop of the same drive is far enough back along the path."""
-    last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
-    keyframe = slam_map.keyframes[row]
-    return last is None or last.segment != keyframe.segment or keyframe.path_m - last.path_m >= NEAR_M
 
 
 def disjoint_neighbours(slam_map: KeyframeMap, row: int, target: int) -> tuple[list[int], list[int]]:

@@ -26,9 +26,6 @@ from dpmjax.slam.model_methods import methods_for
 from dpmjax.slam.system import corrected_points
 from dpmjax.types import AnyArray, Pose, with_short_repr
 
-# Largest sum of probabilities of a second place, as a share of the sum of the best place.
-MAX_RIVAL_SHARE = 0.5
-
 # Largest turn between registrations that agree.
 SAME_PLACE_RAD = 0.06
 
@@ -40,9 +37,6 @@ NUM_AT_ONCE = 2
 
 # Number of further keyframes near the best place that are registered.
 NUM_NEIGHBOURS = 2
-
-# A registration supports a place from this P(correct) on, if the scans agree.
-MIN_PROBABILITY = 0.2
 
 # Scans agree up to this share of points in free space.
 MAX_CONTRADICTED_SHARE = 0.1
@@ -230,7 +224,8 @@ class _Search(NamedTuple):
         """Groups registrations around the most probable ones whose scans agree; the most probable place first."""
         # Few points meet planes of a distant keyframe, so its registration only needs to end at the same place.
         left = sorted(tried, key=lambda one: -one.match.probability)
-        left = [one for one in left if one.match.probability >= MIN_PROBABILITY]
+        # A registration supports a place from this P(correct) on, if the scans agree.
+        left = [one for one in left if one.match.probability >= 0.2]
         places = []
         while first := next((one for one in left if one.do_scans_agree), None):
             others = [one for one in left if one is not first and self._agree(first, one)]
@@ -261,7 +256,8 @@ class _Search(NamedTuple):
         around_m = self._distances(self.slam_map.T_world_keyframe[first.keyframe], first.keyframe)
         is_alone = int((around_m <= extent_m).sum()) <= 1
         is_supported = self._is_supported(best, 1 if is_alone else self.config.min_support)
-        if not is_supported or rival > MAX_RIVAL_SHARE * total:
+        # Largest sum of probabilities of a second place, as a share of the sum of the best place.
+        if not is_supported or rival > 0.5 * total:
             return Localization("not in this map", None, 0.0, None, numbers, evidence)
         part = int(self.parts[first.keyframe])
         return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence, part)

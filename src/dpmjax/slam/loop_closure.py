@@ -17,7 +17,16 @@ from dpmjax.scans.apart import apart
 from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
-from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, has_new_loops, optimize_map, with_match
+from dpmjax.slam.loops import (
+    Loop,
+    LoopState,
+    LoopStatus,
+    accept_consistent,
+    has_new_loops,
+    optimize_map,
+    path_since_loop_m,
+    with_match,
+)
 
 # Upper bound of the radius (DeepPointMap: 100 m).
 MAX_RADIUS_M = 100.0
@@ -34,23 +43,8 @@ DRIFT_SHARE = 0.03
 # Smallest similarity of a candidate by retrieval.
 MIN_COSINE = 0.8
 
-# The mean of fewer vectors is too noisy to subtract.
-MIN_NUM_CENTRED = 20
-
-# Overlap probability above which no further candidate is examined.
-SURE_OVERLAP = 0.9
-
-# Length of path after an accepted loop without a search for another one, in extents.
-REST_SHARE = 0.3
-
-# Smallest number of keyframes between two optimisations.
-EVERY_KEYFRAMES = 8
-
 # Share of all keyframes between two optimisations, so that the cost of a scan does not grow with the map.
 EVERY_SHARE = 0.05
-
-# Largest number of candidates by distance: more find loops after a longer drift, at the cost of their overlap.
-NUM_NEAR = 6
 
 # Number of candidates whose overlap is predicted at a time, alternately by distance and by retrieval: one that surely
 # overlaps ends the search after fewer of them.
@@ -79,7 +73,8 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
         return slam_map, state
     candidates = find_loop_candidates(slam_map, row, config)
     state = state._replace(loops=examine_candidates(methods, slam_map, state.loops, candidates))
-    wait = max(EVERY_KEYFRAMES, int(EVERY_SHARE * len(slam_map)))
+    # Smallest number of keyframes between two optimisations.
+    wait = max(8, int(EVERY_SHARE * len(slam_map)))
     if len(slam_map) - state.num_optimized >= wait and has_new_loops(slam_map, state.loops):
         slam_map, state = optimize_map(slam_map, state)
         return slam_map, search_again(methods, slam_map, state)
@@ -145,11 +140,7 @@ def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
     Returns:
         True if the last accepted loop is near along the path.
     """
-    last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
-    if last is None:
-        return False
-    keyframe = slam_map.keyframes[row]
-    return keyframe.segment == last.segment and keyframe.path_m - last.path_m < REST_SHARE * keyframe.extent_m
+    return path_since_loop_m(slam_map, loops, row) < 0.3 * slam_map.keyframes[row].extent_m
 
 
 def examine_candidates(
@@ -199,7 +190,8 @@ def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list
         for number, overlap in enumerate(overlaps, start):
             status: LoopStatus = "no overlap" if overlap < config.min_overlap else "not registered"
             loops[number] = loops[number]._replace(status=status, overlap=overlap)
-        if max(overlaps) >= SURE_OVERLAP:
+        # Overlap probability above which no further candidate is examined.
+        if max(overlaps) >= 0.9:
             break
     return loops
 
@@ -224,7 +216,8 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
     apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
     is_near = is_old & (apart_m <= np.minimum(RADIUS_SHARE * extent_m + DRIFT_SHARE * since_m, MAX_RADIUS_M))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
-    near = _spread(near, slam_map, extent_m / 2, NUM_NEAR)
+    # Largest number of candidates by distance: more find loops after a longer drift, at the cost of their overlap.
+    near = _spread(near, slam_map, extent_m / 2, 6)
     by_distance = [Loop(row, int(other), "distance") for other in near]
     by_retrieval = [loop for loop in similar_keyframes(slam_map, row, is_old, config) if loop.target not in near]
     in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))
@@ -293,7 +286,8 @@ def most_similar(
     """
     if len(vectors) == 0 or count == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.float32)
-    mean = vectors.mean(axis=0) if len(vectors) >= MIN_NUM_CENTRED else np.zeros_like(query)
+    # The mean of fewer vectors is too noisy to subtract.
+    mean = vectors.mean(axis=0) if len(vectors) >= 20 else np.zeros_like(query)
     centred = query - mean
     # |v - m|^2 = 1 - 2 v.m + m.m for unit vectors: no centred copy of the whole map.
     lengths = np.sqrt(np.maximum(1 - 2 * (vectors @ mean) + mean @ mean, 1e-12)) * max(np.linalg.norm(centred), 1e-6)

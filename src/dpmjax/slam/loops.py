@@ -35,9 +35,6 @@ FLOOR_M, FLOOR_RAD = 0.05, 0.005
 # Standard deviation of odometry over one metre; it grows with the root of the path.
 DRIFT_M = 0.05
 
-# Largest distance along the path between the ends of registrations that support each other.
-PENDING_PATH_M = 40.0
-
 # Standard deviation of the rotation of odometry over one metre.
 DRIFT_RAD = 0.004
 
@@ -46,18 +43,6 @@ CONSISTENT_SIGMAS = 3.0
 
 # Share of the path by which a loop may contradict odometry in any case.
 MIN_DRIFT_SHARE = 0.1
-
-# Largest number of accepted loops that are compared with a new one.
-MAX_COMPARED = 6
-
-# Cost above which the optimisation reduces the weight of a loop edge.
-OUTLIER_CHI2 = 25.0
-
-# Smallest weight of a loop edge that stays after the optimisation.
-MIN_LOOP_WEIGHT = 0.25
-
-# Number of contradicting loops that would remove an edge of odometry.
-CERTAIN = 1e9
 
 # Outcome of a loop candidate; every one but "accepted" is the reason why it is no edge.
 LoopStatus = Literal[
@@ -146,6 +131,13 @@ def num_accepted(loops: Iterable[Loop]) -> int:
     return sum(loop.status == "accepted" for loop in loops)
 
 
+def path_since_loop_m(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> float:
+    """Returns the path from the last accepted loop to a keyframe; infinite without one in its segment."""
+    last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
+    keyframe = slam_map.keyframes[row]
+    return np.inf if last is None or last.segment != keyframe.segment else keyframe.path_m - last.path_m
+
+
 def has_new_loops(slam_map: KeyframeMap, loops: Iterable[Loop]) -> bool:
     """Returns True if loops were accepted since the last optimisation, so that they are not edges yet.
 
@@ -215,7 +207,8 @@ def accept_consistent(
         return are_consistent(slam_map, loops[one], loops[other])
 
     near = list(_near_along(slam_map, loops, number))
-    compared = [other for other in near if loops[other].status == "accepted"][:MAX_COMPARED]
+    # Largest number of accepted loops that are compared with a new one.
+    compared = [other for other in near if loops[other].status == "accepted"][:6]
     others = [other for other in near if other in compared or loops[other].status == "waits for support"]
     others = [other for other in others if agree(number, other)]
     members = [number]
@@ -265,7 +258,8 @@ def _near_along(slam_map: KeyframeMap, loops: Sequence[Loop], number: int) -> It
 def _is_near_along(slam_map: KeyframeMap, row: int, other: int) -> bool:
     """Returns True if two keyframes are near each other along one unbroken path."""
     a, b = slam_map.keyframes[row], slam_map.keyframes[other]
-    return a.segment == b.segment and abs(a.path_m - b.path_m) <= PENDING_PATH_M
+    # Largest distance along the path between the ends of registrations that support each other.
+    return a.segment == b.segment and abs(a.path_m - b.path_m) <= 40.0
 
 
 def _drift(path_m: float) -> tuple[float, float]:
@@ -294,11 +288,14 @@ def optimize_map(slam_map: KeyframeMap, state: LoopState) -> tuple[KeyframeMap, 
     edges = [state.loops[number].edge for number in accepted]
     T_world_keyframe = move_parts(slam_map.T_world_keyframe, measured_parts(slam_map), edges)
     graph = as_pose_graph(replace(slam_map, T_world_keyframe=T_world_keyframe, edges=(*edges, *measured, *guesses)))
-    trust = np.full(len(graph.edges.source), CERTAIN)
+    # Number of contradicting loops that would remove an edge of odometry.
+    trust = np.full(len(graph.edges.source), 1e9)
     trust[: len(edges)] = 1.0
-    settings = PoseGraphConfig(outlier_chi2=OUTLIER_CHI2, is_chordal_start=False)
+    # Cost above which the optimisation reduces the weight of a loop edge.
+    settings = PoseGraphConfig(outlier_chi2=25.0, is_chordal_start=False)
     solved = optimize_pose_graph(graph, settings, trust=trust)
-    loops, is_kept = list(state.loops), solved.weights[: len(edges)] >= MIN_LOOP_WEIGHT
+    # Smallest weight of a loop edge that stays after the optimisation.
+    loops, is_kept = list(state.loops), solved.weights[: len(edges)] >= 0.25
     for number in np.array(accepted, int)[~is_kept]:
         loops[number] = loops[number]._replace(status="taken back")
     kept = [edge for edge, stays in zip(edges, is_kept, strict=True) if stays]

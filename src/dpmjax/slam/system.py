@@ -31,9 +31,6 @@ from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_
 from dpmjax.slam.model_methods import as_methods
 from dpmjax.types import Pose, Poses, with_short_repr
 
-# Number of times that the first two scans are deskewed: the motion between them changes little after the first.
-NUM_BEGINNINGS = 2
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -162,7 +159,8 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedIn
         return after, report
     # The first two scans are deskewed by the motion between them, and placed again.
     before, first = state.begun
-    for _ in range(NUM_BEGINNINGS):
+    # Number of times that the first two scans are deskewed: the motion between them changes little after the first.
+    for _ in range(2):
         T_turn = after.front_end.T_before_last
         after, _ = _step(methods, before, prepare_input(methods, first, T_turn))
         after = after._replace(front_end=after.front_end._replace(T_before_last=T_turn))

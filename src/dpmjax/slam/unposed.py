@@ -40,15 +40,9 @@ from dpmjax.types import Information, Pose, Poses
 # ones that are registered: fewer leave scans alone, more take longer.
 NUM_SIMILAR, NUM_REGISTERED = 16, 6
 
-# Least probability of overlap of a registered pair.
-MIN_OVERLAP = 0.1
-
 # Parts are joined where the probabilities of agreeing motions add up to this, and those of agreeing contradicting
 # ones to at most this share of it.
 SURE, MAX_RIVAL = 0.9, 0.5
-
-# Less probable motions support nothing.
-LEAST_CONFIDENCE = 0.05
 
 # Number of pairs that are registered between two counts of the bar.
 _BATCH = 8
@@ -58,15 +52,6 @@ AGREE_M, AGREE_RAD = 2.0, math.radians(5.0)
 
 # Alignment of a pair from nearly right poses. A larger radius joins different surfaces.
 NEAR = (AlignmentLevel(1.0, 3000, 8), AlignmentLevel(0.4, 6000, 10))
-
-# Scans are near where their distance is less than this share of their median ranges. A smaller share joins fewer scans.
-NEAR_SHARE = 1.0
-
-# Rounds of alignment and optimisation: after the second the poses move by millimetres.
-NUM_ROUNDS = 2
-
-# An alignment that moves farther from the present poses than this has found other surfaces.
-LARGEST_MOVE = (1.0, math.radians(5.0))
 
 # Least standard deviation of an aligned pair: systematic errors of the lidar.
 FLOOR_M, FLOOR_RAD = 0.01, math.radians(0.05)
@@ -168,7 +153,8 @@ def _probable_pairs(model: Model, scans: Sequence[Scan]) -> list[tuple[int, int]
     for row in range(len(scans)):
         own = np.flatnonzero((pairs == row).any(axis=1))
         best = own[np.argsort(-overlaps[own], kind="stable")[:NUM_REGISTERED]]
-        is_taken[best[overlaps[best] >= MIN_OVERLAP]] = True
+        # Least probability of overlap of a registered pair.
+        is_taken[best[overlaps[best] >= 0.1]] = True
     return [(int(a), int(b)) for a, b in pairs[is_taken]]
 
 
@@ -197,7 +183,8 @@ def _best_supported(motions: Sequence[PairMotion], T_world: Poses, part: np.ndar
     between: dict[tuple[int, ...], list[_Joint]] = {}
     for motion in motions:
         ends = part[motion.source], part[motion.target]
-        if ends[0] != ends[1] and motion.confidence >= LEAST_CONFIDENCE:
+        # Less probable motions support nothing.
+        if ends[0] != ends[1] and motion.confidence >= 0.05:
             T = T_world[motion.target] @ motion.T_target_source @ rigid.inverse(T_world[motion.source])
             at = T_world[motion.source if ends[0] < ends[1] else motion.target]
             joint = _Joint(motion, T if ends[0] < ends[1] else rigid.inverse(T), at)
@@ -243,7 +230,8 @@ def refine_jointly(surfaces: Sequence[Surface], T_world_scan: Poses, pairs: Int[
         The poses. The first scan keeps its pose, and so do scans without a pair.
     """
     T_world = np.array(T_world_scan, np.float64)
-    for _ in range(NUM_ROUNDS):
+    # Rounds of alignment and optimisation: after the second the poses move by millimetres.
+    for _ in range(2):
         found = [(pair, align_pair(surfaces, T_world, pair)) for pair in pairs.tolist()]
         kept = [(pair, *edge) for pair, edge in found if edge is not None]
         if not kept:
@@ -269,7 +257,9 @@ def scans_in_reach(surfaces: Sequence[Surface], T_world_scan: Poses) -> Int[np.n
     """
     extents = np.array([np.median(np.linalg.norm(surface.points, axis=1)) for surface in surfaces])
     apart = np.linalg.norm(T_world_scan[:, None, :3, 3] - T_world_scan[:, :3, 3], axis=-1)
-    return np.argwhere(np.tril(apart < NEAR_SHARE * np.minimum.outer(extents, extents), k=-1))
+    # Scans are near where their distance is less than this share of their median ranges. A smaller share joins fewer
+    # scans.
+    return np.argwhere(np.tril(apart < 1.0 * np.minimum.outer(extents, extents), k=-1))
 
 
 def align_pair(
@@ -289,7 +279,8 @@ def align_pair(
     T_start = rigid.inverse(T_world_scan[pair[1]]) @ T_world_scan[pair[0]]
     found = align_on_host(source, target, T_start[None], NEAR)
     T = found.T_target_source[0]
-    if not np.isfinite(found.rmse[0]) or not are_near(T_start, T, *LARGEST_MOVE):
+    # An alignment that moves farther from the present poses than this has found other surfaces.
+    if not np.isfinite(found.rmse[0]) or not are_near(T_start, T, *(1.0, math.radians(5.0))):
         return None
     planes = nearest_planes(source, target, T[None], RADIUS_M, NUM_SAMPLES).take(0)
     information = scattered_information(planes.take(planes.is_paired), T)
