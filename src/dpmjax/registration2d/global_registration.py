@@ -20,7 +20,6 @@ from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.map_assembly import PoseScorer, agreeing_edges, assemble, settle
 from dpmjax.registration2d.pair_search import (
-    Candidates,
     CorrelativeConfig,
     Hypotheses,
     chance_level,
@@ -62,7 +61,7 @@ class _Task(NamedTuple):
         """Rows of the scans that are no keyframes."""
         return np.setdiff1d(np.arange(len(self.scans)), self.keyframes)
 
-    def search(self, source: Indices, target: Indices, turns: Booleans | None = None) -> Candidates:
+    def search(self, source: Indices, target: Indices, turns: Booleans | None = None) -> Hypotheses:
         """Returns candidates of pairs."""
         return search_pairs(self.scans, source, target, _SEARCH, turns=turns)
 
@@ -99,7 +98,9 @@ def register_globally(scans: PlanarScans) -> Floats:
     first, second = np.tril_indices(len(keyframes), k=-1)
     pairs = keyframes[first], keyframes[second]
     found = task.search(*pairs, task.likely_turns(*pairs, _NUM_KEYFRAME_TURNS))
-    inside = found._replace(source=first, target=second)
+    inside = found._replace(
+        source=np.searchsorted(keyframes, found.source), target=np.searchsorted(keyframes, found.target)
+    )
     poses = np.zeros((len(scans), 3))
     poses[keyframes] = assemble(scans.take(keyframes), inside, is_ordered=scans.is_ordered)
     if len(keyframes) < len(scans):
@@ -148,7 +149,7 @@ def _similar_pairs(task: _Task) -> tuple[Indices, Indices, Booleans]:
     return source, target, task.likely_turns(source, target, _NUM_LIKELY_TURNS)
 
 
-def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
+def place_others(task: _Task, poses: Floats, found: Hypotheses, more: Hypotheses) -> tuple[Floats, Hypotheses]:
     """Places all scans, given the poses of the keyframes.
 
     Args:
@@ -175,11 +176,11 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     return poses, more
 
 
-def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> Floats:
+def _place(task: _Task, poses: Floats, found: Hypotheses, more: Hypotheses) -> Floats:
     """Places each other scan at its hypothesis with the best score against the keyframes, and revises all poses."""
     candidates = join_rows(found, more)
     scorer = PoseScorer(task.scans, chance_level(found), noisy_share(task.scans, candidates), task.scans.is_ordered)
-    hypotheses, keyframes = Hypotheses.of(candidates, 0.0).in_both_directions(), task.keyframes
+    hypotheses, keyframes = candidates.take(candidates.scores > 0.0).in_both_directions(), task.keyframes
     is_fresh = np.isin(hypotheses.target, keyframes) & ~np.isin(hypotheses.source, keyframes)
     fresh = hypotheses.take(np.flatnonzero(is_fresh))
     worlds = fresh.world_poses(poses)

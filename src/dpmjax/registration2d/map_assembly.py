@@ -21,7 +21,7 @@ import scipy.sparse.csgraph
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.pair_search import Candidates, Hypotheses, chance_level, noisy_share
+from dpmjax.registration2d.pair_search import Hypotheses, chance_level, noisy_share
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import compare_pairs
 
@@ -123,7 +123,7 @@ def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
 
-def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) -> Floats:
+def assemble(scans: PlanarScans, candidates: Hypotheses, *, is_ordered: bool) -> Floats:
     """Assembles one map of all scans from candidates of their pairs, without initial poses.
 
     Args:
@@ -135,7 +135,7 @@ def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) ->
         (n, 3) T_world_scan; the first pose is zero.
     """
     scorer = PoseScorer(scans, chance_level(candidates), noisy_share(scans, candidates), is_ordered)
-    hypotheses, everyone = Hypotheses.of(candidates, 0.0).in_both_directions(), np.arange(len(scans))
+    hypotheses, everyone = candidates.take(candidates.scores > 0.0).in_both_directions(), np.arange(len(scans))
     maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
     scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
     poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(scans), 3))
@@ -146,22 +146,21 @@ def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) ->
     return np.asarray(se2.relative(poses[0], poses))
 
 
-def agreeing_edges(poses: Floats, candidates: Candidates, scans: PlanarScans) -> Edges:
+def agreeing_edges(poses: Floats, candidates: Hypotheses, scans: PlanarScans) -> Edges:
     """Returns an edge for each pair with a candidate that agrees with the map: its nearest candidate."""
     typical_range, num_beams = scans.typical_range, scans.mask.sum(1)
-    beams = num_beams[candidates.source] + num_beams[candidates.target]
-    shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
+    shares = candidates.scores / np.maximum(num_beams[candidates.source] + num_beams[candidates.target], 1.0)
     here = se2.relative(poses[candidates.target], poses[candidates.source])
-    off = se2.relative(here[:, None], candidates.poses)
-    distance = np.hypot(off[..., 0], off[..., 1]) / (_AGREEMENT[0] * typical_range)
-    turn = np.abs(se2.wrap_angle(off[..., 2])) / _AGREEMENT[1]
+    off = se2.relative(here, candidates.poses)
+    distance = np.hypot(off[:, 0], off[:, 1]) / (_AGREEMENT[0] * typical_range)
+    turn = np.abs(se2.wrap_angle(off[:, 2])) / _AGREEMENT[1]
     mismatch = np.where(shares > _MIN_SHARE, np.maximum(distance, turn), np.inf)
-    best = mismatch.argmin(axis=1)
-    row = np.arange(len(best))
-    keep = mismatch[row, best] < 1.0
+    order = np.lexsort((mismatch, candidates.pair))
+    best = order[np.unique(candidates.pair[order], return_index=True)[1]]
+    best = best[mismatch[best] < 1.0]
     sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
-    information = shares[row, best][keep][:, None, None] * np.diag(1.0 / sigma**2)
-    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
+    information = shares[best][:, None, None] * np.diag(1.0 / sigma**2)
+    return Edges(candidates.source[best], candidates.target[best], candidates.poses[best], information)
 
 
 def _choose_seeds(hypotheses: Hypotheses) -> list[int]:

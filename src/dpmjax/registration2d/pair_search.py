@@ -7,6 +7,7 @@ shifts of one turn. The views of both scans then refine the best poses on ever f
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,14 +55,14 @@ class CorrelativeConfig(NamedTuple):
     max_shift: float = np.inf
 
 
-class Candidates(NamedTuple):
-    """Relative poses of pairs of scans, k for each of p pairs, the best first.
+class Hypotheses(NamedTuple):
+    """Scored relative poses of pairs of scans. A pair may have several, side by side, the best first.
 
     Attributes:
-        source: (p,) rows.
-        target: (p,) rows.
-        poses: (p, k, 3) T_target_source.
-        scores: (p, k) matched less weighted contradicting beams; minus infinity for missing candidates.
+        source: (h,) rows.
+        target: (h,) rows.
+        poses: (h, 3) T_target_source.
+        scores: (h,) matched less weighted contradicting beams, or the score that the maker says.
     """
 
     source: Indices
@@ -69,36 +70,11 @@ class Candidates(NamedTuple):
     poses: Floats
     scores: Floats
 
-
-def chance_level(candidates: Candidates) -> float:
-    """Estimates the score of a wrong pose of a pair: the median of second candidates, which are mostly wrong."""
-    second = candidates.scores[:, 1]
-    second = second[np.isfinite(second)]
-    return max(0.0, float(np.median(second))) if len(second) else 0.0
-
-
-def noisy_share(scans: PlanarScans, candidates: Candidates) -> float:
-    """Computes a bound on the share of beams that range noise makes contradictory, from the best-scored pairs."""
-    best = np.argsort(-candidates.scores[:, 0])[: len(scans)]
-    views = compare_pairs(scans, candidates.source[best], candidates.target[best], candidates.poses[best, 0])
-    share = views.contradicted / np.maximum(views.visible, 1.0)
-    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
-
-
-class Hypotheses(NamedTuple):
-    """Scored relative poses of pairs: (h,) rows, (h, 3) T_target_source, (h,) scores; a pair may have several."""
-
-    source: Indices
-    target: Indices
-    poses: Floats
-    scores: Floats
-
-    @classmethod
-    def of(cls, candidates: Candidates, least_score: float = -np.inf) -> Hypotheses:
-        """Makes hypotheses of all candidates with a score above `least_score`."""
-        row, column = np.nonzero(candidates.scores > least_score)
-        poses, scores = candidates.poses[row, column], candidates.scores[row, column]
-        return cls(candidates.source[row], candidates.target[row], poses, scores)
+    @property
+    def pair(self) -> Indices:
+        """Number (h,) of the pair of each hypothesis, in order from 0."""
+        is_new = (np.diff(self.source) != 0) | (np.diff(self.target) != 0)
+        return np.cumsum(np.append(False, is_new))[: len(self.source)]
 
     def in_both_directions(self) -> Hypotheses:
         """Returns all hypotheses, then all of them with exchanged scans."""
@@ -111,6 +87,22 @@ class Hypotheses(NamedTuple):
     def world_poses(self, poses: Floats) -> Floats:
         """Computes the world pose (h, 3) of each source from the world pose of its target."""
         return np.asarray(se2.compose(poses[self.target], self.poses))
+
+
+def chance_level(found: Hypotheses) -> float:
+    """Estimates the score of a wrong pose of a pair: the median of second hypotheses, which are mostly wrong."""
+    first = np.unique(found.pair, return_index=True)[1]
+    second = found.scores[np.setdiff1d(first + 1, np.append(first, len(found.scores)))]
+    return max(0.0, float(np.median(second))) if len(second) else 0.0
+
+
+def noisy_share(scans: PlanarScans, found: Hypotheses) -> float:
+    """Computes a bound on the share of beams that range noise makes contradictory, from the best-scored pairs."""
+    first = found.take(np.unique(found.pair, return_index=True)[1])
+    best = first.take(np.argsort(-first.scores)[: len(scans)])
+    views = compare_pairs(scans, best.source, best.target, best.poses)
+    share = views.contradicted / np.maximum(views.visible, 1.0)
+    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
 
 
 def poses_apart(poses: Floats, scores: Floats, typical_range: float, count: int) -> Indices:
@@ -170,7 +162,7 @@ def _best_shifts(
 
 def search_pairs(
     scans: PlanarScans, source: Indices, target: Indices, config: CorrelativeConfig, turns: Booleans | None = None
-) -> Candidates:
+) -> Hypotheses:
     """Finds the best-scored relative poses of pairs of scans, without initial poses.
 
     Args:
@@ -181,20 +173,23 @@ def search_pairs(
         turns: (p, num_turns) True for headings of T_target_source to try. Turn k is k 2 pi / num_turns. None: all.
 
     Returns:
-        Candidates.
+        Hypotheses, in the order of the pairs.
     """
     # Pairs with one source lie side by side, so that few scans are turned for a batch.
-    order, found = np.lexsort((target, source)), []
+    order, numbers, found = np.lexsort((target, source)), [], []
     for start in range(0, max(len(order), 1), _SEARCH_BATCH):
         rows = order[start : start + _SEARCH_BATCH]
         tried = None if turns is None else turns[rows]
-        found.append(_search_batch(scans, (source[rows], target[rows]), config, tried))
-    joined, back = join_rows(*found), np.argsort(order)
-    return Candidates(joined.source[back], joined.target[back], joined.poses[back], joined.scores[back])
+        number, some = _search_batch(scans, (source[rows], target[rows]), config, tried)
+        numbers.append(rows[number])
+        found.append(some)
+    return join_rows(*found).take(np.argsort(np.concatenate(numbers), kind="stable"))
 
 
-def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None) -> Candidates:
-    """Finds candidates of one batch of pairs."""
+def _search_batch(
+    scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None
+) -> tuple[Indices, Hypotheses]:
+    """Finds hypotheses of one batch of pairs, and the number of the pair of each."""
     unit, (source, target) = scans.typical_range, pairs
     cell, size = config.cell * unit, config.num_cells
     seen = scans.views
@@ -217,35 +212,38 @@ def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, t
             score, shift = _best_shifts(product, outside, config)
             scores[rows[some], number], poses[rows[some], number, :, :2] = score, cell * shift
         poses[:, number, :, 2] = se2.wrap_angle(turn)
-    found = Candidates(source, target, poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1))
-    # Two candidates may converge to one pose in the refinement.
-    return _keep_apart(refine_candidates(scans, _keep_apart(found, config, unit), config), config, unit)
+    number = np.repeat(np.arange(len(source)), config.num_turns * config.num_peaks)
+    found = Hypotheses(source[number], target[number], poses.reshape(-1, 3), scores.ravel())
+    number, found = _keep_apart(number, found, config, unit)
+    # Two hypotheses may converge to one pose in the refinement.
+    return _keep_apart(number, refine_candidates(scans, found, config), config, unit)
 
 
-def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
-    """Selects the best poses of each pair that lie apart."""
-    shape = len(found.source), config.num_candidates
-    poses, scores = np.zeros((*shape, 3)), np.full(shape, -np.inf)
-    for row in range(len(found.source)):
-        kept = poses_apart(found.poses[row], found.scores[row], typical_range, config.num_candidates)
-        poses[row, : len(kept)], scores[row, : len(kept)] = found.poses[row, kept], found.scores[row, kept]
-    return found._replace(poses=poses, scores=scores)
+def _keep_apart(
+    number: Indices, found: Hypotheses, config: CorrelativeConfig, typical_range: float
+) -> tuple[Indices, Hypotheses]:
+    """Selects the best poses of each pair that lie apart; returns the numbers of their pairs, too."""
+    kept, ends = [np.zeros(0, np.int64)], np.searchsorted(number, np.arange(number.max(initial=-1) + 2))
+    for first, last in itertools.pairwise(ends):
+        own = slice(first, last)
+        kept.append(first + poses_apart(found.poses[own], found.scores[own], typical_range, config.num_candidates))
+    rows = np.concatenate(kept)
+    return number[rows], found.take(rows)
 
 
-def refine_candidates(scans: PlanarScans, found: Candidates, config: CorrelativeConfig) -> Candidates:
-    """Refines candidates on local grids of five steps along each axis, from a spacing of half a cell down.
+def refine_candidates(scans: PlanarScans, found: Hypotheses, config: CorrelativeConfig) -> Hypotheses:
+    """Refines hypotheses on local grids of five steps along each axis, from a spacing of half a cell down.
 
     Args:
         scans: n scans.
-        found: candidates of p pairs. Candidates without a finite score are not refined.
+        found: hypotheses.
         config: settings of the grids.
 
     Returns:
-        Candidates with the best poses near the given ones, in the given order.
+        Hypotheses with the best poses near the given ones, in the given order.
     """
     cell = config.cell * scans.typical_range
-    first, which = np.nonzero(np.isfinite(found.scores))
-    poses, scores = found.poses.copy(), np.full(found.scores.shape, -np.inf)
+    row, poses, scores = np.arange(len(found.scores)), found.poses, found.scores
     match, contradict, _ = scans.tolerances
     axis = np.arange(-2.0, 3.0)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -253,9 +251,9 @@ def refine_candidates(scans: PlanarScans, found: Candidates, config: Correlative
         share = 0.5 ** (level + 1)
         step = share * np.array([cell, cell, 2 * np.pi / config.num_turns])
         blurred = Tolerances.of(max(match, 0.7 * share * cell), max(contradict, 2.1 * share * cell))
-        places = poses[first, which][:, None] + grid * step
-        views = compare_pairs(scans, found.source[first], found.target[first], places, stride=4, tolerances=blurred)
-        score, row = views.matched - _CONTRADICTION_WEIGHT * views.contradicted, np.arange(len(first))
+        places = poses[:, None] + grid * step
+        views = compare_pairs(scans, found.source, found.target, places, stride=4, tolerances=blurred)
+        score = views.matched - _CONTRADICTION_WEIGHT * views.contradicted
         best = score.argmax(axis=1) if len(row) else row
-        poses[first, which], scores[first, which] = places[row, best], score[row, best]
+        poses, scores = places[row, best], score[row, best]
     return found._replace(poses=poses, scores=scores)

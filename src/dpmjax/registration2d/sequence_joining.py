@@ -103,7 +103,7 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
     for number, step in enumerate(steps):
         before, after = rows[step], rows[step + 1]
         gap, here = int(after - before), se2.relative(poses[before], poses[after])
-        candidates = found.poses[number][np.isfinite(found.scores[number])]
+        candidates = found.poses[found.target == 2 * number]
         ways = np.concatenate([[here, sequence.prior.expected(gap)], candidates])
         pairs = np.full(len(ways), 2 * number + 1), np.full(len(ways), 2 * number)
         score = pair_scores(submaps, *pairs, ways)
@@ -177,8 +177,7 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
     if not len(later):
         return Hypotheses(later, earlier, np.zeros((0, 3)), np.zeros(0))
     turns = WallDirections(submaps.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
-    found = search_pairs(submaps.scans, later, earlier, config._replace(num_candidates=4), turns=turns)
-    votes = Hypotheses.of(found)
+    votes = search_pairs(submaps.scans, later, earlier, config._replace(num_candidates=4), turns=turns)
     votes = votes._replace(scores=pair_scores(submaps.scans, votes.source, votes.target, votes.poses))
     return votes.take(votes.scores > _LEAST_VOTE)
 

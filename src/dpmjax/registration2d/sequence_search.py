@@ -17,7 +17,7 @@ import numpy as np
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import join_rows
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
-from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
+from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import (
     LEAST_VISIBLE,
@@ -127,7 +127,7 @@ def _search(scans: PlanarScans, pairs: Indices) -> Hypotheses:
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(_SEARCH.num_turns) / _SEARCH.num_turns)
     turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
-    source, target, poses, _ = Hypotheses.of(search_pairs(scans, source, target, _SEARCH, turns=turns))
+    source, target, poses, _ = search_pairs(scans, source, target, _SEARCH, turns=turns)
     aligned = match_pairs(scans.take(source), scans.take(target), poses[:, None], FINE).poses
     before, after = (pair_scores(scans, source, target, x) for x in (poses, aligned))
     is_better = after > before - 0.02
@@ -161,8 +161,7 @@ def align_arcs(scans: PlanarScans, later: Indices, usual: MotionPrior) -> Hypoth
     found = Hypotheses(source, source - 1, poses, scores).take(np.concatenate(kept))
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
     # of two scans alone may lie beside the right pose, too: the last placed scans choose.
-    near = Candidates(found.source, found.target, found.poses[:, None], found.scores[:, None])
-    shifted = refine_candidates(scans, near, _SEARCH).poses[:, 0]
+    shifted = refine_candidates(scans, found, _SEARCH).poses
     after = pair_scores(scans, found.source, found.target, shifted)
     is_better = after > found.scores
     return join_rows(found, found._replace(poses=shifted, scores=after).take(is_better))
