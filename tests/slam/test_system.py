@@ -102,16 +102,6 @@ def test_scans_prepared_ahead_make_the_same_map(proposer) -> None:
     assert repr(result.reports) == repr(expected.reports)
 
 
-def test_a_step_leaves_the_state_before_as_it_was() -> None:
-    truth = laps(1, side_m=30.0)
-    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), CONFIG)
-    state = init_slam()
-    for scan in scans_of(range(40)):
-        state, _ = step_slam(methods, state, scan)
-    once, twice = (step_slam(methods, state, scans_of([40])[0])[0] for _ in range(2))
-    np.testing.assert_array_equal(once.slam_map.T_world_keyframe, twice.slam_map.T_world_keyframe)
-
-
 def test_every_scan_gets_a_pose_and_empty_ones_are_flagged() -> None:
     truth = laps(1, side_m=20.0)
     scans = scans_of(range(len(truth)))
@@ -235,18 +225,6 @@ def test_in_a_corridor_odometry_knows_the_way() -> None:
         for odometry in (pose(5.0, 3.0, 1.0) @ truth, None)
     ]
     np.testing.assert_allclose(ways_m, [24.0, 39.0], atol=0.5)
-
-
-def test_the_network_helps_where_geometry_fails() -> None:
-    # Of each ten scans nine are dropped for a while: the prediction is wrong by more than geometry can do.
-    truth = laps(1, side_m=60.0)
-    numbers = [*range(10), 20, *range(21, 50)]
-    exact = TruthMatcher(truth, gross_share=0.0)
-    result = run(truth, numbers, matcher=exact)
-    assert result.reports[10].status == "network"
-    assert result.reports[10].probability is not None
-    expected = truth[numbers][:, :3, 3]
-    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], expected) < 0.5
 
 
 def by_network(**changes) -> SlamConfig:

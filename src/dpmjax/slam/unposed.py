@@ -68,14 +68,12 @@ class PairMotion(NamedTuple):
         target: row of the second scan.
         T_target_source: its motion.
         confidence: probability that the motion is right.
-        is_used: True if the poses agree with it.
     """
 
     source: int
     target: int
     T_target_source: Pose
     confidence: float
-    is_used: bool = False
 
 
 class RegisteredClouds(NamedTuple):
@@ -133,9 +131,8 @@ def register_unposed(model: Model, scans: Sequence[RawScan] | Path, *, progress:
         rows = np.flatnonzero(part == number)
         surfaces = [prepared[row].surface for row in rows]
         T_world[rows] = refine_jointly(surfaces, T_world[rows], scans_in_reach(surfaces, T_world[rows]))
-    used = [motion._replace(is_used=_agrees(motion, T_world, part)) for motion in motions]
     first = np.array([np.flatnonzero(part == number)[0] for number in part])
-    return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(used))
+    return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(motions))
 
 
 def _probable_pairs(model: Model, scans: Sequence[Scan]) -> list[tuple[int, int]]:
@@ -211,11 +208,6 @@ class _Joint(NamedTuple):
         """Returns True if both motions put the scan of this one at the same place."""
         T_first_scan = self.T_first_scan
         return are_near(self.T_second_first @ T_first_scan, other.T_second_first @ T_first_scan, AGREE_M, AGREE_RAD)
-
-
-def _agrees(motion: PairMotion, T_world: Poses, part: np.ndarray) -> bool:
-    T = rigid.inverse(T_world[motion.target]) @ T_world[motion.source]
-    return bool(part[motion.source] == part[motion.target]) and are_near(T, motion.T_target_source, AGREE_M, AGREE_RAD)
 
 
 def refine_jointly(surfaces: Sequence[Surface], T_world_scan: Poses, pairs: Int[np.ndarray, "p 2"]) -> Poses:
