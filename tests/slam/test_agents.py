@@ -20,7 +20,6 @@ from dpmjax.slam import (
     run_agents,
     run_slam,
     slam_preset,
-    take_component,
 )
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, scans_of
 
@@ -109,7 +108,7 @@ def test_agents_that_never_meet_stay_apart() -> None:
     assert joint_error_m(result, parts, (0, 2), truth) < 1.0
     # The stranger has the frame of its own first scan, and the trajectory that it has found alone.
     np.testing.assert_allclose(result.T_world_scan[1], result.agents[1].T_world_scan, atol=1e-9)
-    assert len(take_component(result.joined, 1)) == len(result.agents[1].keyframes)
+    assert len(result.joined.maps[1]) == len(result.agents[1].keyframes)
 
 
 @pytest.mark.slow

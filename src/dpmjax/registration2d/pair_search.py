@@ -200,9 +200,9 @@ def _search_batch(
     targets = _spectra(tuple(x[used] for x in views), 0.0, cell, config)
     poses = np.zeros((len(source), config.num_turns, config.num_peaks, 3))
     scores = np.full(poses.shape[:-1], -np.inf)
-    for number in range(config.num_turns):
-        rows = np.arange(len(source)) if turns is None else np.flatnonzero(turns[:, number])
-        turn = 2 * np.pi * number / config.num_turns
+    for k in range(config.num_turns):
+        rows = np.arange(len(source)) if turns is None else np.flatnonzero(turns[:, k])
+        turn = 2 * np.pi * k / config.num_turns
         used, turned = np.unique(source[rows], return_inverse=True)
         sources = _spectra(tuple(x[used] for x in views), turn, cell, config).conj() if len(used) else targets
         for first in range(0, len(rows), _IMAGES):
@@ -210,11 +210,11 @@ def _search_batch(
             i, j = turned[some], still[rows[some]]
             product = sources[0, i] * targets[1, j] + sources[1, i] * targets[0, j]
             score, shift = _best_shifts(product, outside, config)
-            scores[rows[some], number], poses[rows[some], number, :, :2] = score, cell * shift
-        poses[:, number, :, 2] = se2.wrap_angle(turn)
-    number = np.repeat(np.arange(len(source)), config.num_turns * config.num_peaks)
-    found = Hypotheses(source[number], target[number], poses.reshape(-1, 3), scores.ravel())
-    number, found = _keep_apart(number, found, config, unit)
+            scores[rows[some], k], poses[rows[some], k, :, :2] = score, cell * shift
+        poses[:, k, :, 2] = se2.wrap_angle(turn)
+    all_pairs = np.repeat(np.arange(len(source)), config.num_turns * config.num_peaks)
+    everything = Hypotheses(source[all_pairs], target[all_pairs], poses.reshape(-1, 3), scores.ravel())
+    number, found = _keep_apart(all_pairs, everything, config, unit)
     # Two hypotheses may converge to one pose in the refinement.
     return _keep_apart(number, refine_candidates(scans, found, config), config, unit)
 
@@ -255,5 +255,5 @@ def refine_candidates(scans: PlanarScans, found: Hypotheses, config: Correlative
         views = compare_pairs(scans, found.source, found.target, places, stride=4, tolerances=blurred)
         score = views.matched - _CONTRADICTION_WEIGHT * views.contradicted
         best = score.argmax(axis=1) if len(row) else row
-        poses, scores = places[row, best], score[row, best]
+        poses, scores = places[row, best], np.asarray(score[row, best])
     return found._replace(poses=poses, scores=scores)

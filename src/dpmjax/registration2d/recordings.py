@@ -123,7 +123,7 @@ def find_silent_steps(scans: ScanSet, odometry: Floats) -> Booleans:
     Returns:
         (n - 1,) True for the steps of a run in which the robot may have moved.
     """
-    is_seen: Booleans = np.asarray(scans.mask).any(axis=1)
+    is_seen = np.asarray(np.asarray(scans.mask).any(axis=1))
     stands = np.abs(np.diff(odometry, axis=0)).max(axis=1) < 1e-9
     is_silent = np.zeros(len(stands), np.bool_)
     for first, last in find_runs(stands, _LEAST_SILENT):

@@ -1,9 +1,7 @@
 from .agents import AgentsResult as AgentsResult
-from .agents import JoinedMaps as JoinedMaps
 from .agents import MergedMaps as MergedMaps
 from .agents import merge_maps as merge_maps
 from .agents import run_agents as run_agents
-from .agents import take_component as take_component
 from .config import DescriptorConfig as DescriptorConfig
 from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig

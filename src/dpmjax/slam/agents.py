@@ -39,21 +39,29 @@ OnKeyframe = Callable[[int, int], None]
 
 
 @with_short_repr
-class JoinedMaps(NamedTuple):
-    """Several maps in one record; maps that meet have one frame.
+class MergedMaps(NamedTuple):
+    """Merged maps, and the maps that have met.
 
     Attributes:
-        slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
-        map_of_keyframe: (k,) number of the map that each keyframe comes from.
-        component_of_map: number of the component of each map, from 0; joined maps share one. Each component has its own
-            frame. Poses of different components or of different `measured_parts` cannot be compared.
+        maps: one map for each component, in the frame of its first map; a map that met no other is unchanged. Poses of
+            different maps or of different `measured_parts` cannot be compared.
+        component: row of `maps` that each given map is part of; maps with equal numbers have met.
         loops: candidates between maps and their outcome; rows are those of `slam_map`.
+        slam_map: the keyframes of all maps in one record, map by map; the scan numbers of each map continue those of
+            the map before.
+        map_of_keyframe: (k,) number of the given map that each keyframe comes from.
     """
 
+    maps: tuple[KeyframeMap, ...]
+    component: tuple[int, ...]
+    loops: tuple[Loop, ...]
     slam_map: KeyframeMap
     map_of_keyframe: Int[np.ndarray, " k"]
-    component_of_map: tuple[int, ...]
-    loops: tuple[Loop, ...]
+
+    @property
+    def is_joined(self) -> bool:
+        """True if all maps have become one, and measured motions join all its keyframes."""
+        return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
 @with_short_repr
@@ -65,42 +73,14 @@ class AgentsResult(NamedTuple):
             its first agent.
         component: number of the component of each agent. Agents of one component have met. Only their poses can be
             compared, within `measured_parts`.
-        joined: all keyframes in one record, and the loops between agents.
+        joined: their merged maps, and the loops between agents.
         agents: result of each agent alone.
     """
 
     T_world_scan: tuple[Poses, ...]
     component: tuple[int, ...]
-    joined: JoinedMaps
+    joined: MergedMaps
     agents: tuple[SlamResult, ...]
-
-
-@with_short_repr
-class MergedMaps(NamedTuple):
-    """Merged maps, and the maps that have met.
-
-    Attributes:
-        maps: one map for each component, in the frame of its first map; a map that met no other is unchanged.
-        joined: the keyframes of all maps in one record, and the loops between maps.
-    """
-
-    maps: tuple[KeyframeMap, ...]
-    joined: JoinedMaps
-
-    @property
-    def component(self) -> tuple[int, ...]:
-        """Row of `maps` that each given map is part of; maps with equal numbers have met."""
-        return self.joined.component_of_map
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """Candidates between maps and their outcome; rows count all keyframes, map by map."""
-        return self.joined.loops
-
-    @property
-    def is_joined(self) -> bool:
-        """True if all maps have become one, and measured motions join all its keyframes."""
-        return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
 @runs_on_host("call it outside, and pass its result in")
@@ -128,7 +108,7 @@ def run_agents(
     methods = as_methods(model, config)
     agents = tuple(run_slam(methods, scans) for scans in sequences)
     joined = join_maps(methods, [agent.map for agent in agents])
-    return AgentsResult(_trajectories(joined, agents), joined.component_of_map, joined, agents)
+    return AgentsResult(_trajectories(joined, agents), joined.component, joined, agents)
 
 
 @runs_on_host("call it outside, and pass its result in")
@@ -153,18 +133,12 @@ def merge_maps(
     loaded: list[KeyframeMap] = [read_path(slam_map, "saved_maps.load_map") for slam_map in maps]
     for slam_map in loaded:
         require_type("maps", slam_map, KeyframeMap, "load_map")
-    joined = join_maps(methods_for(model, loaded[0]), loaded, on_keyframe=on_keyframe)
-    numbers = joined.component_of_map
-    merged = [
-        take_component(joined, component) if numbers.count(component) > 1 else loaded[numbers.index(component)]
-        for component in range(max(numbers) + 1)
-    ]
-    return MergedMaps(tuple(merged), joined)
+    return join_maps(methods_for(model, loaded[0]), loaded, on_keyframe=on_keyframe)
 
 
 def join_maps(
     methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = lambda _num, _all: None
-) -> JoinedMaps:
+) -> MergedMaps:
     """Finds loops between maps, and optimises each group of joined maps as one graph.
 
     The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
@@ -175,7 +149,7 @@ def join_maps(
         on_keyframe: callback for progress.
 
     Returns:
-        All keyframes, and the components of the joined maps.
+        The merged maps.
 
     Raises:
         ValueError: if a map was made by another matcher.
@@ -200,21 +174,12 @@ def join_maps(
     # Scipy numbers the parts in the order of their first nodes.
     components = tuple(connected_parts(len(maps), between).tolist())
     joined = replace(joined, T_world_keyframe=_in_own_frames(joined, map_of_row, components, maps))
-    return JoinedMaps(joined, map_of_row, components, loops)
-
-
-def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
-    """Extracts the map of one component.
-
-    Args:
-        joined: maps from `join_maps`.
-        component: its number.
-
-    Returns:
-        The map of the keyframes and edges of that component, with rows of its own.
-    """
-    is_taken = np.array(joined.component_of_map)[joined.map_of_keyframe] == component
-    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist())
+    component_of_row, merged = np.array(components)[map_of_row], []
+    for number in range(max(components) + 1):
+        alone = maps[components.index(number)]
+        rows = np.flatnonzero(component_of_row == number).tolist()
+        merged.append(take_keyframes(joined, rows) if components.count(number) > 1 else alone)
+    return MergedMaps(tuple(merged), components, loops, joined, map_of_row)
 
 
 def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
@@ -241,7 +206,7 @@ def _in_own_frames(
     return np.reshape(T_new_old, (-1, 4, 4))[component] @ T_old
 
 
-def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:
+def _trajectories(joined: MergedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:
     """Computes the poses of all scans; the first scan of a component's first agent is its origin."""
     found: list[Poses] = []
     origins: dict[int, Pose] = {}
@@ -252,7 +217,7 @@ def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Pos
             # `place_scans` has the first scan as its origin.
             first = agent.reports[0]
             T_world_agent = T_world_keyframe[first.keyframe] @ first.T_keyframe_scan
-            T_origin_world = origins.setdefault(joined.component_of_map[number], rigid.inverse(T_world_agent))
+            T_origin_world = origins.setdefault(joined.component[number], rigid.inverse(T_world_agent))
             T_agent_scan = T_origin_world @ T_world_agent @ T_agent_scan
         found.append(T_agent_scan)
     return tuple(found)
