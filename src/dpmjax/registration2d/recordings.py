@@ -43,8 +43,6 @@ _LEAST_SILENT, _MAX_COMPARED = 3, 8
 # A beam has changed by more than these standard deviations of the noise, and this share of the typical range; the
 # robot has stood where a smaller share of the beams has changed.
 _NOISE, _LEAST_CHANGE, _CHANGED_SHARE = 6.0, 0.01, 0.01
-# Scans that are aligned at a time.
-_BLOCK = 1024
 
 
 class Recording(NamedTuple):
@@ -286,11 +284,9 @@ def align_between(scans: PlanarScans, chosen: Indices, poses: Float[np.ndarray, 
         (farther, _TURNS, _LOOSE_SIGMA),
     ):
         rows = np.flatnonzero(is_left)
-        for start in range(0, len(rows), _BLOCK):
-            some = rows[start : start + _BLOCK]
-            found, fits = _align_with(scans, poses, (others[some], target[some]), turns, sigma)
-            aligned[others[some[fits]]] = found[fits]
-            is_left[some[fits]] = False
+        found, fits = _align_with(scans, poses, (others[rows], target[rows]), turns, sigma)
+        aligned[others[rows[fits]]] = found[fits]
+        is_left[rows[fits]] = False
     return aligned
 
 
