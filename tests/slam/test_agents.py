@@ -141,14 +141,6 @@ def test_an_agent_without_scans_is_alone() -> None:
     assert [len(T_world_scan) for T_world_scan in result.T_world_scan] == [30, 2, 0, 30]
 
 
-def test_an_agent_alone_finds_what_it_finds_alone() -> None:
-    methods = methods_of(TRUTH)
-    alone = dpmjax.run_slam(methods, scans_of(range(60)))
-    result = run_agents(methods, [scans_of(range(60))])
-    np.testing.assert_allclose(result.T_world_scan[0], alone.T_world_scan, atol=1e-9)
-    assert result.component == (0,)
-
-
 @pytest.mark.slow
 def test_maps_of_different_days_are_merged() -> None:
     methods = methods_of(TRUTH)
