@@ -192,13 +192,6 @@ def test_planar_scans_are_aligned_on_the_host_and_on_a_device() -> None:
     np.testing.assert_allclose(on_device.T_target_source, T, atol=2e-3)
 
 
-def test_other_radii_compile_nothing(assert_compiles_nothing) -> None:
-    schedule = np.full((3, 2), 1.0, np.float32)
-    align(SOURCE, TARGET, GUESS, schedule)
-    with assert_compiles_nothing():
-        align(SOURCE, TARGET, GUESS, 2 * schedule)
-
-
 def test_pairs_are_the_nearest_planes() -> None:
     """The oracle measures all distances."""
     a, b = (surface_of_elements(side) for side in (SOURCE, TARGET))

@@ -1,7 +1,6 @@
 from .align import AlignedMotion as AlignedMotion
 from .align import AlignmentLevel as AlignmentLevel
 from .align import align_on_host as align_on_host
-from .align import schedule_of as schedule_of
 from .augment import AugmentConfig as AugmentConfig
 from .augment import augment_scan as augment_scan
 from .corrections import deskew as deskew

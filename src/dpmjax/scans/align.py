@@ -102,18 +102,11 @@ def _solve(pairs: Pairs, kernel: Any) -> tuple[PlaneStep, Any]:
     return step, xp.where(is_enough, rmse, np.inf)
 
 
-def schedule_of(levels: tuple[AlignmentLevel, ...]) -> Float[np.ndarray, "k 2"]:
-    """Returns the radius and the width of the kernel of each step of all levels, for `align`."""
-    rows = [[level.radius_m, level.kernel_width_m] for level in levels for _ in range(level.num_iterations)]
-    return np.array(rows, np.float32)
-
-
 @jax.jit
 def align(
     source: SurfaceElements,
     target: SurfaceElements,
     T_target_source: Float[AnyArray, "d1 d1"],
-    schedule: Float[AnyArray, "k 2"] | None = None,
 ) -> AlignedMotion:
     """Aligns two sets of surface elements from a first guess, by exhaustive search on any device.
 
@@ -124,15 +117,14 @@ def align(
         source: elements in the source frame; masked ones may hold anything.
         target: the same in the target frame.
         T_target_source: first guess, within the first radius and about 10 degrees.
-        schedule: largest distance of a pair, and width of the kernel, of each step; other numbers compile nothing.
-            None takes that of `LEVELS`.
 
     Returns:
         The motion.
     """
-    schedule = schedule_of(LEVELS) if schedule is None else schedule
     source, target = (_flat(jax.tree.map(jnp.asarray, side)) for side in (source, target))
-    T, schedule = jnp.asarray(T_target_source, source.positions.dtype), jnp.asarray(schedule, source.positions.dtype)
+    T = jnp.asarray(T_target_source, source.positions.dtype)
+    steps = [(level.radius_m, level.kernel_width_m) for level in LEVELS for _ in range(level.num_iterations)]
+    schedule = jnp.array(steps, T.dtype)
 
     def step_from(source: SurfaceElements, target: SurfaceElements, T: Any, scale: Any) -> AlignedMotion:
         moved = move_elements((source.positions, source.normals), T)

@@ -248,7 +248,8 @@ class _Search(NamedTuple):
         status: ScanStatus = "tracked" if best is tried.tracked else "network"
         if best.score < wanted and not _is_confirmed(tried, config.min_probability):
             T = self._guess(tried)
-            status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
+            # After six scans without an accepted pose, a new segment begins. Loops may join it later.
+            status = "restarted" if len(state.lost) + 1 >= 6 else "predicted"
             information = diagonal_information(GUESS_M, GUESS_RAD)
         elif self.scan.weak_axis is not None:
             sigma_m = sigma_along(information, self.scan.weak_axis)

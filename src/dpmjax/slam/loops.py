@@ -17,7 +17,6 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.pose_graph.optimize import PoseGraphConfig, optimize_pose_graph
 from dpmjax.scans.weak_directions import diagonal_information, with_least_covariance
-from dpmjax.slam.config import LoopClosureConfig
 from dpmjax.slam.interfaces import Match
 from dpmjax.slam.keyframe_map import KeyframeMap, MapEdge, as_pose_graph, measured_parts
 from dpmjax.types import Information, Pose, Poses
@@ -151,14 +150,14 @@ def has_new_loops(slam_map: KeyframeMap, loops: Iterable[Loop]) -> bool:
     return num_accepted(loops) > len(slam_map.edges_of("loop"))
 
 
-def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> Loop:
+def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, min_probability: float) -> Loop:
     """Records the registration of a loop, and tests it against its probability and odometry.
 
     Args:
         slam_map: the map.
         loop: the candidate.
         match: its registration.
-        config: smallest probability.
+        min_probability: smallest accepted P(correct).
 
     Returns:
         The loop; it "waits for support", or its status is the reason of the rejection.
@@ -166,12 +165,12 @@ def with_match(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClos
     information = DESCRIPTOR_INFORMATION
     if match.information is not None:
         information = with_least_covariance(match.information, FLOOR_M, FLOOR_RAD)
-    status = _status(slam_map, loop, match, config)
+    status = _status(slam_map, loop, match, min_probability)
     return Loop(*loop[:3], status, loop.overlap, match.probability, match.rmse, match.T_target_source, information)
 
 
-def _status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosureConfig) -> LoopStatus:
-    if match.probability < config.min_probability:
+def _status(slam_map: KeyframeMap, loop: Loop, match: Match, min_probability: float) -> LoopStatus:
+    if match.probability < min_probability:
         return "improbable"
     source, target = slam_map.keyframes[loop.source], slam_map.keyframes[loop.target]
     if source.segment == target.segment:
@@ -186,16 +185,13 @@ def _status(slam_map: KeyframeMap, loop: Loop, match: Match, config: LoopClosure
     return "waits for support"
 
 
-def accept_consistent(
-    slam_map: KeyframeMap, loops: tuple[Loop, ...], number: int, config: LoopClosureConfig
-) -> tuple[Loop, ...]:
+def accept_consistent(slam_map: KeyframeMap, loops: tuple[Loop, ...], number: int) -> tuple[Loop, ...]:
     """Accepts a loop and waiting loops if enough of them agree pairwise (greedy by probability).
 
     Args:
         slam_map: the map.
         loops: all candidates, in the order of their sources.
         number: index of the loop. Only a loop that waits for support changes.
-        config: the required number of registrations.
 
     Returns:
         All candidates after.
@@ -215,7 +211,8 @@ def accept_consistent(
     for other in sorted(others, key=lambda other: -(loops[other].probability or 0.0)):
         if all(agree(member, other) for member in members[1:]):
             members.append(other)
-    if len(members) < config.min_support:
+    # A single registration may be wrong with a high probability.
+    if len(members) < 2:
         return loops
     return tuple(loop._replace(status="accepted") if row in members else loop for row, loop in enumerate(loops))
 
