@@ -1,7 +1,5 @@
 """Fixtures of all tests. Shapes and types are checked at run time, by jaxtyping and beartype."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import os
@@ -112,6 +110,17 @@ def as_user() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def weights(tmp_path) -> Path:
+    """A file of a network that compiles in seconds."""
+    import dpmjax
+    from tests.deeppointmap import toy
+
+    path = tmp_path / "model.safetensors"
+    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
+    return path
 
 
 @pytest.fixture

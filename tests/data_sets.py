@@ -1,7 +1,5 @@
 """Writers of data sets in the layouts of their authors, for tests of the readers and of the commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

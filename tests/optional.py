@@ -1,7 +1,5 @@
 """Tests that need a package of an extra are skipped with the reason, also if the package is broken."""
 
-from __future__ import annotations
-
 import importlib
 from types import ModuleType
 

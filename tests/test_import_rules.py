@@ -1,7 +1,5 @@
 """Who may import whom: the plan of the house, checked on the source so that it cannot rot."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A pipeline gives the same for a file or folder as for the arrays in it, and names a bad one in a line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax

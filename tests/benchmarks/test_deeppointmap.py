@@ -1,7 +1,5 @@
 """The DeepPointMap benchmark: each stage has a process of its own, and each number stands beside its rival."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,19 +1,12 @@
 """The promises of every command to the shell: exit codes, one-line errors, results on Ctrl-C, resume."""
 
-from __future__ import annotations
-
-import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from dpmjax.cli.run import STOPPING
-
-REPOSITORY = Path(__file__).parents[2]
+from tests.processes import start_python
 
 TOY = '''
 """A toy.
@@ -67,20 +60,7 @@ if __name__ == "__main__":
 @pytest.fixture
 def toy(tmp_path):
     (tmp_path / "toy.py").write_text(TOY)
-    paths = [str(REPOSITORY), str(REPOSITORY / "src"), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-
-    def start(*arguments):
-        return subprocess.Popen(
-            [sys.executable, "toy.py", *arguments],
-            cwd=tmp_path,
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-
-    return start
+    return lambda *arguments: start_python("toy.py", *arguments, cwd=tmp_path)
 
 
 def finish(process):

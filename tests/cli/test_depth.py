@@ -1,7 +1,5 @@
 """`dpmjax depth`: errors of poses, and input that is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image

@@ -1,7 +1,5 @@
 """Every subcommand on simulated input, on a copy of the files that are installed, away from the checkout."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Several drives on a cluster: the same poses as one by one, also where a worker is killed."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

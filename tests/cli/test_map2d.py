@@ -1,12 +1,9 @@
 """Whole runs of the main command on tiny scans, its help, and its answers to bad input."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +17,8 @@ from dpmjax.io import ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
 from tests.data_sets import write_deepmapping_folder
+from tests.processes import run_python
 
-REPOSITORY = Path(__file__).parents[2]
 NUM_SCANS = 16
 SCALE_M = 0.05
 METRICS = (
@@ -51,22 +48,13 @@ def test_unit_of_the_fit_is_that_of_the_worlds_of_the_paper(walk, preset, unit, 
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
     """Runs the command in a process of its own; `interrupt` stops it after the first call of the step."""
-    command = ["-m", "dpmjax", "map2d"]
-    if interrupt:
-        code = (
-            "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, run_command\n"
-            "append = Run.append_row\n"
-            "Run.append_row = lambda *a, **k: (append(*a, **k), os.kill(os.getpid(), signal.SIGINT))\n"
-            "raise SystemExit(run_command(m.main, name='map2d', description=None))"
-        )
-        command = ["-c", code]
-    return subprocess.run(
-        [sys.executable, *command, *map(str, options)],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        timeout=300,
+    code = (
+        "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, run_command\n"
+        "append = Run.append_row\n"
+        "Run.append_row = lambda *a, **k: (append(*a, **k), os.kill(os.getpid(), signal.SIGINT))\n"
+        "raise SystemExit(run_command(m.main, name='map2d', description=None))"
     )
+    return run_python(*(("-c", code) if interrupt else ("-m", "dpmjax", "map2d")), *options)
 
 
 def metrics_of(folder: Path) -> dict:
@@ -120,10 +108,8 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     assert metrics_of(tmp_path / "broken")["steps"] == metrics_of(tmp_path / "unbroken")["steps"]
     one, other = (np.load(tmp_path / name / "trajectory.npy") for name in ("broken", "unbroken"))
     np.testing.assert_array_equal(one, other)
-    steps = [line.split(",")[0] for line in (tmp_path / "broken" / "metrics.csv").read_text().splitlines()[1:]]
-    assert steps == [
-        line.split(",")[0] for line in (tmp_path / "unbroken" / "metrics.csv").read_text().splitlines()[1:]
-    ]
+    rows = [(tmp_path / name / "metrics.csv").read_text().splitlines() for name in ("broken", "unbroken")]
+    assert [row.split(",")[0] for row in rows[0]] == [row.split(",")[0] for row in rows[1]]
 
 
 @pytest.mark.slow
@@ -182,17 +168,15 @@ def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize(
     ("spoil", "found"),
-    [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan"), ("all_equal", "all scans are equal")],
+    [
+        (lambda points: 0 * points, "scans.npy"),
+        (lambda points: np.nan * points, "scans.npy"),
+        (lambda points: points[:1], "scan"),
+        (lambda points: np.tile(points[:1], (NUM_SCANS, 1, 1)), "all scans are equal"),
+    ],
 )
 def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_path, refused, spoil, found) -> None:
-    points = np.where(walk.mask[..., None], walk.points, 0.0)
-    if spoil == "one_scan":
-        points = points[:1]
-    elif spoil == "all_equal":
-        points[:] = points[:1]
-    else:
-        points[:] = np.nan if spoil == "all_nan" else 0.0
-    np.save(tmp_path / "scans.npy", points)
+    np.save(tmp_path / "scans.npy", spoil(np.where(walk.mask[..., None], walk.points, 0.0)))
     assert found in refused("map2d", tmp_path / "scans.npy")
 
 
@@ -201,7 +185,3 @@ def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_
 )
 def test_a_start_that_is_not_there_is_named(as_user, scans_npz, refused, init, found) -> None:
     assert found in refused("map2d", scans_npz, "--init", init)
-
-
-def test_a_resumed_run_has_data_and_start_of_its_own() -> None:
-    assert Map2dOptions(resume=True, topic="/scan", ordered=False).resume

@@ -1,7 +1,5 @@
 """The command `dpmjax merge` on a network that compiles in seconds."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 
@@ -62,10 +60,7 @@ def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> 
     assert metrics["parts"] == [{"file": "map.npz", "maps": [1, 2], **counts}]
     assert metrics["status"] == "done"
     rows = list(csv.DictReader((out / "loops.csv").read_text().splitlines()))
-    assert [(row["map"], row["other_map"], row["status"]) for row in rows] == [
-        ("2", "1", "accepted"),
-        ("2", "1", "improbable"),
-    ]
+    assert [row["map"] + row["other_map"] + row["status"] for row in rows] == ["21accepted", "21improbable"]
     # Scans are numbered as in the drive of each map.
     assert [row["scan"] for row in rows] == [str(keyframe.scan) for keyframe in b.keyframes[:2]]
     assert len(dpmjax.read_g2o(out / "graph.g2o").poses) == len(both)

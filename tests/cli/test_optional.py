@@ -1,7 +1,5 @@
 """A package of an extra that is missing or broken is named in one line, and nothing is begun without it."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,7 +44,7 @@ def test_the_error_of_a_broken_package_is_one_line(packages: Path, failure: str)
         require_importable("broken", "--methods x")
 
 
-def test_a_missing_package_is_named_with_its_extra(packages: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_with_its_extra(packages: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert why_not_importable("open3d") == "open3d is not installed (pip install 'dpmjax[baselines]')"
     (packages / "kiss_slam").mkdir()
@@ -55,17 +53,11 @@ def test_a_missing_package_is_named_with_its_extra(packages: Path, monkeypatch: 
     # The one that is missing is named, not the one that needs it.
     assert why_not_importable("kiss_slam.slam") == "open3d is not installed (pip install 'dpmjax[baselines]')"
     assert why_not_importable("no_such_package") == "no_such_package is not installed (pip install 'no_such_package')"
-
-
-def test_a_package_that_warns_can_be_used(packages: Path) -> None:
     (packages / "broken.py").write_text("import warnings; warnings.warn('old', DeprecationWarning)")
     assert why_not_importable("broken") is None
-    require_importable("broken", "--methods x")
 
 
-def test_info_names_what_is_broken_and_what_is_missing(
-    packages: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_info_names_what_is_broken_and_what_is_missing(packages: Path, monkeypatch, capsys) -> None:
     for name in PACKAGES:
         (packages / f"{name}.py").touch()
     (packages / "open3d.py").write_text(FAILURES["a missing library"])
@@ -95,7 +87,7 @@ def test_tests_of_a_broken_package_are_skipped_with_the_reason(packages: Path) -
     ],
 )
 def test_a_command_names_a_broken_package_before_any_work(
-    packages: Path, tmp_path: Path, capsys: pytest.CaptureFixture, module, arguments, package, named
+    packages: Path, tmp_path, capsys, module, arguments, package, named
 ) -> None:
     (packages / f"{package}.py").write_text(FAILURES["a missing library"])
     options = [*arguments, "-o", str(tmp_path / "out")]

@@ -1,7 +1,5 @@
 """The page of a run stands alone, agrees with the files, and opens in a browser without an error."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

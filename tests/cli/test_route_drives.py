@@ -1,7 +1,5 @@
 """Drives along a trajectory of the user: the town follows it, and each scan is simulated once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax.numpy as jnp

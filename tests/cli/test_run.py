@@ -1,7 +1,5 @@
 """The folder of a run, its tables and numbers, and options of a command line."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

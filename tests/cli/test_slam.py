@@ -3,15 +3,11 @@
 Matcher and geometry know the truth; a scan is one point, whose x is the number of its pose.
 """
 
-from __future__ import annotations
-
 import csv
 import errno
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -24,9 +20,9 @@ from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json, run_
 from dpmjax.io import LidarSequence, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
 from tests.optional import import_or_skip
+from tests.processes import run_python, start_python
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
 
-REPOSITORY = Path(__file__).parents[2]
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
 SAME_FILES = (
     "trajectory.npy", "trajectory_tum.txt", "trajectory_kitti.txt", "odometry.npy", "keyframes.txt", "graph.g2o",
@@ -39,12 +35,7 @@ def truth_methods(config) -> SlamMethods:
 
 
 def run(*options) -> int:
-    return run_command(
-        slam.main,
-        name="slam",
-        description=slam.__doc__,
-        args=list(map(str, options)),
-    )
+    return run_command(slam.main, name="slam", description=slam.__doc__, args=list(map(str, options)))
 
 
 def write_drive(folder: Path, *, with_poses: bool = True) -> Path:
@@ -264,24 +255,16 @@ sys.exit(run(*sys.argv[1:]))
 """
 
 
-def start(*options) -> subprocess.Popen:
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
-    return subprocess.Popen(
-        [sys.executable, "-c", PROCESS, *map(str, options)], cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL
-    )
-
-
 @pytest.mark.slow
 def test_a_killed_run_equals_an_unbroken_one(whole, drive, tmp_path) -> None:
     rng, out = np.random.default_rng(0), tmp_path / "out"
     for _ in range(5):
-        process = start(*(["--resume"] if out.exists() else [drive]), "-o", out)
+        process = start_python("-c", PROCESS, *(["--resume"] if out.exists() else [drive]), "-o", out)
         deadline = time.monotonic() + 120
         while not (out / "run_state.npz").exists() and time.monotonic() < deadline:
             time.sleep(0.05)
         time.sleep(rng.uniform(0, 4))
         process.kill()
         process.wait()
-    assert start("--resume", "-o", out).wait(timeout=300) == EXIT_OK
+    assert run_python("-c", PROCESS, "--resume", "-o", out).returncode == EXIT_OK
     assert_same_results(out, whole)

@@ -1,7 +1,5 @@
 """Broken drives: `dpmjax slam` ends with results, or with one line and an exit code, never with a traceback."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import dataclass
@@ -51,11 +49,6 @@ def leave_networks_out(patch: pytest.MonkeyPatch) -> None:
     methods = SlamMethods(NoMatcher(), SurfaceGeometry(model_preset("tiny")), SlamConfig())
     patch.setattr(slam, "slam_methods", lambda config: methods)
     patch.setattr(slam_run, "draw_pictures", lambda *_: None)
-
-
-@pytest.fixture
-def without_networks(monkeypatch) -> None:
-    leave_networks_out(monkeypatch)
 
 
 def write_scan(path: Path, points: np.ndarray) -> None:

@@ -1,7 +1,5 @@
 """The command that trains: options, the background, and runs that are broken off."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import replace
@@ -30,7 +28,7 @@ from dpmjax.deeppointmap import (
     init_training,
     prepare_drive,
     training_preset,
-)
+)  # fmt: skip
 from dpmjax.deeppointmap.training.loop import Speed, after_evaluation
 from dpmjax.deeppointmap.training.objective import ObjectiveTerms
 from dpmjax.metrics.poses import registration_recall
@@ -181,12 +179,9 @@ def test_batches_made_ahead_are_those_made_alone() -> None:
             toy.assert_trees_equal(batch, maker(step))
 
 
-def test_groups_take_the_place_of_the_stages_of_the_preset() -> None:
+def test_groups_and_scans_take_the_place_of_those_of_the_preset() -> None:
     settings = training_settings(TrainOptions(groups=(8, 16, 8), steps=60))
     assert [(stage.max_group, stage.num_steps) for stage in settings.curriculum] == [(8, 20), (16, 20), (8, 20)]
-
-
-def test_scans_of_a_step_may_be_more_than_those_of_the_preset_and_hold_larger_groups() -> None:
     settings = training_settings(TrainOptions(scans=96, groups=(32,)))
     assert settings.sampling.num_scans == 96
     assert max(settings.layout_at(step, seed=0).num_scans for step in range(20)) == 96
@@ -250,15 +245,10 @@ def test_data_that_cannot_be_trained_on_is_named(as_user, tmp_path, refused) -> 
         file.write_bytes(file.read_bytes()[:-3])
     assert "all 4 scans are bad" in refused("train", "--data", spoiled)
 
-
-def test_a_drive_that_cannot_be_validated_on_is_named_before_scans_are_prepared(as_user, tmp_path, refused) -> None:
-    good, without = write_drive(tmp_path / "good"), write_drive(tmp_path / "without", has_poses=False)
+    # Before scans are prepared: drives to validate on, and the folder of the results.
+    good = write_drive(tmp_path / "good")
     assert "nowhere" in refused("train", "--data", good, "--validate", tmp_path / "nowhere")
     assert "no poses" in refused("train", "--data", good, "--validate", without)
-
-
-def test_a_folder_that_cannot_be_written_is_named(as_user, tmp_path, refused) -> None:
-    good = write_drive(tmp_path / "good")
     (tmp_path / "file").write_text("")
     assert "cannot write to" in refused("train", "--data", good, "-o", tmp_path / "file" / "out")
 

@@ -1,7 +1,5 @@
 """Runs an experiment as its command does, and reads its rows."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from types import ModuleType

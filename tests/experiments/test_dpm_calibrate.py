@@ -1,10 +1,7 @@
 """Calibration on simulated places, its check, and the weights of the evidence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
@@ -24,13 +21,6 @@ from dpmjax.deeppointmap.scan_evaluation import StagedRegistration
 from experiments import dpm_calibrate
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
-
-
-@pytest.fixture
-def weights(tmp_path):
-    path = tmp_path / "model.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
-    return path
 
 
 @pytest.fixture

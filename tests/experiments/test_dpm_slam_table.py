@@ -1,7 +1,5 @@
 """The table of SLAM: settings on a network that compiles in seconds, agents that know the truth, a peer that does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +9,7 @@ import pytest
 
 import dpmjax
 from dpmjax.cli import why_not_importable
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
+from dpmjax.cli.run import EXIT_OK, load_json
 from dpmjax.geometry import rigid
 from dpmjax.io import LidarSequence
 from dpmjax.slam import Localization, SlamConfig, SlamMethods
@@ -67,11 +65,6 @@ def with_peer(monkeypatch) -> None:
 @pytest.fixture(scope="module")
 def model() -> dpmjax.Model:
     return dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
-
-
-def go_on() -> bool:
-    """No signal stops the methods."""
-    return False
 
 
 def drive_along(T_world_lidar: np.ndarray) -> LidarSequence:
@@ -144,7 +137,7 @@ def test_parts_overlap_and_hold_all_scans() -> None:
 def test_a_scan_without_points_stays_where_the_last_one_was(tmp_path) -> None:
     whole = toy.drive(num_scans=5)
     read = lambda index: np.zeros((0, 3), np.float32) if index in (0, 2) else whole.read_scan(index)  # noqa: E731
-    row = map_by_peer(tmp_path, replace(whole, read_scan=read), go_on, PEER)
+    row = map_by_peer(tmp_path, replace(whole, read_scan=read), lambda: False, PEER)
     assert row["num_scans"] == 5
     np.testing.assert_allclose(np.load(tmp_path / "trajectory.npy")[:, 0, 3], [0, 0, 0, STEP_M, 2 * STEP_M])
 
@@ -188,24 +181,6 @@ def test_wrong_loops_are_counted_and_find_nothing(tmp_path) -> None:
     assert 0.0 < both["loop_recall"] < 0.2
     # A loop between local maps counts for all scans of the newer one.
     assert measure(loop(200, 0)._replace(newer=(200, 399), older=(0, 199)))["loop_recall"] == 1.0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere"], "nowhere"),
-        (["drive", "--weights", "no_such_model"], "no_such_model"),
-        ([], "give at least one folder"),
-        (["drive", "--localize", 3, "--methods", "paper"], "--localize"),
-        (["drive", "--methods", "nonsense"], "--methods"),
-    ],
-)
-def test_bad_input_is_one_line(tmp_path, capsys, arguments, message: str) -> None:
-    assert run(dpm_slam_table, *arguments, "-o", tmp_path / "out") == EXIT_BAD_INPUT
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert message in lines[0]
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", list(_slam_peers.PEERS))

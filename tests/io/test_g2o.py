@@ -1,7 +1,5 @@
 """g2o files: the order of the numbers, exact round trips, refusals in one line."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 

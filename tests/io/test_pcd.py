@@ -1,7 +1,5 @@
 """PCD files as the Point Cloud Library and drivers write them: compressed, padded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Laws of the one door for scans and of NumPy files."""
 
 import gzip
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -10,6 +8,7 @@ import pytest
 from dpmjax.io import InputError, ScanSequence, read_planar_poses, read_sequence
 from dpmjax.sequences import has_angular_order
 from tests.data_sets import write_deepmapping_folder
+from tests.processes import run_python
 
 NUM_BEAMS = 20
 ANGLES = np.linspace(-2, 2, NUM_BEAMS)
@@ -196,8 +195,8 @@ def test_sequence_refuses_shapes_that_do_not_belong_together(as_user, change):
 def test_import_is_light():
     heavy = "('scipy', 'jax', 'matplotlib')"
     code = f"import sys, dpmjax.io as d; d.InputError; print(*[m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
+    done = run_python("-c", code)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
 def test_the_largest_range_of_many_beams_is_no_echo(tmp_path, caplog):

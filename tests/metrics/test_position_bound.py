@@ -1,7 +1,5 @@
 """The bound on positions, against the one world where it can be written down."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpmjax.simulation import LidarSensor
 from dpmjax.simulation.town.cast import cast_turn, near_world
@@ -125,9 +126,13 @@ def land():
     return heights, np.array([-40.0, -35.0])
 
 
+def ground_of(heights, origin):
+    return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
+
+
 def test_ground_is_met_where_a_ray_first_goes_below_it(land):
     heights, origin = land
-    ground = Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
+    ground = ground_of(heights, origin)
     rays = directions(np.random.default_rng(5), 150)
     start = np.array([1.0, 2.0, float(ground_height(ground, jnp.array([1.0, 2.0]))) + 1.73])
     found = cross_ground(ground, jnp.asarray(start, jnp.float32), jnp.asarray(rays, jnp.float32)[:, None], 40.0)[:, 0]
@@ -147,29 +152,13 @@ def small_town(land, rng):
     thickness = rng.uniform(0.05, 0.4, len(place))
     poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
     tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
-    traffic = RoadUsers(
-        lane_points=jnp.zeros((2, 64, 3)),
-        lane_lengths=jnp.ones(2),
-        lanes=jnp.zeros(4, jnp.int32),
-        starts=jnp.zeros(4),
-        speeds=jnp.zeros(4),
-        sides=jnp.zeros(4),
-        half_sizes=jnp.ones((4, 3)),
-        mask=jnp.zeros(4, bool),
-    )
-    town = TownPrimitives(
-        pack_bodies(boxes, SOLID),
-        pack_bodies(poles, POLE),
-        pack_bodies(tufts, SOFT),
-        Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0)),
-        traffic,
-    )
-    return town, boxes, poles, tufts
+    lanes = jnp.zeros((2, 64, 3)), jnp.ones(2), jnp.zeros(4, jnp.int32)
+    traffic = RoadUsers(*lanes, *[jnp.zeros(4)] * 3, half_sizes=jnp.ones((4, 3)), mask=jnp.zeros(4, bool))
+    bodies = pack_bodies(boxes, SOLID), pack_bodies(poles, POLE), pack_bodies(tufts, SOFT)
+    return TownPrimitives(*bodies, ground_of(heights, origin), traffic), boxes, poles, tufts
 
 
 def tilted_pose():
-    from scipy.spatial.transform import Rotation
-
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.06, -0.05]).as_matrix()
     pose[:3, 3] = [0.5, -0.3, 2.2]
@@ -221,14 +210,13 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
 def test_padding_takes_no_part(turn):
     look, town, _, _ = turn
     pose = jnp.asarray(tilted_pose(), jnp.float32)
-    garbage = jax.tree.map(lambda x: x, town)
     full = np.asarray(town.boxes.mask)
     centres = np.asarray(town.boxes.centres).copy()
     centres[~full] = pose[:3, 3] + np.array([3.0, 0, 0], np.float32)
     sizes = np.asarray(town.boxes.half_sizes).copy()
     sizes[~full] = 2.0
     boxes = town.boxes._replace(centres=jnp.asarray(centres), half_sizes=jnp.asarray(sizes))
-    garbage = garbage._replace(boxes=boxes)
+    garbage = town._replace(boxes=boxes)
     np.testing.assert_array_equal(look(town, pose).ranges, look(garbage, pose).ranges)
 
 

@@ -1,7 +1,5 @@
 """Curves: phases in order, gaps left out, axes that suit the values; reliability by bins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,10 +1,5 @@
 """Panels and layers: all layers lie at their places in one frame, for any data."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -12,6 +7,7 @@ from matplotlib.colors import to_rgb
 from dpmjax import viz
 from dpmjax.viz import Edges, Panel, Points, Track
 from dpmjax.viz.figures import INK, REFERENCE
+from tests.processes import run_python
 
 RED, BLUE = "#ff0000", "#0000ff"
 
@@ -96,4 +92,4 @@ def test_drawing_leaves_no_global_state_and_no_early_matplotlib():
         "viz.figure([viz.Panel('a', [viz.Track(np.zeros((2, 3)))])]);"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    assert run_python("-c", code).returncode == 0

@@ -1,7 +1,5 @@
 """Pictures of SLAM, of registered scans and of pairs show all of their data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
