@@ -95,7 +95,6 @@ def distance_of_beams(points: Any, mask: Any, **T: Any) -> Any:
 
 
 def contrast(rng: np.random.Generator) -> Arrays:
-    """Descriptors, of which some queries and some keys do not count."""
     masks = {name: rng.uniform(size=NUM) < 0.8 for name in ("is_query", "is_key")}
     return points("queries", "keys")(rng) | {"positives": rng.permutation(NUM)} | masks
 
@@ -303,7 +302,6 @@ def padded(kernel: Kernel, arrays: Arrays, point: float | None = None, hidden: f
 
 
 def total(kernel: Kernel, arrays: Arrays) -> Any:
-    """A weighted sum of all numbers that a kernel returns."""
     leaves = floats(kernel.call(**arrays))
     leaves = [jnp.where(jnp.isfinite(leaf), leaf, 0.0).ravel() for leaf in leaves]
     return sum(jnp.sum(jnp.cos(jnp.arange(leaf.size)) * leaf) for leaf in leaves)

@@ -18,7 +18,6 @@ def start_python(*arguments: object, **options) -> subprocess.Popen[str]:
 
 
 def run_python(*arguments: object, timeout: float = 600, **options) -> subprocess.CompletedProcess[str]:
-    """Runs Python in the repository to its end."""
     process = start_python(*arguments, **options)
     try:
         output, errors = process.communicate(timeout=timeout)

@@ -81,7 +81,6 @@ def test_module_imports_only_what_its_room_may(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def imported_rooms() -> dict[str, set[str]]:
-    """Returns for each room the rooms that its modules import."""
     rooms: dict[str, set[str]] = {room_of(path): set() for path in MODULES}
     for path in MODULES:
         names = (name.split(".") for name in imported_names(path))
@@ -90,7 +89,6 @@ def imported_rooms() -> dict[str, set[str]]:
 
 
 def reached(room: str, imported: dict[str, set[str]]) -> set[str]:
-    """The rooms that a room imports, directly or through others."""
     found: set[str] = set()
     new = imported[room]
     while new:

@@ -34,7 +34,6 @@ def _made_outside_of_programs() -> None:
 
 
 def each(kernels: dict[str, Kernel]) -> pytest.MarkDecorator:
-    """Runs a test for each of some kernels."""
     marks = {name: (pytest.mark.slow,) if name in SLOW else () for name in kernels}
     rows = [pytest.param(kernel, id=name, marks=marks[name]) for name, kernel in kernels.items()]
     return pytest.mark.parametrize("kernel", rows)

@@ -12,8 +12,6 @@ from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 
 class Terminal(io.StringIO):
-    """Text that a program takes for a terminal."""
-
     def isatty(self) -> bool:
         return True
 

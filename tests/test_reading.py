@@ -23,7 +23,6 @@ def assert_equal(found, expected) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Drive, two scans for the network, and a map."""
     folder = tmp_path_factory.mktemp("files")
     (folder / "drive").mkdir()
     for number, scan in enumerate(DRIVE):

@@ -34,7 +34,6 @@ the tests of `dpmjax train` run it."""
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """A folder with the files of the package that setuptools installs."""
     options = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
     patterns = ["*.py", *options["package-data"]["*"]]
 

@@ -18,7 +18,6 @@ from tests.deeppointmap import toy
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    """Weights, and the maps of two drives and of a part of one."""
     folder = tmp_path_factory.mktemp("case")
     model = dpmjax.init_model(jax.random.key(0), toy.SLAM_MODEL)
     dpmjax.save_model(model, folder / "model.safetensors")

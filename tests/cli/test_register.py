@@ -18,7 +18,6 @@ from tests.deeppointmap import toy
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Weights and two scans, in two formats."""
     folder = tmp_path_factory.mktemp("scans")
     drive = toy.drive(num_scans=2)
     dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), folder / "model.safetensors")

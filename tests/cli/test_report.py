@@ -25,7 +25,6 @@ TABLES = {
 
 
 def made(folder: Path, num_points: int) -> str:
-    """The page of a small run."""
     numbers = {"status": "done", "verdict": "10 scans & 1 loop", "ate_m": 0.123456789, "versions": {"jax": "0.10"}}
     (folder / "metrics.json").write_text(json.dumps(numbers))
     np.save(folder / "trajectory.npy", np.tile(np.eye(4), (10, 1, 1)))

@@ -43,7 +43,6 @@ def _in_empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def start():
-    """Opens a run, and closes it at the end of the test."""
     runs = []
 
     def open_run(**options) -> Run:

@@ -65,7 +65,6 @@ def with_truth(monkeypatch) -> None:
 
 @pytest.fixture(scope="module")
 def whole(drive, tmp_path_factory) -> Path:
-    """The folder of a run that nothing has stopped."""
     folder = tmp_path_factory.mktemp("output") / "whole"
     with pytest.MonkeyPatch.context() as patch:
         use_truth(patch)

@@ -40,8 +40,6 @@ TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
 
 
 class StopAfter:
-    """Stops training after a number of steps."""
-
     def __init__(self, num: int) -> None:
         self._left = num
 
@@ -72,7 +70,6 @@ def num_steps(trained) -> int:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """An unbroken run and its folder."""
     folder = tmp_path_factory.mktemp("whole")
     return train(folder), folder
 

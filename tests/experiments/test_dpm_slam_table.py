@@ -38,8 +38,6 @@ STEP_M, NUM_SCANS = 1.9, 6
 
 
 class SteadyPeer:
-    """Goes ahead by the same step at each scan."""
-
     def __init__(self, *, is_indoors: bool) -> None:
         self.num = 0
 

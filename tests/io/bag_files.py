@@ -133,7 +133,6 @@ class BagWriter:
         self.write("/livox/lidar", kind, stamp_ns, self.make(kind, self.header(stamp_ns), *values))
 
     def write_scan(self, ranges: np.ndarray, stamp_ns: int, *, delay_ns: int = 0) -> None:
-        """Writes a planar scan of the whole turn."""
         step = 2 * np.pi / len(ranges)
         limits = (-np.pi, np.pi - step, step, 0.0, 0.1, 0.1, 30.0)
         values = (ranges.astype(np.float32), np.zeros(0, np.float32))
@@ -149,7 +148,6 @@ class BagWriter:
         return self.make("geometry_msgs/msg/Quaternion", *map(float, numbers))
 
     def write_odometry(self, pose: np.ndarray, stamp_ns: int, *, delay_ns: int = 0) -> None:
-        """Writes x, y, heading as an Odometry."""
         point = self.make("geometry_msgs/msg/Point", float(pose[0]), float(pose[1]), 0.0)
         zeros = np.zeros(36)
         covered = self.make("geometry_msgs/msg/Pose", point, self._turn(pose[2]))

@@ -192,7 +192,6 @@ def assert_on_walls(scans) -> None:
 
 
 def moments(poses: np.ndarray = POSES):
-    """Each pose with its stamp."""
     return [(EPOCH_NS + index * STEP_NS, pose) for index, pose in enumerate(poses)]
 
 

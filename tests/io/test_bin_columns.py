@@ -14,7 +14,6 @@ NUM = 1200
 
 @pytest.fixture
 def table() -> np.ndarray:
-    """Points in a street, intensity, ring and time."""
     rng = np.random.default_rng(0)
     azimuth, ring = rng.uniform(-np.pi, np.pi, NUM), rng.integers(0, 32, NUM)
     ranges = rng.uniform(3, 40, NUM)

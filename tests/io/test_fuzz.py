@@ -52,8 +52,6 @@ def log_bytes(rng):
 
 
 def at(name: str, write: Callable[[Path, np.random.Generator], object]) -> Write:
-    """A writer of one file of this name."""
-
     def write_file(folder: Path, rng: np.random.Generator) -> Path:
         write(folder / name, rng)
         return folder / name
@@ -95,7 +93,6 @@ def write_drive(folder, rng, *, kind):
 
 
 def pcd_bytes(rng, *, kind):
-    """Files of the Point Cloud Library: compressed, or padded."""
     points = np.round(cloud(rng), 1).astype("<f4")
     if kind == "compressed":
         return pcd_header("x y z", "4 4 4", "F F F", "1 1 1", "binary_compressed", 40) + compressed(list(points.T))
@@ -122,7 +119,6 @@ def write_planar_bag(folder, rng, *, kind):
 
 
 def write_plain_drive(folder, rng):
-    """Scans with stamps, and a TUM file of another rate."""
     for index in range(3):
         write_pcd(folder / f"{index}.pcd", cloud(rng))
     (folder / "times.txt").write_text("10.0\n10.1\n10.2\n")
@@ -238,7 +234,6 @@ def spoil(path: Path, rng: np.random.Generator) -> None:
 
 
 def spoil_arrays(path: Path, rng: np.random.Generator) -> None:
-    """Writes valid NumPy files of wrong shapes, dtypes and values."""
     shape = tuple(int(n) for n in rng.choice([0, 1, 2, 3, 4, 5, 20], size=rng.integers(0, 5)))
     values = rng.normal(size=shape) * 10.0 ** rng.integers(-40, 41)
     values = np.where(rng.random(shape) < rng.choice([0, 0.1, 1]), rng.choice([np.nan, np.inf, 0.0, -np.inf]), values)

@@ -148,7 +148,7 @@ POINTS, MASK, POSES = np.zeros((25, 6, 2)), np.ones((25, 6), bool), np.tile(np.e
         (lambda: point_distance(POINTS, MASK, BROKEN, REFERENCE), "T_estimated: expected finite"),
         (lambda: registration_recall(POSES[:2], POSES), "T_estimated"),
         (lambda: segment_error(POSES, POSES[:3]), "reference"),
-        (lambda: segment_error(POSES, POSES, stride=0), "stride"),
+        (lambda: segment_error(POSES, POSES, stride=0), "expected poses .* and a stride from 1"),
         (lambda: loop_recall(POSES, np.zeros((2, 3), int), find_revisits(POSES)), "newer_ends"),
         (lambda: loop_recall(POSES, np.array([[0, 4]]), find_revisits(POSES)), "newer_ends"),
     ],

@@ -104,7 +104,6 @@ def test_nothing_solid_stands_in_the_lane_of_any_kind(kind):
 
 
 def soft_town(rows):
-    """An empty town with boxes only."""
     town = make_town(0, TownConfig(route_length_m=100)).primitives
     empty = [bodies._replace(mask=jnp.zeros_like(bodies.mask)) for bodies in town[:3]]
     traffic = town.traffic._replace(mask=jnp.zeros_like(town.traffic.mask))

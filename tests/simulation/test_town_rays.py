@@ -167,7 +167,6 @@ def tilted_pose():
 
 @pytest.fixture(scope="module")
 def turn(land):
-    """A small town and what a turn of the sensor meets there."""
     town, *tables = small_town(land, np.random.default_rng(11))
     rays = make_rays(SENSOR, jnp.float32(0.01), jnp.zeros(6))
 

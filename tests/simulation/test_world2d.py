@@ -39,7 +39,6 @@ def test_a_name_is_a_kind_with_a_seed():
 
 
 def longest_straight_edge(grid):
-    """Pixels of the longest edge along a row or a column."""
     edges = [grid[1:] != grid[:-1], (grid[:, 1:] != grid[:, :-1]).T]
     starts = [np.flatnonzero(np.diff(np.pad(line, 1).astype(int))) for edge in edges for line in edge]
     return max((int((run[1::2] - run[::2]).max()) for run in starts if len(run)), default=0)

@@ -22,7 +22,6 @@ def labels(figure) -> list[str]:
 
 
 def colors_of(axes) -> set[tuple[int, ...]]:
-    """Returns the colours of the cells that are not white."""
     picture = np.asarray(axes.images[0].get_array()).reshape(-1, 3)
     return {tuple(color) for color in np.unique(picture, axis=0).tolist()} - {(255, 255, 255)}
 
