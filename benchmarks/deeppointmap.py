@@ -115,8 +115,7 @@ def time_training(scans: Scans, quick: bool, *, preset: str) -> list[Row]:
     T_world_lidar = np.tile(np.eye(4), (num_scans, 1, 1))
     T_world_lidar[:, 0, 3] = np.linspace(0, 10, num_scans)
     drive = LidarSequence("town", ("town",) * num_scans, lambda _: scans["town"], T_world_lidar)
-    with dpm.SampleMaker(dpm.ScanStore([dpm.prepare_drive(drive, settings)]), settings, seed=0) as maker:
-        batch = maker(0)
+    batch = dpm.SampleMaker(dpm.ScanStore([dpm.prepare_drive(drive, settings)]), settings, seed=0)(0)
     state = dpm.init_training(jax.random.key(0), settings)
     timing = measure(dpm.make_step(settings), state, batch, repeats=3 if quick else 12)
     case = f"{preset}, K = 2, {num_scans} scans: training step"

@@ -10,7 +10,7 @@ import jax
 
 from benchmarks import Row, measure
 from dpmjax import cli
-from dpmjax.deepmapping import ToyConfig, fit, toy_problem
+from dpmjax.deepmapping import ToyConfig, solve, toy_problem
 from experiments.toy_1d import FORMS, share_at_minimum
 
 
@@ -22,7 +22,8 @@ def run(quick: bool) -> list[Row]:
 
         def ends(form: str = form, num_seeds: int = num_seeds) -> jax.Array:
             problem = toy_problem(replace(toy, form=form))
-            return fit(problem, None, key=jax.random.key(0), num_starts=num_seeds).poses
+            keys = jax.random.split(jax.random.key(0), num_seeds)
+            return jax.vmap(lambda key: solve(problem, None, key=key))(keys)[1].poses
 
         case = f"{form} form, {num_seeds} seeds x {toy.num_steps} steps: dpmjax"
         rows += measure(ends, repeats=3).rows(case)

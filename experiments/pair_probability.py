@@ -67,7 +67,7 @@ def main(options: PairOptions, run: cli.Run) -> cli.Row:
         features = [PairEvidence(*(float(row[name]) for name in PairEvidence._fields)).features() for row in rows]
         weights, bias = dpm.fit_weights(np.array(features), is_right.astype(bool))
         share = is_right.mean()
-        numbers |= {"weights": weights.tolist(), "bias": float(bias - np.log(share / (1 - share)))}
+        numbers |= {"weights": list(weights), "bias": float(bias - np.log(share / (1 - share)))}
     return numbers
 
 

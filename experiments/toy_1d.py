@@ -53,45 +53,51 @@ def main(options: ToyOptions, run: cli.Run) -> cli.Row:
 
     def work(initialization: Any, learning_rate: float) -> cli.Row:
         found = descend(replace(paper, initialization=initialization, learning_rate=learning_rate), options)
-        return {form: share_at_minimum(np.asarray(fit.poses)) for form, fit in found.items()}
+        return {form: share_at_minimum(path(fit)[:, -1]) for form, fit in found.items()}
 
-    shares = {f"{form} form, gradient descent": share_at_minimum(np.asarray(fit.poses)) for form, fit in fits.items()}
+    shares = {f"{form} form, gradient descent": share_at_minimum(path(fit)[:, -1]) for form, fit in fits.items()}
     starts = jnp.asarray(path(fits["direct"])[:, 0])
     for solver in SOLVERS:
-        solve = jax.jit(jax.vmap(partial(minimize, solver=solver, max_iterations=options.steps)))
-        shares[f"direct form, jaxopt {solver}"] = share_at_minimum(np.asarray(solve(starts)))
+        descent = jax.jit(jax.vmap(partial(minimize, solver=solver, max_iterations=options.steps)))
+        shares[f"direct form, jaxopt {solver}"] = share_at_minimum(np.asarray(descent(starts)))
     cases = [
         {"initialization": one, "learning_rate": rate} for one in get_args(dm.Initialization) for rate in LEARNING_RATES
     ]
     summary = cli.summarize(cli.fill_table(run, cases, work), tuple(cases[0]), FORMS)
-    x_best, loss_best = dm.global_minimum()
+    x_best, loss_best = dm.GLOBAL_MINIMUM
     notes = [f"{name}: {share:.1%} at x = {x_best:.3f}, L = {loss_best:.3f}" for name, share in shares.items()]
     numbers = {"x_global": x_best, "loss_global": loss_best, "share_at_global_minimum": shares}
     return numbers | cli.write_summary(run, summary, *notes)
 
 
-def descend(toy: dm.ToyConfig, options: ToyOptions) -> dict[str, dm.Fit]:
-    """Fits all seeds as starts of one fit in each form, from the same starts."""
+Fits = tuple[dm.FitState, dm.Report]
+
+
+def descend(toy: dm.ToyConfig, options: ToyOptions) -> dict[str, Fits]:
+    """Fits all seeds in one vmap in each form, from the same starts."""
+    keys = jax.random.split(jax.random.key(options.seed), options.seeds)
     problems = {form: dm.toy_problem(replace(toy, form=form)) for form in FORMS}
-    starts = {"key": jax.random.key(options.seed), "num_starts": options.seeds}
-    return {form: dm.fit(problem, None, **starts) for form, problem in problems.items()}
+    return {form: jax.jit(jax.vmap(partial(solve, problem)))(keys) for form, problem in problems.items()}
 
 
-def path(fit: dm.Fit) -> np.ndarray:
+def solve(problem: dm.Problem, key: jax.Array) -> Fits:
+    """Returns the last state and the report of one seed."""
+    return dm.solve(problem, None, key=key)
+
+
+def path(fits: Fits) -> np.ndarray:
     """Returns (seeds, steps + 1) x of every seed from the start to the end."""
-    x = np.atleast_2d(np.asarray(fit.report.terms))
-    return np.concatenate([x, np.reshape(fit.poses, (-1, 1))], axis=1)
+    _, report = fits
+    return np.concatenate([np.asarray(report.terms), np.asarray(report.poses)[:, None]], axis=1)
 
 
-def draw(run: cli.Run, toy: dm.ToyConfig, fits: dict[str, dm.Fit]) -> None:
+def draw(run: cli.Run, toy: dm.ToyConfig, fits: dict[str, Fits]) -> None:
     """Draws figure 14 of one seed."""
     network, direct = map(path, fits.values())
     # Out of the same vmap as the shares: the descent is chaotic, and one seed compiled alone rounds its way elsewhere.
     chosen = choose_seed(network, direct)
     z, x = jnp.linspace(-VIEW, VIEW, 1201), np.linspace(-VIEW, VIEW, 2401)
-    params = fits["network"].state.params
-    if len(network) > 1:
-        params = jax.tree.map(lambda leaf: leaf[chosen], params)
+    params = jax.tree.map(lambda leaf: leaf[chosen], fits["network"][0].params)
     converted = dm.toy_loss(jax.vmap(lambda one: dm.network_value(toy, params.replace(z=one)))(z))
     x_direct, visited = float(direct[chosen, -1]), network[chosen]
     figure = viz.toy_figure(
@@ -127,7 +133,7 @@ def choose_seed(network_x: np.ndarray, direct_x: np.ndarray) -> int:
 
 def is_at_minimum(x: np.ndarray) -> np.ndarray:
     """Returns True for ends at the global minimum."""
-    return np.abs(np.asarray(x, np.float64) - dm.global_minimum()[0]) < SAME_PLACE
+    return np.abs(np.asarray(x, np.float64) - dm.GLOBAL_MINIMUM[0]) < SAME_PLACE
 
 
 def share_at_minimum(x: np.ndarray) -> float:

@@ -39,7 +39,7 @@ gc.disable()
 # rooms would take twelve seconds of each worker. An integer is a float, as for mypy.
 CHECKED_ROOMS = ("checks", "deeppointmap", "geometry", "losses", "metrics", "nets", "pose_graph", "scans", "sequences")
 CHECKED_FILES = (
-    *("deepmapping.objective", "deepmapping.localization_training"),
+    *("deepmapping.objective", "deepmapping.relocalization"),
     *(f"registration_rgbd.{name}" for name in ("motion_search", "projective_consistency", "trajectory_search")),
 )
 jaxtyping.install_import_hook(

@@ -55,11 +55,12 @@ class Checkpoints:
         Returns:
             The state.
         """
-        for step in self._steps():
-            restored = self.restore(step, like)
-            if restored is not None:
-                return restored
-        return fallback
+        steps: list[int] = []
+        if self._folder.is_dir():
+            with self._manager() as manager:
+                steps = sorted(manager.all_steps(), reverse=True)
+        states = (self.restore(step, like) for step in steps)
+        return next((state for state in states if state is not None), fallback)
 
     def restore(self, step: int, like: StateT) -> StateT | None:
         """Reads the state of a step.
@@ -80,12 +81,6 @@ class Checkpoints:
             return None
         leaves = [jax.numpy.asarray(restored[name]) for name in target]
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
-
-    def _steps(self) -> list[int]:
-        if not self._folder.is_dir():
-            return []
-        with self._manager() as manager:
-            return sorted(manager.all_steps(), reverse=True)
 
     def _manager(self) -> ocp.CheckpointManager:
         logging.getLogger("absl").setLevel(logging.ERROR)

@@ -254,20 +254,6 @@ def require_count(name: str, value: int) -> None:
         raise ValueError(f"{name}: expected at least 1, got {value}")
 
 
-def require_some(name: str, items: Sequence[Any]) -> None:
-    """Checks that a sequence has an item.
-
-    Args:
-        name: name of the argument, for the message.
-        items: the argument.
-
-    Raises:
-        ValueError: there is no item.
-    """
-    if len(items) == 0:
-        raise ValueError(f"{name}: expected at least one, got none")
-
-
 def require_pairs(sources: Sequence[Any], targets: Sequence[Any]) -> None:
     """Checks that each source has a target, and that there is a pair.
 
@@ -278,7 +264,7 @@ def require_pairs(sources: Sequence[Any], targets: Sequence[Any]) -> None:
     Raises:
         ValueError: the lengths differ or are 0.
     """
-    require_some("sources", sources)
+    require_value(len(sources) > 0, "sources", "at least one", "none")
     if len(sources) != len(targets):
         raise ValueError(f"targets: expected {len(sources)}, one for each source, got {len(targets)}")
 

@@ -16,7 +16,7 @@ import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
@@ -27,10 +27,8 @@ from dpmjax.compile_cache import TRACED_FOLDER
 Result = TypeVar("Result")
 
 
-class _Program(NamedTuple):
-    # The program on flat arrays, and the structure of its result.
-    call: Any
-    tree: Any
+# A program on flat arrays, and the structure of its result.
+_Program = tuple[Any, Any]
 
 
 class KeptProgram:
@@ -48,7 +46,8 @@ class KeptProgram:
         program, leaves = self._find(args, kwargs)
         if program is None:
             return self._jitted(*args, **kwargs)
-        return jax.tree.unflatten(program.tree, program.call(*leaves))
+        call, tree = program
+        return jax.tree.unflatten(tree, call(*leaves))
 
     def prepare(self, *args: Any, **kwargs: Any) -> Callable[[], Any]:
         """Compiles the program of these arguments; the result calls it with them."""
@@ -59,13 +58,13 @@ class KeptProgram:
         if program is None:
             self._jitted.lower(*args, **kwargs).compile()
             return functools.partial(self._jitted, *args, **kwargs)
-        compiled = program.call.lower(*leaves).compile()
-        return lambda: jax.tree.unflatten(program.tree, compiled(*leaves))
+        call, tree = program
+        compiled = call.lower(*leaves).compile()
+        return lambda: jax.tree.unflatten(tree, compiled(*leaves))
 
     def _find(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[_Program | None, list[Any]]:
         """Returns the program of these arguments and its input; None where nothing is kept."""
-        folder, options = os.environ.get(TRACED_FOLDER), jax.config
-        settings: Any = options
+        folder, settings = os.environ.get(TRACED_FOLDER), cast(Any, jax.config)
         if not folder or settings.jax_disable_jit or jax.device_count() > 1:
             return None, []
         bound = self._signature.bind(*args, **kwargs)
@@ -100,7 +99,7 @@ class KeptProgram:
         shapes = [str(jax.typeof(leaf)) for leaf in leaves]
         try:
             result, program = keep_result(self._name, (static, tree, shapes, jax.default_backend()), trace)
-            return _Program(jax.jit(export.deserialize(program).call), result)
+            return jax.jit(export.deserialize(program).call), result
         except Exception:
             return None
 
@@ -146,7 +145,9 @@ def keep_result(name: str, key: Any, compute: Callable[[], Result]) -> Result:
     folder = os.environ.get(TRACED_FOLDER)
     if not folder:
         return compute()
-    path = Path(folder) / _file_name(name, key)
+    enables_x64 = cast(Any, jax.config).jax_enable_x64
+    identity = pickle.dumps((name, key, jax.__version__, enables_x64, source_version()))
+    path = Path(folder) / f"{name.removeprefix('dpmjax.')}-{hashlib.sha256(identity).hexdigest()[:24]}"
     try:
         return cast(Result, pickle.loads(path.read_bytes()))
     except Exception:
@@ -157,12 +158,6 @@ def keep_result(name: str, key: Any, compute: Callable[[], Result]) -> Result:
         part.write_bytes(pickle.dumps(result))
         part.replace(path)
     return result
-
-
-def _file_name(name: str, key: Any) -> str:
-    settings: Any = jax.config
-    identity = pickle.dumps((name, key, jax.__version__, settings.jax_enable_x64, source_version()))
-    return f"{name.removeprefix('dpmjax.')}-{hashlib.sha256(identity).hexdigest()[:24]}"
 
 
 @functools.cache

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Literal, TypeVar, cast
+from typing import TypeVar, cast
 
 Given = TypeVar("Given")
-Reader = Literal[
-    "io.read_lidar_file", "io.open_lidar_sequence", "io.read_sequence", "io.read_pose_folder", "saved_maps.load_map"
-]
 
 
-def read_path(value: Given | str | Path, reader: Reader) -> Given:
+def read_path(value: Given | str | Path, reader: str) -> Given:
     """Reads the value if it is a path, and returns any other value unchanged.
 
     The reader is imported by name when a path is given, because algorithms do not depend on files.
 
     Args:
         value: the argument of a pipeline.
-        reader: package and name of the reader.
+        reader: package and name of the reader, such as "io.read_lidar_file".
 
     Returns:
         The argument that the pipeline works with.

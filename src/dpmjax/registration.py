@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike
 
 from dpmjax import deeppointmap, registration2d, registration_rgbd
 from dpmjax.checks import runs_on_host
-from dpmjax.deeppointmap.matching import MatchConfig
+from dpmjax.deeppointmap.encoding import ScanOrCloud
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.prepared_scans import RawScan, ScanOrCloud
 from dpmjax.progress import progress_bar
 from dpmjax.registration2d.pipeline import RegisteredScans, RegistrationConfig, RegistrationHooks
 from dpmjax.scans.pair_registration import ScanRegistration
 from dpmjax.slam.unposed import RegisteredClouds, register_unposed
-from dpmjax.types import Registration, ScanSet
+from dpmjax.types import RawScan, Registration, ScanSet
 
 
 @overload
@@ -31,9 +30,7 @@ def register(
     source: ScanOrCloud,
     target: ScanOrCloud,
     *,
-    config: MatchConfig | None = None,
     refine: bool | None = None,
-    scale: float = 1.0,
 ) -> Registration: ...
 
 
@@ -54,7 +51,7 @@ def register(model: Model | None, source: Any, target: Any, **options: Any) -> R
         source: planar scan (n, 2), any unit; depth image (h, w, 3) in the frame of the camera, or lidar scan (n, 3),
             metres. With a model also a prepared scan or a descriptor cloud.
         target: the same.
-        **options: of `deeppointmap.register`, with a model only: config, refine, scale.
+        **options: of `deeppointmap.register`, with a model only: refine.
 
     Returns:
         `T_target_source`, which maps points of the source to the target; `confidence`, the probability that it is

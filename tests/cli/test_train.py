@@ -13,7 +13,7 @@ import pytest
 from dpmjax.cli import train_run
 from dpmjax.cli.run import CHECKPOINTS, HISTORY
 from dpmjax.cli.train import TrainOptions, training_settings
-from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
+from dpmjax.cli.train_run import Records, Selection, run_training
 from dpmjax.deeppointmap import (
     CurriculumStage,
     Evaluation,
@@ -58,7 +58,7 @@ def train_both(folder: Path, *, stop_after: int = 99):
 
 
 def train(folder: Path, *, stop_after: int = 99, total_s: float = math.inf):
-    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=tuple(KINDS))
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL)
     records = Records(run_in(folder), TRAINING, Selection(pairs, "a toy"), seed=0)
     hooks = TrainingHooks(evaluate_every=2, stop=StopAfter(stop_after))
     return run_training(records, toy.store(), TRAINING, hooks, seed=0, total_s=total_s)
@@ -118,17 +118,16 @@ def test_drives_without_held_out_places_leave_the_choice_to_the_last_step(monkey
     assert nothing == Selection(None, "the last step: no drive has held-out places")
     some = train_run.draw_selection(TRAINING, [toy.drive, lambda: toy.drive(1)], "the drives")
     assert some.chosen_by == "the drives"
-    assert [pairs.kind for pairs in some.pairs.pairs] == list(KINDS)
-    assert [len(pairs.sources) for pairs in some.pairs.pairs] == [4] * 2
-    assert max(pairs.sources.max() for pairs in some.pairs.pairs) >= 24  # of the second drive
+    assert [len(rows) for rows in some.pairs.pairs.values()] == [4, 4]
+    assert max(rows.max() for rows in some.pairs.pairs.values()) >= 24  # of the second drive
 
 
 def test_the_table_has_the_accuracy_of_offsets_at_each_evaluation(tmp_path: Path, monkeypatch) -> None:
     r2 = np.array([0.75, 1.0, -0.25])
-    recalls = (registration_recall(np.eye(4)[None], np.eye(4)[None]),)
-    found = Evaluation(recalls, (), r2, toy.cloud(np.zeros((1, 3))))
+    recalls = {"near": registration_recall(np.eye(4)[None], np.eye(4)[None])}
+    found = Evaluation(recalls, {}, r2, toy.cloud(np.zeros((1, 3))))
     monkeypatch.setattr(train_run.dpm, "evaluate_registration", lambda model, pairs: found)
-    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL, kinds=tuple(KINDS)[:1]), np.ones(())
+    nothing, one = draw_evaluation_pairs([toy.drive()], 1, toy.MODEL), np.ones(())
     records = Records(run_in(tmp_path), TRAINING, Selection(nothing, "a toy"), seed=0)
     report = TrainingReport(one, ObjectiveTerms(one, one, one, one, np.ones((), int)), one, one)
     with records:
@@ -171,9 +170,9 @@ def test_the_best_of_equal_models_is_the_later() -> None:
 
 @pytest.mark.slow
 def test_batches_made_ahead_are_those_made_alone() -> None:
-    with SampleMaker(toy.store(), TRAINING, seed=0) as maker:
-        for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
-            toy.assert_trees_equal(batch, maker(step))
+    maker = SampleMaker(toy.store(), TRAINING, seed=0)
+    for step, batch in zip(range(1, 6), maker.batches(1, 6), strict=True):
+        toy.assert_trees_equal(batch, maker(step))
 
 
 def test_groups_and_scans_take_the_place_of_those_of_the_preset() -> None:
@@ -209,7 +208,7 @@ def test_a_run_from_weights_has_their_network_and_begins_with_their_parameters(t
     assert settings.learning_rate == pytest.approx(0.2 * training_settings(TrainOptions()).learning_rate)
     assert settings.curriculum == training_preset("tiny").curriculum
     some = init_model(jax.random.key(5), toy.MODEL)
-    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL, kinds=tuple(KINDS))
+    pairs = draw_evaluation_pairs([toy.drive(seed=9)], 2, toy.MODEL)
     sets = Selection(pairs, "a toy")
     with Records(run_in(tmp_path), TRAINING, sets, seed=0, weights=some) as records:
         toy.assert_trees_equal(records.start.state.params, some.params)

@@ -24,7 +24,7 @@ coordinator, number, folder = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 join_processes(coordinator, 2, number)
 
 from pathlib import Path
-from dpmjax.cli.train_run import KINDS, Records, Selection, run_training
+from dpmjax.cli.train_run import Records, Selection, run_training
 from dpmjax.deeppointmap import TrainingHooks, draw_evaluation_pairs
 from tests.cli.test_train_processes import TRAINING
 from tests.data_sets import run_in
@@ -37,7 +37,7 @@ def stop():
     return signal.SIGINT if number == 0 and len(calls) == 3 else 0
 
 assert is_first() == (number == 0)
-sets = Selection(draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL, kinds=tuple(KINDS)), "a toy")
+sets = Selection(draw_evaluation_pairs([toy.drive(seed=9)], 1, toy.MODEL), "a toy")
 records = Records(run_in(Path(folder)), TRAINING, sets, seed=0) if is_first() else None
 done = run_training(records, toy.store(), TRAINING, TrainingHooks(evaluate_every=1, stop=stop), seed=0)
 assert done.stopped_by == signal.SIGINT

@@ -11,12 +11,11 @@ import pytest
 
 import dpmjax
 from dpmjax import deepmapping as dm
-from dpmjax.deepmapping import localization_training
+from dpmjax.deepmapping import relocalization
 from dpmjax.deepmapping.engine import init
-from dpmjax.deepmapping.localization_training import make_raster, render_scans
 from dpmjax.deepmapping.mapping import mapping_data, mapping_problem
 from dpmjax.deepmapping.problem import MapFrame
-from dpmjax.deepmapping.relocalization import propose_poses
+from dpmjax.deepmapping.relocalization import make_raster, propose_poses, render_scans
 from dpmjax.geometry import se2
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
 from dpmjax.simulation import cast_scans, make_world, scan_world, simulate_sequence
@@ -66,8 +65,8 @@ def unmapped(fitted) -> dm.Fitted:
 def trained(fitted, tiny_walk) -> dm.Fitted:
     scans = ScanSet(tiny_walk.points, tiny_walk.mask)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localization_training, "_SCANS_PER_STEP", 32)
-        patch.setattr(localization_training, "_NUM_RENDERED", 400)
+        patch.setattr(relocalization, "_SCANS_PER_STEP", 32)
+        patch.setattr(relocalization, "_NUM_RENDERED", 400)
         return dm.train_localization(fitted, scans, num_steps=400, key=KEY)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.prepared_scans import compact_elements, compact_image, expand_elements, expand_image
+from dpmjax.deeppointmap.compact_scans import compact_elements, compact_image, expand_elements, expand_image
 from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, scan_surface
 from dpmjax.types import SurfaceElements
 

@@ -12,7 +12,7 @@ from dpmjax.deeppointmap.confidence import (
     SCAN_FEATURES,
     Calibration,
     LogisticModel,
-    fit_logistic,
+    fit_weights,
     logistic_probability,
 )
 from tests.deeppointmap import toy
@@ -20,14 +20,14 @@ from tests.deeppointmap import toy
 
 def test_separable_examples_have_a_finite_fit() -> None:
     features = np.repeat(np.array([[0.0], [1.0]]), 20, axis=0) * np.ones(4)
-    model = fit_logistic(CLOUD_FEATURES, features, features[:, 0] > 0.5)
+    model = LogisticModel(CLOUD_FEATURES, *fit_weights(features, features[:, 0] > 0.5))
     assert np.isfinite(model.weights).all()
     assert logistic_probability(model, features[-1]) > 0.9 > 0.1 > logistic_probability(model, features[0])
 
 
 def test_examples_of_one_kind_are_refused() -> None:
     with pytest.raises(ValueError, match="is_right: expected right and wrong"):
-        fit_logistic(CLOUD_FEATURES, np.ones((3, 4)), np.ones(3, bool))
+        fit_weights(np.ones((3, 4)), np.ones(3, bool))
 
 
 def test_fit_finds_the_probabilities_whose_shares_the_examples_have() -> None:
@@ -37,7 +37,7 @@ def test_fit_finds_the_probabilities_whose_shares_the_examples_have() -> None:
     probability = 1 / (1 + np.exp(-(numbers @ np.array([2.0, 0.0, -1.0, 0.5]) + 1.0)))
     features = numbers * [1, 10, 0.1, 1] + [0, 5, 2, 0]
     is_right = rng.uniform(size=len(shares)) < shares * probability
-    found = logistic_probability(fit_logistic(CLOUD_FEATURES, features, is_right, shares), features)
+    found = logistic_probability(LogisticModel(CLOUD_FEATURES, *fit_weights(features, is_right, shares)), features)
     np.testing.assert_allclose(found, probability, atol=0.05)
     assert (shares * found).mean() == pytest.approx(is_right.mean(), abs=0.005)
 

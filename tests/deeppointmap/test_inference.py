@@ -12,7 +12,7 @@ import dpmjax
 from dpmjax.deeppointmap import VerificationConfig, prepare_scan
 from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, LogisticModel
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
-from dpmjax.deeppointmap.scan_registration import register_each
+from dpmjax.deeppointmap.registration import register_each
 from dpmjax.geometry import PyramidConfig, PyramidStage
 from dpmjax.geometry.normals import pyramid_elements
 from dpmjax.scans import ViewCorrelationConfig
@@ -92,23 +92,6 @@ def test_prepared_scans_register_as_raw_ones(model, scans) -> None:
     assert dpmjax.overlap(model, *prepared) == dpmjax.overlap(model, *scans)
 
 
-def test_a_scan_enlarged_by_the_user_or_by_the_scale_is_encoded_alike(model, scans) -> None:
-    expected, found = dpmjax.encode(model, 2 * scans[0]), dpmjax.encode(model, scans[0], scale=2)
-    np.testing.assert_array_equal(found.features, expected.features)
-    np.testing.assert_array_equal(found.positions, expected.positions)
-
-
-def test_motions_are_in_metres_whatever_the_scale(model, scans) -> None:
-    clouds = [dpmjax.encode(model, scan, scale=2) for scan in scans]
-    enlarged, found = dpmjax.register(model, *clouds), dpmjax.register(model, *clouds, scale=2)
-    np.testing.assert_allclose(2 * found.T_target_source[:3, 3], enlarged.T_target_source[:3, 3], rtol=1e-6)
-    np.testing.assert_array_equal(found.T_target_source[:3, :3], enlarged.T_target_source[:3, :3])
-    np.testing.assert_allclose(2 * found.rmse, enlarged.rmse, rtol=1e-6)
-    of_scans = dpmjax.register(model, *scans, scale=2)
-    prepared = [prepare_scan(model, scan, scale=2) for scan in scans]
-    np.testing.assert_array_equal(dpmjax.register(model, *prepared).T_target_source, of_scans.T_target_source)
-
-
 def test_a_cloud_without_elements_is_not_refined(model, scans) -> None:
     bare = dpmjax.encode(model, scans[1]).described
     for source in (scans[0], prepare_scan(model, scans[0])):
@@ -154,7 +137,8 @@ def test_exchanged_scans_have_the_inverse_motion_as_probable(model, scans, bias:
     of_scans = LogisticModel(SCAN_FEATURES, (0.3, *(0.0,) * 8), bias)
     calibration = Calibration(LogisticModel(CLOUD_FEATURES, (0.1, 0.0, 0.0, 0.0), bias), of_scans)
     calibrated = replace(model, config=replace(model.config, calibration=calibration))
-    for pair in (tuple(scans[:2]), tuple(dpmjax.encode(model, scan) for scan in scans[:2])):
+    for prepare in (prepare_scan, dpmjax.encode):
+        pair = tuple(prepare(model, scan) for scan in scans)
         one, other = (dpmjax.register(calibrated, *ends) for ends in (pair, pair[::-1]))
         assert one.confidence == other.confidence
         np.testing.assert_allclose(one.T_target_source @ other.T_target_source, np.eye(4), atol=1e-4)
@@ -167,15 +151,11 @@ def test_exchanged_scans_have_the_inverse_motion_as_probable(model, scans, bias:
     ("call", "message"),
     [
         (lambda model, a, b: dpmjax.register("dpm_small", a, b), "model: expected one from"),
-        (lambda model, a, b: dpmjax.register(model, a, b, scale="big"), "scale: expected a number"),
-        (lambda model, a, b: dpmjax.encode(model, a, scale=0), "scale"),
         (lambda model, a, b: dpmjax.encode(model, a, num_elements=7), "num_elements: expected"),
         (lambda model, a, b: dpmjax.encode(model, a, num_elements=33), "num_elements: expected"),
         (lambda model, a, b: dpmjax.encode(model, np.zeros((5, 4))), r"points\[:, :3\]"),
         (lambda model, a, b: dpmjax.encode(model, np.zeros(3)), "shape"),
         (lambda model, a, b: dpmjax.encode(model, np.array([["a", "b", "c"]])), "real numbers"),
-        (lambda model, a, b: dpmjax.register(model, prepare_scan(model, a, scale=2), b), "target: expected scale 2"),
-        (lambda model, a, b: dpmjax.overlap(model, prepare_scan(model, a, scale=2), b), "got scales 1 and 2"),
         (lambda model, a, b: dpmjax.encode_scans(model, []), "scans: expected at least one"),
         (lambda model, a, b: dpmjax.register_pairs(model, [a, b], [a]), "targets: expected 2"),
         (lambda model, a, b: dpmjax.register_pairs(model, [a, b], [b, dpmjax.encode(model, a)]), "expected scans in"),

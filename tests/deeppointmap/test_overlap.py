@@ -13,7 +13,7 @@ import dpmjax
 from dpmjax.deeppointmap import correlate
 from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, logistic_probability
 from dpmjax.deeppointmap.matching import TEMPERATURE
-from dpmjax.deeppointmap.model import overlap_logit, similarity_features
+from dpmjax.deeppointmap.model import decode
 from dpmjax.deeppointmap.overlap_prediction import (
     HIGH,
     OverlapEvidence,
@@ -52,7 +52,9 @@ def test_evidence_has_the_names_that_the_probability_is_fitted_on() -> None:
 @pytest.mark.slow
 def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     a, b = cloud(1), cloud(2)
-    features = [np.asarray(similarity_features(model, one), float) for one in correlate(model, a, b)]
+    features = [
+        np.asarray(decode(model, one.features, part="similarity_head"), float) for one in correlate(model, a, b)
+    ]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in features]
     similarity = unit[0] @ unit[1].T
     exponential = np.exp(similarity / TEMPERATURE)
@@ -111,7 +113,7 @@ def test_the_probability_is_the_logistic_function_of_the_evidence(fitted, assert
 
 def test_a_model_without_a_fit_answers_with_its_trained_head(model, fitted) -> None:
     a, b = cloud(1), cloud(2)
-    expected = jax.nn.sigmoid(overlap_logit(model, *correlate(model, a, b)))
+    expected = jax.nn.sigmoid(decode(model, *correlate(model, a, b), part="overlap_logit"))
     np.testing.assert_allclose(overlap_probability(model, a, b), expected, **ACCUMULATED)
     np.testing.assert_array_equal(head_probability(fitted, a, b), head_probability(model, a, b))
 

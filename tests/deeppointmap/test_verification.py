@@ -5,8 +5,8 @@ from dataclasses import astuple, replace
 import numpy as np
 import pytest
 
+from dpmjax.deeppointmap.compact_scans import compact_elements, expand_elements
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion
-from dpmjax.deeppointmap.prepared_scans import compact_elements, expand_elements
 from dpmjax.deeppointmap.verification import (
     EVIDENCE,
     VerificationConfig,

@@ -16,8 +16,9 @@ from dpmjax.deeppointmap import (
     Calibration,
     LogisticModel,
     MatchEvidence,
+    calibration,
 )
-from dpmjax.deeppointmap.scan_evaluation import StagedRegistration
+from dpmjax.deeppointmap.evaluation import StagedRegistration
 from experiments import dpm_calibrate
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
@@ -46,10 +47,9 @@ def kinds(monkeypatch) -> list[str | None]:
         return StagedRegistration(T, T, T, evidence, 0.5, 0.0)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    module = "dpmjax.deeppointmap.calibration"
-    monkeypatch.setattr(f"{module}.encode", lambda model, points, num_elements: points)
-    monkeypatch.setattr(f"{module}.register_in_stages", staged)
-    monkeypatch.setattr(f"{module}.register_clouds", lambda *_: motions[-1])
+    monkeypatch.setattr(calibration, "encode", lambda model, points, num_elements: points)
+    monkeypatch.setattr(calibration, "register_in_stages", staged)
+    monkeypatch.setattr(calibration, "register_clouds", lambda *_: motions[-1])
     return kinds
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from dpmjax.geometry import neighbours
-from dpmjax.geometry.neighbours import WAIT_POLICY, HostTree
+from dpmjax.geometry.neighbours import HostTree
 
 
 @pytest.mark.parametrize("ordered_from", [1, 1000])
@@ -50,8 +50,8 @@ def test_a_pickled_tree_finds_the_same(num_points: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", [None, "ACTIVE"])
 def test_other_libraries_keep_their_policy_of_waiting(policy: str | None) -> None:
-    variables = {name: value for name, value in os.environ.items() if name != WAIT_POLICY}
-    variables |= {} if policy is None else {WAIT_POLICY: policy}
-    program = f"import os, dpmjax.geometry.neighbours; print(os.environ.get({WAIT_POLICY!r}))"
+    variables = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    variables |= {} if policy is None else {"OMP_WAIT_POLICY": policy}
+    program = "import os, dpmjax.geometry.neighbours; print(os.environ.get('OMP_WAIT_POLICY'))"
     printed = subprocess.run([sys.executable, "-c", program], env=variables, capture_output=True, check=True, text=True)
     assert printed.stdout.strip() == str(policy)

@@ -63,15 +63,6 @@ def test_points_on_a_line_in_space_get_a_normal_to_it() -> None:
     np.testing.assert_allclose(result.flatness, 0, atol=1e-5)
 
 
-def test_radius_keeps_neighbours_of_another_wall_out() -> None:
-    wall = np.stack([np.linspace(0, 1, 11), np.full(11, 2.0)], axis=1)
-    other = np.array([[3.0, 9.0], [4.0, 9.5]])
-    points = np.concatenate([wall, other]).astype(np.float32)
-    result = jax.device_get(estimate_normals(points, 13, radius=0.35))
-    np.testing.assert_allclose(result.normals[:11], np.tile([0, -1], (11, 1)), rtol=0, atol=1e-5)
-    assert not result.mask[11:].any()
-
-
 @DIMS
 def test_gradient_is_zero_and_finite(dim: int) -> None:
     gradient = jax.jit(jax.grad(lambda p: jnp.sum(estimate_normals(p, 5).normals ** 3)))(jnp.asarray(surface(5, dim)))
@@ -83,8 +74,6 @@ def test_wrong_arguments_are_named(as_user) -> None:
         estimate_normals(jnp.ones((5, 4)), 3)
     with pytest.raises(ValueError, match="^k: expected at least 3"):
         estimate_normals(jnp.ones((5, 3)), 2)
-    with pytest.raises(ValueError, match="^radius: expected a number above 0"):
-        estimate_normals(jnp.ones((5, 3)), 3, radius=-1.0)
 
 
 def test_pixels_of_a_plane_have_its_normal_and_pixels_across_an_edge_none() -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.geometry import PyramidConfig, PyramidStage, build_pyramid_on_host
-from dpmjax.geometry.pyramid_storage import moved_pyramid, pack_pyramid, record_type, stored_pyramids
+from dpmjax.geometry.pyramid_storage import moved_pyramid, record_type, store_pyramid, stored_pyramids
 from dpmjax.types import PointPyramid
 
 CONFIG = PyramidConfig((PyramidStage(24, (0.3, 0.5), 6), PyramidStage(8, (1.0,), 3), PyramidStage(4, (2.0,), 3)), 2)
@@ -22,10 +22,8 @@ def pyramid(num_points: int) -> PointPyramid:
 
 
 def stored(*pyramids: PointPyramid):
-    records = np.zeros(len(pyramids), record_type(CONFIG, CAPACITY))
-    for number, one in enumerate(pyramids):
-        pack_pyramid(one, records[number])
-    return stored_pyramids(records, CONFIG)
+    leaves = [tuple(jax.tree.leaves(store_pyramid(one))) for one in pyramids]
+    return stored_pyramids(np.array(leaves, record_type(CONFIG, CAPACITY)), CONFIG)
 
 
 def one_of(pyramid: PointPyramid):

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, correlate, init_model, model_preset, overlap
-from dpmjax.deeppointmap.model import overlap_logit, predict_offsets, similarity_features
+from dpmjax.deeppointmap.model import decode, predict_offsets
 from dpmjax.nets import DecoderConfig, attention
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
-from tests.tolerances import ACCUMULATED, ROUNDING
+from tests.tolerances import ACCUMULATED
 
 CONFIG = replace(
     toy.MODEL,
@@ -78,7 +78,11 @@ def test_gradient_is_finite(num_valid: int) -> None:
 def loss_and_gradient(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> jax.Array:
     p, q = correlate(model, a, b)
     offsets = predict_offsets(model, p.features, q.features)
-    return jnp.sum(offsets**2) + jnp.sum(similarity_features(model, q) ** 2) + overlap_logit(model, p, q)
+    return (
+        jnp.sum(offsets**2)
+        + jnp.sum(decode(model, q.features, part="similarity_head") ** 2)
+        + decode(model, p, q, part="overlap_logit")
+    )
 
 
 def test_gradient_of_attention_in_chunks_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,18 +96,6 @@ def test_gradient_of_attention_in_chunks_is_that_of_the_whole(monkeypatch: pytes
     monkeypatch.setattr(attention, "MAX_LIVE_LOGITS", 15)
     parts = gradient()
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **ACCUMULATED), parts, whole)
-
-
-@pytest.mark.slow
-def test_shared_layers_are_one_layer_applied_again(model: Model) -> None:
-    shared_config = replace(CONFIG, decoder=replace(CONFIG.decoder, shares_layers=True))
-    decoder = {name: value for name, value in model.params["decoder"].items() if name != "layer_1"}
-    repeated = {**model.params["decoder"], "layer_1": model.params["decoder"]["layer_0"]}
-    shared = Model({**model.params, "decoder": decoder}, shared_config)
-    unshared = Model({**model.params, "decoder": repeated}, CONFIG)
-    a, b = cloud(16, 8), cloud(17, 8)
-    for found, expected in zip(correlate(shared, a, b), correlate(unshared, a, b), strict=True):
-        np.testing.assert_allclose(found.features, expected.features, **ROUNDING)
 
 
 @pytest.mark.slow

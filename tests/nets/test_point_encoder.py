@@ -87,16 +87,6 @@ def test_gradient_is_finite_in_degenerate_clouds_too(model: Model) -> None:
     assert any(leaf.any() for leaf in jax.tree.leaves(gradient.params["encoder"]["stage_0"]))
 
 
-def test_bfloat16_is_close_and_leaves_positions_alone(model: Model) -> None:
-    pyramid = pyramid_of(points(8))
-    low = encode_pyramid(Model(model.params, CONFIG.with_compute_dtype("bfloat16")), pyramid)
-    high = encode_pyramid(model, pyramid)
-    np.testing.assert_array_equal(low.positions, high.positions)
-    assert low.features.dtype == jnp.float32
-    # bfloat16 has 8 bits, so each product in a chain has an error of 0.4 %.
-    assert jnp.linalg.norm(low.features - high.features) < 0.03 * jnp.linalg.norm(high.features)
-
-
 @pytest.mark.slow
 def test_paper_size_is_the_published_one() -> None:
     shapes = model_shapes(ModelConfig())
@@ -114,8 +104,6 @@ def test_wrong_pyramids_and_widths_are_named(as_user, model: Model) -> None:
         encode_pyramid(model, pyramid.replace(levels=(pyramid.levels[0], short, *pyramid.levels[2:])))
     with pytest.raises(ValueError, match="^stem_channels: expected at least 1"):
         EncoderConfig(stem_channels=0)
-    with pytest.raises(ValueError, match="^compute_dtype: expected one of float32, bfloat16, got 'float16'"):
-        EncoderConfig(compute_dtype="float16")
     with pytest.raises(ValueError, match="^decoder.input_channels: expected the encoder's output_channels 128, got 64"):
         ModelConfig(decoder=DecoderConfig(input_channels=64))
 

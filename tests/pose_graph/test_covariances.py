@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.pose_graph import PoseGraph, PoseGraphConfig, covariances, optimize_pose_graph, pose_covariances
+from dpmjax.pose_graph import PoseGraph, PoseGraphConfig, free_nodes, optimize_pose_graph, pose_covariances
 from tests.pose_graph.test_optimize import KINDS, exponential, from_matrices, random_graph, to_matrix, whitened
 
 
@@ -30,7 +30,7 @@ def dense_covariances(graph: PoseGraph) -> np.ndarray:
 
 @KINDS
 def test_covariances_are_blocks_of_the_dense_inverse(tangent: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(covariances, "_BATCH", 4)  # two batches
+    monkeypatch.setattr(free_nodes, "_BATCH", 4)  # two batches
     solved = optimize_pose_graph(random_graph(3, tangent, noise=0.02, start=0.02)).graph
     found = pose_covariances(solved)
     np.testing.assert_array_equal(found[0], 0.0)

@@ -18,7 +18,7 @@ def arrays_of(seed: int, tangent: int, **options: float) -> tuple[jax.Array, Edg
 
 
 def moved(poses: jax.Array, step: jax.Array) -> jax.Array:
-    return se2.compose(poses, step) if poses.ndim == 2 else rigid.compose(poses, rigid.exp(step))
+    return se2.compose(poses, step) if poses.ndim == 2 else rigid.matmul(poses, rigid.exp(step))
 
 
 @pytest.mark.slow

@@ -140,14 +140,14 @@ def test_derivatives_are_those_of_finite_differences(tangent: int) -> None:
     # Large residuals: there the derivative of the logarithm is far from the identity.
     graph = random_graph(1, tangent, start=0.4)
     still = np.zeros((len(graph.poses), tangent))
-    at = linearise(graph.poses, still, graph.edges)
+    at = linearise(graph.poses, graph.edges)
     gradient = np.zeros_like(still)
     np.add.at(gradient, np.stack([graph.edges.target, graph.edges.source], axis=1), at.gradient)
     expected = np.zeros_like(still)
     for index in np.ndindex(still.shape):
         step = still.copy()
         step[index] = 1e-5
-        forward, backward = (linearise(graph.poses, sign * step, graph.edges).chi2.sum() for sign in (1, -1))
+        forward, backward = (linearise(graph.poses, graph.edges, sign * step).chi2.sum() for sign in (1, -1))
         expected[index] = (forward - backward) / 4e-5
     np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-5)
     # J^T W J of a whole edge is symmetric, and its gradient is J^T W r: their lengths belong together.

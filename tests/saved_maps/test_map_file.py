@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dpmjax import load_map, save_map
-from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_scan
+from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan
 from dpmjax.io import InputError
 from dpmjax.saved_maps import load_state, map_bytes
 from dpmjax.scans.surfaces import SurfaceConfig, range_image, scan_surface

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.slam import (

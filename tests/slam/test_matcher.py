@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.deeppointmap.compact_scans import expand_elements
 from dpmjax.deeppointmap.matching import MatchConfig
-from dpmjax.deeppointmap.prepared_scans import expand_elements
-from dpmjax.deeppointmap.scan_registration import match_clouds
+from dpmjax.deeppointmap.registration import match_clouds
 from dpmjax.scans import Scan
 from dpmjax.slam import NetworkMatcher, Submap, SurfaceGeometry
 from dpmjax.slam.model_methods import union_of

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpmjax import model_preset
-from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_elements, compact_image
+from dpmjax.deeppointmap.compact_scans import CompactScan, compact_elements, compact_image
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import turn_rad
 from dpmjax.scans import Scan

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax.deeppointmap.prepared_scans import CompactElements, CompactImage, CompactScan, expand_elements
+from dpmjax.deeppointmap.compact_scans import CompactElements, CompactImage, CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.scans.lidar import Scan
 from dpmjax.scans.surfaces import surface_of_elements

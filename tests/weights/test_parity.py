@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import Model, ModelConfig, correlate, encode_pyramid, overlap, register
-from dpmjax.deeppointmap.model import decode, predict_offsets, similarity_features
+from dpmjax.deeppointmap.model import decode, predict_offsets
 from dpmjax.deeppointmap.training.objective import ObjectiveConfig, TrainingSide, matching_loss, training_pairs
 from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage, build_pyramid_on_host
@@ -95,7 +95,7 @@ def test_correlated_features_and_similarity_are_the_published_ones(case: Case) -
     expected = reference.correlate(case.network, *case.expected)
     for cloud, features in zip(correlated, expected, strict=True):
         assert_near(cloud.features, features)
-    a, b = (np.asarray(similarity_features(case.model, cloud), np.float64) for cloud in correlated)
+    a, b = (np.asarray(decode(case.model, cloud.features, part="similarity_head"), np.float64) for cloud in correlated)
     assert_near(reference.cosines(a, b), reference.similarity(case.network, *expected))
 
 
@@ -125,7 +125,7 @@ def test_losses_and_accuracy_are_the_published_ones(case: Case) -> None:
             TrainingSide(
                 positions=cloud.positions,
                 mask=cloud.mask,
-                matched_features=similarity_features(model, correlated[here]),
+                matched_features=decode(model, correlated[here].features, part="similarity_head"),
                 coarse_features=decode(model, cloud.features, part="coarse_head"),
                 close=close[here],
                 offsets=predict_offsets(model, own[:, None], correlated[there].features, None, close[here].indices),

@@ -160,10 +160,9 @@ def fill_overlap(
         num_pairs = OVERLAP_FACTOR * options.pairs
         found = deeppointmap.evaluate_overlap(model, by_name[drive], num_pairs, seed=options.seed)
         row: cli.Row = {"num_pairs": len(found.is_overlap), "has_revisits": found.has_revisits}
-        head = None if found.by_head is None else found._replace(probability=found.by_head)
-        for suffix, one in (("", found), ("_head", head)):
-            row[f"auc{suffix}"] = None if one is None else one.area_under_curve
-            row[f"brier{suffix}"] = None if one is None else one.brier_score
+        for name, probability in (("", found.probability), ("_head", found.by_head)):
+            for measure, rate in (("auc", metrics.area_under_curve), ("brier", metrics.brier_score)):
+                row[f"{measure}{name}"] = None if probability is None else rate(probability, found.is_overlap)
         return row
 
     return cli.fill_table(run, [{"drive": name} for name in by_name], work, "overlap.csv")

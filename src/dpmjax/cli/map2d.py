@@ -30,6 +30,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from dpmjax import cli, deepmapping, geometry, io, metrics, registration2d, simulation, viz
+from dpmjax.progress import progress_bar
 from dpmjax.sequences import FloatArray, ScanSequence
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
-    """Registers the scans with the recorder as engine of the fit, and prints each stage."""
+    """Registers the scans with the recorder as engine of the fit, and prints each stage and one bar."""
     import jax
 
     fit = fit_settings(options, sequence)
@@ -127,25 +128,32 @@ def register_sequence(
         min_turn=MIN_TURN_RAD,
     )
 
+    bar = progress_bar("registration", is_shown=True)
+
     def show(stage: str, share: float) -> None:
         if share == 0.0:
-            print(f"{stage} ...", flush=True)
+            bar.write(f"{stage} ...")
 
     def engine(rows: np.ndarray) -> Callable[..., deepmapping.Fit]:
         if len(rows) < len(sequence):
-            print(f"{len(rows)} of the scans are registered, chosen by their motion")
+            bar.write(f"{len(rows)} of the scans are registered, chosen by their motion")
         fitted = sequence.take(rows)
         unit = fit.unit or geometry.typical_range(fitted.points, fitted.mask)
         return partial(recorder, measure=ate_of(fitted, unit))
 
-    return registration2d.register_scans(
-        scan_set_of(sequence),
-        config,
-        key=jax.random.key(options.seed),
-        start=start,
-        odometry=sequence.odometry_poses if options.ordered else None,
-        hooks=registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine),
-    )
+    def advance(share: float) -> None:
+        bar.update(share - bar.n)
+
+    hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine, advance)
+    with bar:
+        return registration2d.register_scans(
+            scan_set_of(sequence),
+            config,
+            key=jax.random.key(options.seed),
+            start=start,
+            odometry=sequence.odometry_poses if options.ordered else None,
+            hooks=hooks,
+        )
 
 
 def map_numbers(sequence: ScanSequence, result: registration2d.RegisteredScans, options: Map2dOptions) -> cli.Numbers:

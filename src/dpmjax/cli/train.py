@@ -256,19 +256,19 @@ def training_numbers(trained: deeppointmap.Trained, records: Records) -> Numbers
 
 def evaluate(trained: deeppointmap.Trained, records: Records) -> Numbers:
     """Returns recall and errors of the trained and of the untrained network."""
-    from dpmjax.cli.train_run import KINDS
+    from dpmjax.cli.train_run import RECALLS
 
     pairs = records.selection.pairs
     if pairs is None:
         return {}
-    numbers: Numbers = {"num_held_out_pairs": len(pairs.pairs[0].sources)}
+    numbers: Numbers = {"num_held_out_pairs": len(next(iter(pairs.pairs.values())))}
     print("evaluation ...", flush=True)
     for suffix, model in (("", trained.model), ("_untrained", records.untrained)):
         recalls = deeppointmap.evaluate_registration(model, pairs).recalls
-        named = zip(pairs.pairs, recalls, strict=True)
-        numbers |= {f"{KINDS[some.kind]}{suffix}": recall.recall for some, recall in named}
-        numbers[f"translation_error_median{suffix}_m"] = float(np.median(recalls[0].translation_errors_m))
-        numbers[f"rotation_error_median{suffix}_deg"] = float(np.median(recalls[0].rotation_errors_deg))
+        numbers |= {f"{RECALLS[band]}{suffix}": recall.recall for band, recall in recalls.items()}
+        near = next(iter(recalls.values()))
+        numbers[f"translation_error_median{suffix}_m"] = float(np.median(near.translation_errors_m))
+        numbers[f"rotation_error_median{suffix}_deg"] = float(np.median(near.rotation_errors_deg))
     return numbers
 
 

@@ -36,14 +36,14 @@ NUM_AT_ONCE = 16
 # Largest number of scans of an evaluation, and number of its pairs of each kind, all drives together.
 MAX_EVALUATED_SCANS, NUM_HELD_OUT_PAIRS = 96, 32
 # Pairs of scans, near and far, which choose the model, and the names of their recalls.
-KINDS = {dpm.PairKind(2.0, 10.0): "recall", dpm.PairKind(10.0, 20.0): "recall_far"}
+RECALLS = {"near": "recall", "middle": "recall_far"}
 OVERLAP_CHECKPOINTS = "checkpoints_overlap"
 # Seconds between checkpoints; Ctrl-C and the end write one too.
 SAVE_EVERY_S = 300.0
 MEASURES = ("loss", "pairing", "offset", "top1_accuracy", "score", "coarse", "gradient_norm", "learning_rate")
 # Coefficients of determination of predicted offsets, on the pairs that choose the model; empty without an offset head.
 OFFSETS = ("offset_r2_normal", "offset_r2_along", "offset_r2_up")
-COLUMNS = ("step", "stage", "run_s", *MEASURES, *KINDS.values(), *OFFSETS, "overlap_loss", "overlap_accuracy")
+COLUMNS = ("step", "stage", "run_s", *MEASURES, *RECALLS.values(), *OFFSETS, "overlap_loss", "overlap_accuracy")
 
 
 class PlannedDrive(NamedTuple):
@@ -195,7 +195,7 @@ def draw_selection(settings: dpm.TrainingConfig, drives: Sequence[cli.Source], c
             yield drive.take(slice(None, None, -(-len(drive) // max_scans) or 1))
 
     num_pairs = max(1, NUM_HELD_OUT_PAIRS // len(drives))
-    pairs = dpm.draw_evaluation_pairs(opened(), num_pairs, settings.model, kinds=tuple(KINDS))
+    pairs = dpm.draw_evaluation_pairs(opened(), num_pairs, settings.model)
     return (
         Selection(pairs, chosen_by) if pairs.pairs else Selection(None, "the last step: no drive has held-out places")
     )
@@ -247,10 +247,9 @@ class Records:
         """Returns the mean recall of the pairs that choose the model, and measures their offsets."""
         assert self.selection.pairs is not None
         found = dpm.evaluate_registration(model, self.selection.pairs)
-        named = zip(self.selection.pairs.pairs, found.recalls, strict=True)
-        self._recalls = {KINDS[some.kind]: recall.recall for some, recall in named}
+        self._recalls = {RECALLS[band]: recall.recall for band, recall in found.recalls.items()}
         self._recalls |= dict(zip(OFFSETS, found.offset_r2.tolist(), strict=True))
-        return float(np.mean([recall.recall for recall in found.recalls]))
+        return float(np.mean([recall.recall for recall in found.recalls.values()]))
 
     def on_report(self, record: dpm.StepRecord, progress: dpm.TrainingProgress) -> None:
         """Adds a row, updates the bar, and writes a checkpoint every few minutes."""
@@ -302,10 +301,8 @@ class Records:
                     self._of_overlap.save(record.step, state)
                     self._saved_at = time.perf_counter()
 
-            hooks, start = dpm.OverlapHooks(on_report, stop), self.overlap_start
-            model, state = dpm.train_overlap(
-                store, trained.model, self._settings, seed=self.seed, start=start, hooks=hooks
-            )
+            hooks: dict[str, Any] = {"on_report": on_report, "stop": stop, "start": self.overlap_start}
+            model, state = dpm.train_overlap(store, trained.model, self._settings, seed=self.seed, **hooks)
         self._of_overlap.save(int(state.step), state)
         stopped_by = 0 if int(state.step) >= total else stop()
         return trained._replace(model=model, overlap=state, stopped_by=stopped_by)

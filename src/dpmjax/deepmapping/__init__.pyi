@@ -16,7 +16,6 @@ from .engine import resume as resume
 from .engine import solve as solve
 from .engine import step as step
 from .engine import steps_per_call as steps_per_call
-from .localization_training import train_localization as train_localization
 from .mapping import Fitted as Fitted
 from .mapping import MapPicture as MapPicture
 from .mapping import Registered as Registered
@@ -30,9 +29,10 @@ from .problem import Problem as Problem
 from .relocalization import Relocalized as Relocalized
 from .relocalization import propose_poses as propose_poses
 from .relocalization import relocalize as relocalize
+from .relocalization import train_localization as train_localization
+from .toy import GLOBAL_MINIMUM as GLOBAL_MINIMUM
 from .toy import Initialization as Initialization
 from .toy import ToyConfig as ToyConfig
-from .toy import global_minimum as global_minimum
 from .toy import network_value as network_value
 from .toy import toy_loss as toy_loss
 from .toy import toy_problem as toy_problem

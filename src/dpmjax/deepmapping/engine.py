@@ -1,9 +1,9 @@
 """Optimisation of the parameters of a `Problem`: `init` a state, `step` it, `resume` it to the end.
 
 A state is one pytree of arrays; a run that is resumed from a saved state equals an unbroken one. The data are arguments
-of the compiled step, so that another set of the same shape compiles nothing. Several starts, with different keys, have
-one more leading axis. `init`, `begin_phase`, `step` and `solve` are pure functions of arrays, for `jit` and `vmap`.
-`fit` and `resume` run the same steps from the host, with progress and a stop.
+of the compiled step, so that another set of the same shape compiles nothing. `init`, `begin_phase`, `step` and `solve`
+are pure functions of arrays, for `jit` and `vmap`: several starts are a `vmap` of `solve` over their keys. `fit` and
+`resume` run the same steps from the host, with progress and a stop.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from dpmjax.checks import as_key, require_count
+from dpmjax.checks import as_key
 from dpmjax.deepmapping.problem import Problem
 from dpmjax.kept_programs import kept_jit, prepare_program
 from dpmjax.types import with_short_repr
@@ -29,7 +29,7 @@ from dpmjax.types import with_short_repr
 
 @flax.struct.dataclass
 class FitState:
-    """Complete state of a fit; for several starts every leaf has a leading axis.
+    """Complete state of a fit.
 
     Attributes:
         params: trained parameters of the problem.
@@ -43,14 +43,14 @@ class FitState:
     params: Any
     optimizer: Any
     key: Array
-    phase: Int[Array, "*starts"]
-    phase_step: Int[Array, "*starts"]
-    step: Int[Array, "*starts"]
+    phase: Int[Array, ""]
+    phase_step: Int[Array, ""]
+    step: Int[Array, ""]
 
 
 @with_short_repr
 class Report(NamedTuple):
-    """Result of one call of the step; for several starts every leaf has a leading axis.
+    """Result of one call of the step.
 
     Attributes:
         losses: losses of each step of the call.
@@ -58,14 +58,14 @@ class Report(NamedTuple):
         poses: poses of the whole data set after the call.
     """
 
-    losses: Float[Array, "... t"]
+    losses: Float[Array, " t"]
     terms: Any
     poses: Any
 
     @property
     def loss(self) -> float:
-        """Mean loss of the call, of the best start."""
-        return float(np.asarray(self.losses).mean(axis=-1).min())
+        """Mean loss of the call."""
+        return float(np.asarray(self.losses).mean())
 
 
 class Progress(NamedTuple):
@@ -107,24 +107,21 @@ class Fit(NamedTuple):
     compile_s: float
 
 
-def init(problem: Problem, data: Any, *, key: jax.Array, num_starts: int = 1) -> FitState:
+def init(problem: Problem, data: Any, *, key: jax.Array) -> FitState:
     """Makes a fresh state at the start of the first phase.
 
     Args:
         problem: problem to fit.
         data: data of the problem.
         key: key of the run.
-        num_starts: number of starts that differ in their keys; with 1, there is no leading axis.
 
     Returns:
         The state.
 
     Raises:
-        ValueError: there is no start, or `key` is no key.
+        ValueError: `key` is no key.
     """
-    require_count("num_starts", num_starts)
-    key = as_key("key", key)
-    return _init(problem, data, key if num_starts == 1 else jax.random.split(key, num_starts))
+    return _init(problem, data, as_key("key", key))
 
 
 def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = None) -> tuple[FitState, Report]:
@@ -147,7 +144,7 @@ def step(problem: Problem, state: FitState, data: Any, *, phase: int | None = No
         if isinstance(state.phase, jax.core.Tracer):
             raise ValueError("phase: expected the index of the phase, because the state is traced")
         state = _enter_phase(problem, state, data)
-        phase = _scalar(state.phase)
+        phase = int(state.phase)
     return _advance(problem, phase, state, data)
 
 
@@ -164,15 +161,10 @@ def begin_phase(problem: Problem, state: FitState, data: Any, *, phase: int) -> 
     Returns:
         The state, with fresh moments of the optimiser.
     """
-
-    def begin(state: FitState, data: Any) -> FitState:
-        params = problem.next_phase(problem.config, problem.phases[phase - 1], state.params, data)
-        moments = problem.optimizer(problem.config, problem.phases[phase]).init(params)
-        return replace(
-            state, params=params, optimizer=moments, phase=state.phase + 1, phase_step=jnp.zeros_like(state.phase_step)
-        )
-
-    return _over_starts(begin, state, data)
+    params = problem.next_phase(problem.config, problem.phases[phase - 1], state.params, data)
+    moments = problem.optimizer(problem.config, problem.phases[phase]).init(params)
+    zero = jnp.zeros_like(state.phase_step)
+    return replace(state, params=params, optimizer=moments, phase=state.phase + 1, phase_step=zero)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -193,13 +185,12 @@ def solve(problem: Problem, data: Any, *, key: jax.Array) -> tuple[FitState, Rep
     for phase in range(len(problem.phases)):
         if phase > 0:
             state = begin_phase(problem, state, data, phase=phase)
-        length = num_calls(problem, problem.phases[phase])
-        state, reports = jax.lax.scan(partial(_scanned_step, problem, data, phase), state, length=length)
+
+        def advance(state: FitState, _: None, phase: int = phase) -> tuple[FitState, Report]:
+            return step(problem, state, data, phase=phase)
+
+        state, reports = jax.lax.scan(advance, state, length=num_calls(problem, problem.phases[phase]))
     return state, jax.tree.map(lambda leaf: leaf[-1], reports)
-
-
-def _scanned_step(problem: Problem, data: Any, phase: int, state: FitState, _: None) -> tuple[FitState, Report]:
-    return step(problem, state, data, phase=phase)
 
 
 def is_finished(problem: Problem, state: FitState) -> bool:
@@ -212,8 +203,8 @@ def is_finished(problem: Problem, state: FitState) -> bool:
     Returns:
         True if no step remains.
     """
-    phase = _scalar(state.phase)
-    return phase == len(problem.phases) - 1 and _scalar(state.phase_step) >= problem.phases[phase].num_steps
+    phase = int(state.phase)
+    return phase == len(problem.phases) - 1 and int(state.phase_step) >= problem.phases[phase].num_steps
 
 
 def fit(
@@ -221,7 +212,6 @@ def fit(
     data: Any,
     *,
     key: jax.Array,
-    num_starts: int = 1,
     on_report: Callable[[Progress], None] = lambda _progress: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Fit:
@@ -231,15 +221,13 @@ def fit(
         problem: problem to fit.
         data: data of the problem, with initial poses where there are some.
         key: key of the run.
-        num_starts: number of starts that advance side by side.
         on_report: called after each call of the step.
         stop: called before each call of the step; the fit ends where it returns True.
 
     Returns:
         Fit.
     """
-    state = init(problem, data, key=key, num_starts=num_starts)
-    return resume(problem, state, data, on_report=on_report, stop=stop)
+    return resume(problem, init(problem, data, key=key), data, on_report=on_report, stop=stop)
 
 
 def resume(
@@ -269,18 +257,13 @@ def resume(
         begun = time.perf_counter()
         state = _enter_phase(problem, state, data)
         # Compiled ahead, so that compile time is counted apart.
-        advance = prepare_program(_advance, problem, _scalar(state.phase), state, data)
+        advance = prepare_program(_advance, problem, int(state.phase), state, data)
         compiled = time.perf_counter()
         state, report = jax.block_until_ready(advance())
         compile_s, run_s = compile_s + compiled - begun, run_s + time.perf_counter() - compiled
-        share = min(1.0, _scalar(state.step) / total)
-        on_report(Progress(problem.phases[_scalar(state.phase)], state, report, share, run_s, compile_s))
-    return Fit(state, _current_poses(problem, _scalar(state.phase), state, data), report, run_s, compile_s)
-
-
-def _scalar(count: Array) -> int:
-    """Returns a counter, which is the same for all starts."""
-    return int(np.asarray(count).reshape(-1)[0])
+        share = min(1.0, int(state.step) / total)
+        on_report(Progress(problem.phases[int(state.phase)], state, report, share, run_s, compile_s))
+    return Fit(state, _current_poses(problem, int(state.phase), state, data), report, run_s, compile_s)
 
 
 def num_calls(problem: Problem, phase: Any) -> int:
@@ -311,9 +294,6 @@ def steps_per_call(problem: Problem, phase: Any) -> int:
 
 @partial(jax.jit, static_argnums=0)
 def _init(problem: Problem, data: Any, key: Array) -> FitState:
-    """Makes a state, or one for each of several keys."""
-    if key.ndim:
-        return jax.vmap(lambda one: _init(problem, data, one))(key)
     params = problem.init(problem.config, key, data)
     moments = problem.optimizer(problem.config, problem.phases[0]).init(params)
     zero = jnp.zeros((), jnp.int32)
@@ -322,20 +302,15 @@ def _init(problem: Problem, data: Any, key: Array) -> FitState:
 
 def _enter_phase(problem: Problem, state: FitState, data: Any) -> FitState:
     """Returns the state at the start of the next phase if the phase is over and not the last; else the same state."""
-    phase = _scalar(state.phase)
-    if phase + 1 == len(problem.phases) or _scalar(state.phase_step) < problem.phases[phase].num_steps:
+    phase = int(state.phase)
+    if phase + 1 == len(problem.phases) or int(state.phase_step) < problem.phases[phase].num_steps:
         return state
     return begin_phase(problem, state, data, phase=phase + 1)
 
 
-def _over_starts(function: Callable[..., Any], state: FitState, data: Any) -> Any:
-    """Calls the function on one state, or on all starts side by side."""
-    return jax.vmap(function, in_axes=(0, None))(state, data) if state.step.ndim else function(state, data)
-
-
 @kept_jit("problem", "phase")
 def _current_poses(problem: Problem, phase: int, state: FitState, data: Any) -> Any:
-    return _over_starts(lambda s, d: problem.poses(problem.config, problem.phases[phase], s.params, d), state, data)
+    return problem.poses(problem.config, problem.phases[phase], state.params, data)
 
 
 @kept_jit("problem", "phase_index")
@@ -344,19 +319,14 @@ def _advance(problem: Problem, phase_index: int, state: FitState, data: Any) -> 
     phase = problem.phases[phase_index]
     optimizer = problem.optimizer(problem.config, phase)
 
-    def call(state: FitState, data: Any) -> tuple[FitState, Report]:
-        def one_step(state: FitState, _: None) -> tuple[FitState, tuple[Array, Any]]:
-            key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
-            loss_of = partial(problem.loss, problem.config, phase)
-            (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(
-                state.params, data, state.phase_step, key
-            )
-            updates, moments = optimizer.update(gradient, state.optimizer, state.params)
-            params = optax.apply_updates(state.params, updates)
-            counts = {"phase_step": state.phase_step + 1, "step": state.step + 1}
-            return replace(state, params=params, optimizer=moments, **counts), (loss, terms)
+    def one_step(state: FitState, _: None) -> tuple[FitState, tuple[Array, Any]]:
+        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+        loss_of = jax.value_and_grad(partial(problem.loss, problem.config, phase), has_aux=True)
+        (loss, terms), gradient = loss_of(state.params, data, state.phase_step, key)
+        updates, moments = optimizer.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, updates)
+        counts = {"phase_step": state.phase_step + 1, "step": state.step + 1}
+        return replace(state, params=params, optimizer=moments, **counts), (loss, terms)
 
-        state, (losses, terms) = jax.lax.scan(one_step, state, length=steps_per_call(problem, phase))
-        return state, Report(losses, terms, problem.poses(problem.config, phase, state.params, data))
-
-    return _over_starts(call, state, data)
+    state, (losses, terms) = jax.lax.scan(one_step, state, length=steps_per_call(problem, phase))
+    return state, Report(losses, terms, problem.poses(problem.config, phase, state.params, data))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.checks import Beams, require_type, runs_on_host
 from dpmjax.deepmapping.config import DeepMappingConfig, preset
 from dpmjax.deepmapping.engine import Fit, Progress, Report, fit
-from dpmjax.deepmapping.problem import MappingData, Params, Problem, Sensor, bind_map, make_optimizer, phases_of
+from dpmjax.deepmapping.problem import MappingData, Params, Problem, bind_map, make_optimizer, phases_of
 from dpmjax.deepmapping.sensors import DEPTH, PLANAR, as_scan_set, positions_of, scale_start
 from dpmjax.geometry import se2
 from dpmjax.geometry.sampling import typical_range
@@ -30,13 +30,10 @@ from dpmjax.registration_rgbd.trajectory_search import PlacedImages, initialize_
 from dpmjax.sequences import DepthSequence
 from dpmjax.types import ScanSet, with_short_repr
 
-_SENSORS: dict[type, Sensor] = {ScanSet: PLANAR, DepthScans: DEPTH}
 # A given unit of length is between the first of these shares and the second of the typical range.
 _UNIT_SHARES = 0.1, 10.0
 # Number of samples on a beam that mark cells as explored.
 _SAMPLES = 64
-
-Scans = ScanSet | DepthScans
 
 
 @with_short_repr
@@ -133,9 +130,9 @@ def mapping_problem(config: DeepMappingConfig, data: MappingData) -> Problem:
     Returns:
         The problem; poses are as in `Fitted`, in units of the fit.
     """
-    of_sensor = _SENSORS[type(data.scans)]._asdict()
-    phases, steps = phases_of(config, data), config.steps_per_call
-    return Problem(config, phases, optimizer=make_optimizer, steps_per_call=steps, **of_sensor)
+    make = PLANAR if isinstance(data.scans, ScanSet) else DEPTH
+    steps = config.steps_per_call
+    return make(config, phases_of(config, data), optimizer=make_optimizer, steps_per_call=steps)
 
 
 @runs_on_host("call deepmapping.solve there")

@@ -45,12 +45,19 @@ def blocks_of_step(phase: PhaseConfig, num_scans: int, step: Int[Array, ""], *, 
     Returns:
         The batch.
     """
-    if phase.scans_per_window is None and phase.is_as_published and num_scans > phase.scans_per_step:
+    count = phase.scans_per_step
+    if phase.scans_per_window is not None:
+        rows = jnp.asarray(window_rows(num_scans, phase.scans_per_window))
+    elif num_scans <= count:
+        rows = jnp.arange(num_scans)[None]
+    elif phase.is_as_published:
         # The published order: batches follow each other in time, and the last one is shorter.
-        first = step % num_batches(phase, num_scans) * phase.scans_per_step
-        rows = first + jnp.arange(phase.scans_per_step)[None]
+        rows = step % num_batches(phase, num_scans) * count + jnp.arange(count)[None]
         return Batch(jnp.minimum(rows, num_scans - 1), rows < num_scans)
-    rows = _rows_of_step(phase, num_scans, key=key)
+    else:
+        length = min(_BLOCK, count)
+        first = jax.random.randint(key, (count // length, 1), 0, num_scans - length + 1)
+        rows = first + jnp.arange(length)
     return Batch(rows, jnp.ones(rows.shape, bool))
 
 
@@ -65,17 +72,6 @@ def num_batches(phase: PhaseConfig, num_scans: int) -> int:
         The number, at least 1.
     """
     return max(1, -(-num_scans // phase.scans_per_step))
-
-
-def _rows_of_step(phase: PhaseConfig, num_scans: int, *, key: jax.Array) -> Int[Array, "w m"]:
-    if phase.scans_per_window is not None:
-        return jnp.asarray(window_rows(num_scans, phase.scans_per_window))
-    count = phase.scans_per_step
-    if num_scans <= count:
-        return jnp.arange(num_scans)[None]
-    length = min(_BLOCK, count)
-    first = jax.random.randint(key, (count // length, 1), 0, num_scans - length + 1)
-    return first + jnp.arange(length)
 
 
 def draw_offsets(phase: PhaseConfig, furthest: int, *, key: jax.Array) -> Int[Array, " o"]:

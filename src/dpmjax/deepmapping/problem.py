@@ -79,22 +79,6 @@ class MappingData(NamedTuple):
     start: Float[Array, "n ..."] | None = None
 
 
-class Sensor(NamedTuple):
-    """Functions of `Problem` that depend on the sensor: poses, and comparison of pairs of scans.
-
-    Attributes:
-        init: function of `Problem`.
-        loss: function of `Problem`.
-        poses: function of `Problem`.
-        next_phase: function of `Problem`.
-    """
-
-    init: Callable[..., Params]
-    loss: Callable[..., tuple[Float[Array, ""], Terms]]
-    poses: Callable[..., Array]
-    next_phase: Callable[..., Params]
-
-
 @flax.struct.dataclass
 class MapFrame:
     """Square or cube of the world that maps to [-1, 1]^d, the domain of M-Net; in units of the fit."""

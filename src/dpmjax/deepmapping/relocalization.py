@@ -7,6 +7,7 @@ cost means that the place is not in the map.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -14,24 +15,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+import optax
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from dpmjax.checks import require_value, runs_on_host
-from dpmjax.deepmapping.config import DeepMappingConfig
-from dpmjax.deepmapping.localization_training import (
-    MapRaster,
-    has_localization,
-    has_windows,
-    make_raster,
-    nearest_nodes,
-    turn_scans,
-)
+from dpmjax.checks import require_count, require_value, runs_on_host
+from dpmjax.deepmapping.config import DeepMappingConfig, PhaseConfig
+from dpmjax.deepmapping.engine import solve
 from dpmjax.deepmapping.mapping import Fitted
-from dpmjax.deepmapping.problem import MapFrame
+from dpmjax.deepmapping.problem import MapFrame, Params, Problem, bind_map, choose_frame
 from dpmjax.deepmapping.sensors import as_scan_set, choose_beams, localize_scans
 from dpmjax.geometry import se2
+from dpmjax.nets.mapping import LocalizationNet
 from dpmjax.types import ScanSet, with_short_repr
 
 # Step of the coarsest grid of poses, along x and y in units of the fit, and in radians; each level halves it.
@@ -216,3 +212,252 @@ def propose_poses(
         return found - turns[:, None] * jnp.array([0.0, 0.0, 1.0])
 
     return jnp.asarray(jax.lax.map(propose, scans, batch_size=32))
+
+
+# Number of nodes of the raster along each side of the map's frame.
+NUM_NODES = 513
+# Absolute log odds above which a node is observed, free or occupied; M-Net is zero where no beam has passed.
+_SEEN = 0.3
+# Largest share of unobserved nodes along a rendered beam.
+_MAX_UNSEEN = 0.1
+# Distance from a scan that the raster of an MLP covers, in units of the fit.
+_REACH = 1.5
+# Longest rendered beam in nodes.
+_MAX_NODES = 400
+# Least share of the beams of a rendered scan that hit the map.
+_LEAST_BEAMS = 0.5
+# Learning rate of Adam at the start; a cosine schedule reduces it to a hundredth.
+_LEARNING_RATE = 2e-3
+# Largest random heading of a scan; `relocalize` tries all turns, so L-Net needs only a range of headings.
+_MAX_TURN_DEG = 20.0
+# Number of scans of a step, drawn with replacement. Number of scans rendered from the map at random free positions;
+# half of each step are rendered scans, so that L-Net learns observed places off the trajectory.
+_SCANS_PER_STEP, _NUM_RENDERED = 64, 4096
+# Largest share of masked beams of a scan.
+_LARGEST_DROP = 0.2
+
+
+class MapRaster(NamedTuple):
+    """Log odds of the map at the nodes of a raster.
+
+    Attributes:
+        logits: rows along x, columns along y.
+        frame: square that the raster covers.
+    """
+
+    logits: Float[Array, "r r"]
+    frame: MapFrame
+
+    @property
+    def spacing(self) -> Float[Array, ""]:
+        """Distance of two nodes, in units of the fit."""
+        return 2.0 * self.frame.half_side / (NUM_NODES - 1)
+
+
+def make_raster(fitted: Fitted) -> MapRaster:
+    """Evaluates M-Net at all nodes.
+
+    Args:
+        fitted: a fit of planar scans.
+
+    Returns:
+        MapRaster, over the frame of a grid. An MLP is defined everywhere: the raster covers what its scans see.
+    """
+    frame = fitted.params.frame
+    if fitted.config.occupancy.kind == "mlp":
+        positions = jnp.asarray(fitted.poses[:, :2] / fitted.unit, jnp.float32)
+        ends = jnp.stack([positions - _REACH, positions + _REACH])
+        frame = choose_frame(ends, jnp.ones(ends.shape[:2], bool), margin=1.0)
+    return _raster(fitted.params, frame, fitted.config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _raster(params: Params, frame: MapFrame, config: DeepMappingConfig) -> MapRaster:
+    axis = jnp.linspace(-1.0, 1.0, NUM_NODES)
+    local = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    logits = bind_map(params, config)(frame.centre + frame.half_side * local)
+    return MapRaster(logits.reshape(NUM_NODES, NUM_NODES), frame)
+
+
+def nearest_nodes(frame: MapFrame, points: Float[Array, "... 2"]) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
+    """Finds the nearest nodes of points.
+
+    Args:
+        frame: frame of the map.
+        points: points in the world, typical ranges.
+
+    Returns:
+        Index of the nearest node in the flat raster, and True where the point is inside the raster.
+    """
+    position = (0.5 * (points - frame.centre) / frame.half_side + 0.5) * (NUM_NODES - 1)
+    index = jnp.clip(jnp.round(position).astype(jnp.int32), 0, NUM_NODES - 1)
+    is_inside = ((position >= 0.0) & (position <= NUM_NODES - 1)).all(-1)
+    return index[..., 0] * NUM_NODES + index[..., 1], is_inside
+
+
+def render_scans(
+    raster: MapRaster, scans: ScanSet, count: int, *, key: jax.Array
+) -> tuple[ScanSet, Float[Array, "m 3"]]:
+    """Renders scans at random free places of the map, at heading zero.
+
+    Args:
+        raster: raster of the map.
+        scans: (n, b, 2) in units of the fit; rendered scans have the same bearings.
+        count: number of positions that are tried.
+        key: key of the positions.
+
+    Returns:
+        Scans and poses at the positions where enough beams hit occupied nodes of M-Net.
+    """
+    place_key, row_key = jax.random.split(key)
+    free = np.flatnonzero(np.asarray(raster.logits) < -_SEEN)
+    chosen = free[np.asarray(jax.random.randint(place_key, (count if len(free) else 0,), 0, max(len(free), 1)))]
+    nodes = np.stack(np.divmod(chosen, NUM_NODES), axis=-1).astype(np.float32)
+    places = raster.frame.centre - raster.frame.half_side + raster.spacing * nodes
+    rows = jax.random.randint(row_key, (len(chosen),), 0, len(scans.points))
+    ranges, is_met = _follow_beams(raster, places, scans.points[rows])
+    mask = is_met & scans.mask[rows]
+    reach = jnp.linalg.norm(jnp.where(mask[..., None], scans.points[rows], 1.0), axis=-1)
+    points = jnp.where(mask[..., None], scans.points[rows] * (ranges / reach)[..., None], 0.0)
+    kept = np.flatnonzero(np.asarray(mask.mean(axis=1)) >= _LEAST_BEAMS)
+    poses = jnp.concatenate([places, jnp.zeros((len(chosen), 1))], axis=1)
+    return ScanSet(points[kept], mask[kept]), poses[kept]
+
+
+@jax.jit
+def _follow_beams(
+    raster: MapRaster, places: Float[Array, "m 2"], towards: Float[Array, "m b 2"]
+) -> tuple[Float[Array, "m b"], Bool[Array, "m b"]]:
+    """Computes ranges to the first occupied node towards points of the sensor frame, and True for valid ranges."""
+    ranges = raster.spacing * jnp.arange(1, _MAX_NODES + 1)
+
+    def follow(beams: tuple[Float[Array, " 2"], Float[Array, "b 2"]]) -> tuple[Array, Array]:
+        place, points = beams
+        direction = points / jnp.maximum(jnp.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
+        row, is_inside = nearest_nodes(raster.frame, place + ranges[:, None, None] * direction)
+        logits = jnp.where(is_inside, raster.logits.reshape(-1)[row], 0.0)
+        first = jnp.argmax(logits > _SEEN, axis=0)
+        is_before = jnp.arange(_MAX_NODES)[:, None] < first
+        unseen = jnp.sum(is_before & (logits > -_SEEN), axis=0)
+        return ranges[first], (logits.max(axis=0) > _SEEN) & (unseen <= 1 + _MAX_UNSEEN * first)
+
+    return jax.lax.map(follow, (places, towards), batch_size=16)
+
+
+def has_windows(fitted: Fitted) -> bool:
+    """Returns True where the fit has an L-Net for each of several windows instead of one for all scans.
+
+    Args:
+        fitted: result of `fit_deepmapping` or of `train_localization`.
+
+    Returns:
+        True if a leading axis of L-Net's weights is that of the windows.
+    """
+    return has_localization(fitted) and fitted.params.localization["params"]["Dense_0"]["bias"].ndim > 1
+
+
+def has_localization(fitted: Fitted) -> bool:
+    """Returns True where the fit has an L-Net; one of free poses from given poses has none.
+
+    Args:
+        fitted: result of `fit_deepmapping` or of `train_localization`.
+
+    Returns:
+        True if there are weights.
+    """
+    return bool(fitted.params.localization)
+
+
+def train_localization(fitted: Fitted, scans: ScanSet | ArrayLike, *, num_steps: int = 5000, key: jax.Array) -> Fitted:
+    """Trains L-Net on the poses of the fit, for `relocalize` in the same world frame.
+
+    The labels are the poses of the fit, not ground truth. Scans are turned and partly masked. Half of them are rendered
+    from the map of M-Net at positions off the trajectory.
+
+    Args:
+        fitted: any fit, also from given poses.
+        scans: (n, b, 2) the scans of the fit.
+        num_steps: number of steps of Adam.
+        key: key of the batches.
+
+    Returns:
+        The fit with another L-Net and with zero start poses; poses and map are the same.
+
+    Raises:
+        ValueError: the number of scans is not that of the fit, or there is no step.
+    """
+    require_count("num_steps", num_steps)
+    scans = as_scan_set(scans)
+    num, num_given = len(fitted.poses), len(scans.points)
+    require_value(num_given == num, "scans", f"the {num} scans of the fit", num_given)
+    poses = jnp.asarray(fitted.poses / [fitted.unit, fitted.unit, 1.0], jnp.float32)
+    measured = replace(scans, points=scans.points / fitted.unit)
+    render_key, train_key, net_key = jax.random.split(key, 3)
+    rendered, places = render_scans(make_raster(fitted), measured, _NUM_RENDERED, key=render_key)
+    begin: Any = fitted.params.localization
+    if has_windows(fitted):
+        begin = jax.tree.map(lambda weights: weights[0], begin)
+    elif not has_localization(fitted):
+        begin = jax.jit(LocalizationNet(fitted.config.localization).init)(net_key, measured.points[0], measured.mask[0])
+    shares = [np.full(len(some), 1.0 / len(some)) for some in (poses, places) if len(some)]
+    both, labels = jax.tree.map(lambda *parts: jnp.concatenate(parts), (measured, poses), (rendered, places))
+    phase = replace(fitted.config.cold_phases[0], num_steps=num_steps, num_epochs=0)
+    problem = Problem(fitted.config, (phase,), _init, _optimizer, _loss, fitted.config.steps_per_call)
+    state, _ = solve(problem, TrainingScans(begin, both, labels, jnp.asarray(np.concatenate(shares))), key=train_key)
+    params = replace(fitted.params, localization=state.params, start=jnp.zeros_like(fitted.params.start))
+    return fitted._replace(params=params)
+
+
+class TrainingScans(NamedTuple):
+    """Data of the problem of `train_localization`, in units of the fit.
+
+    Attributes:
+        begin: weights of L-Net before the first step.
+        scans: scans of the fit, and rendered ones.
+        poses: labels.
+        weights: frequency with which each scan is drawn.
+    """
+
+    begin: Any
+    scans: ScanSet
+    poses: Float[Array, "n 3"]
+    weights: Float[Array, " n"]
+
+
+def _init(config: DeepMappingConfig, key: jax.Array, data: TrainingScans) -> Any:
+    return data.begin
+
+
+def _optimizer(config: DeepMappingConfig, phase: PhaseConfig) -> optax.GradientTransformation:
+    return optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, phase.num_steps, 0.01))
+
+
+def _loss(
+    config: DeepMappingConfig, phase: PhaseConfig, params: Any, data: TrainingScans, step: Array, key: jax.Array
+) -> tuple[Float[Array, ""], None]:
+    """Computes the mean error of L-Net's poses for scans that are drawn, turned and partly masked."""
+    row_key, first_key, turn_key, share_key, drop_key = jax.random.split(key, 5)
+    num_scans, num_beams = data.scans.mask.shape
+    rows = jax.random.choice(row_key, num_scans, (_SCANS_PER_STEP,), p=data.weights)
+    beams = choose_beams(num_beams, phase, jax.random.randint(first_key, (), 0, num_beams))
+    points, mask, poses = data.scans.points[rows][:, beams], data.scans.mask[rows][:, beams], data.poses[rows]
+    limit = np.deg2rad(_MAX_TURN_DEG)
+    turn = jax.random.uniform(turn_key, rows.shape, minval=-limit, maxval=limit) - poses[:, 2]
+    hidden = jax.random.uniform(drop_key, mask.shape) < _LARGEST_DROP * jax.random.uniform(share_key, (len(rows), 1))
+    # At least one beam of a scan remains.
+    seen = jnp.where((mask & ~hidden).any(-1, keepdims=True), mask & ~hidden, mask)
+    error = localize_scans(params, turn_scans(points, turn), seen, config) - poses
+    return jnp.mean(jnp.abs(error[:, :2]).sum(-1) + jnp.abs(se2.wrap_angle(error[:, 2] - turn))), None
+
+
+def turn_scans(points: Float[Array, "m b 2"], turns: Float[Array, " m"]) -> Float[Array, "m b 2"]:
+    """Simulates scans of sensors whose headings are larger by `turns`, by turning all points back.
+
+    Args:
+        points: points in the sensor frames.
+        turns: radians.
+
+    Returns:
+        Points in the frames of the turned sensors.
+    """
+    return se2.transform_points(jnp.zeros((len(turns), 3)).at[:, 2].set(-turns), points)

@@ -29,7 +29,7 @@ from dpmjax.deepmapping.objective import (
     join_windows,
     window_rows,
 )
-from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Sensor, choose_frame, mapping_loss, phases_of
+from dpmjax.deepmapping.problem import MapFrame, MappingData, Params, Problem, choose_frame, mapping_loss, phases_of
 from dpmjax.geometry import rigid, se2
 from dpmjax.geometry.se3 import motion_matrices
 from dpmjax.nets.mapping import LocalizationNet, init_map_net
@@ -232,8 +232,8 @@ def _planar_loss(
     return mapping_loss(config, phase, params, world, chamfer_term(world, offsets, phase.chamfer_limit), key=free_key)
 
 
-# DeepMapping of planar scans; poses are (n, 3) x, y, heading.
-PLANAR = Sensor(_planar_init, _planar_loss, _planar_poses, _planar_next_phase)
+# The problem of DeepMapping of planar scans; poses are (n, 3) x, y, heading.
+PLANAR = partial(Problem, init=_planar_init, loss=_planar_loss, poses=_planar_poses, next_phase=_planar_next_phase)
 
 
 def _net(config: DeepMappingConfig) -> LocalizationNet:
@@ -257,7 +257,7 @@ def _poses(
     rows: Int[Array, " m"] | slice = _ALL,
 ) -> Float[Array, "m 4 4"]:
     """Computes the poses of these scans, by default of all (`Problem.poses`): T_start @ motion, in units of the fit."""
-    return rigid.compose(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
+    return rigid.matmul(params.start[rows], motion_matrices(_motions(config, phase, params, data.scans, rows)))
 
 
 def _depth_frame(scans: DepthScans, T: Float[Array, "n 4 4"]) -> MapFrame:
@@ -336,5 +336,5 @@ def _depth_loss(
     return mapping_loss(config, phase, params, world, pair_term, key=free_key)
 
 
-# DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
-DEPTH = Sensor(_init, _depth_loss, _poses, _next_phase)
+# The problem of DeepMapping of depth images; poses are (n, 4, 4) T_world_camera.
+DEPTH = partial(Problem, init=_init, loss=_depth_loss, poses=_poses, next_phase=_next_phase)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
 from dpmjax import metrics
 from dpmjax.deeppointmap.confidence import (
@@ -24,22 +25,23 @@ from dpmjax.deeppointmap.confidence import (
     LogisticModel,
     MatchEvidence,
     calibrated_probability,
-    fit_logistic,
+    fit_weights,
     logistic_probability,
-    lookalike_share,
 )
 from dpmjax.deeppointmap.encoding import encode
-from dpmjax.deeppointmap.evaluation_pairs import (
+from dpmjax.deeppointmap.evaluation import (
     ScanPair,
     draw_rows_apart,
+    encode_pairs,
+    head_overlap,
     read_scan_pairs,
+    register_in_stages,
     scan_distances,
     split_places,
 )
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.overlap_prediction import evidence_pairs
-from dpmjax.deeppointmap.scan_evaluation import encode_pairs, head_overlap, register_in_stages
-from dpmjax.deeppointmap.scan_registration import register_clouds
+from dpmjax.deeppointmap.registration import register_clouds
 from dpmjax.deeppointmap.training.overlap_stage import draw_overlap_pairs, overlap_labels, why_no_overlap
 from dpmjax.deeppointmap.training.sampling import ScanTable
 from dpmjax.sequences import LidarSequence
@@ -113,7 +115,7 @@ def measure_pair(model: Model, pair: ScanPair) -> Row:
         pair: the pair.
 
     Returns:
-        The evidence of each kind, `is_right` and `is_right_of_clouds`, the leads over places that look alike, None
+        The evidence of each kind, `is_right` and `is_right_of_clouds`, the leads over places that look alike, infinite
         where none does, and the true distance, metres.
     """
     num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points)
@@ -133,9 +135,7 @@ def measure_pair(model: Model, pair: ScanPair) -> Row:
         features = getattr(evidence, kind)
         values = [None] * len(names) if features is None else np.asarray(features).tolist()
         row |= {column_of(kind, name): value for name, value in zip(names, values, strict=True)}
-        if kind in HAVE_LOOKALIKES:
-            gap = float(evidence.lookalike_gap)
-            row[f"lookalike_gap_{kind}"] = gap if np.isfinite(gap) else None
+        row[f"lookalike_gap_{kind}"] = float(evidence.lookalike_gap) if kind in HAVE_LOOKALIKES else np.inf
     return row
 
 
@@ -180,14 +180,11 @@ def measure_overlap(
     rng = np.random.default_rng([OVERLAP_STREAM, seed])
     pairs = draw_overlap_pairs(table, num_pairs, rng, anchors=allowed)
     sides = encode_pairs(model, drives, pairs, rng=rng)
-    columns = dict(zip(OVERLAP_FEATURES, np.asarray(evidence_pairs(model, *sides), float).T, strict=True))
-    if (by_head := head_overlap(model, sides)) is not None:
-        columns["head"] = by_head
-    columns["is_overlap"] = overlap_labels(table, pairs)
-    return [
-        dict(zip(columns, values, strict=True))
-        for values in zip(*(column.tolist() for column in columns.values()), strict=True)
-    ]
+    by_head = head_overlap(model, sides)
+    names = (*OVERLAP_FEATURES, "is_overlap", *(() if by_head is None else ("head",)))
+    evidence = np.asarray(evidence_pairs(model, *sides), float).T.tolist()
+    columns = *evidence, overlap_labels(table, pairs).tolist(), *(() if by_head is None else (by_head.tolist(),))
+    return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
 class MeasuredDrives(NamedTuple):
@@ -228,22 +225,19 @@ def measure_drives(
     drives = [drive.take(slice(None, None, -(-len(drive) // MAX_SCANS))) for drive in drives]
     splits = [split_places(drive) for drive in drives]
     of_training = [drive.take(split.training) for drive, split in zip(drives, splits, strict=True)]
+    held_out = [split.held_out for split in splits]
 
-    def numbers(num_pairs: int) -> int:
-        return max(2, -(-num_pairs // (len(drives) * len(DRIVE_BANDS_M))))
-
-    def measure(parts: Sequence[LidarSequence], num: int, anchors: Sequence[Any]) -> list[Row]:
-        rows = []
+    def measure(parts: Sequence[LidarSequence], num_pairs: int, anchors: Sequence[Any]) -> list[Row]:
+        num, rows = max(2, -(-num_pairs // (len(drives) * len(DRIVE_BANDS_M)))), []
         for place, (drive, anchor) in enumerate(zip(parts, anchors, strict=True)):
             for pair in draw_calibration_pairs(drive, DRIVE_BANDS_M, num, seed, anchors=anchor):
                 on_pair()
                 rows.append({"place": place, **measure_pair(model, pair)})
         return rows
 
-    held_out = [split.held_out for split in splits]
     return MeasuredDrives(
-        measure(of_training, numbers(NUM_CONFIDENCE_PAIRS), [None] * len(drives)),
-        measure(drives, numbers(NUM_TESTED_CONFIDENCE_PAIRS), held_out),
+        measure(of_training, NUM_CONFIDENCE_PAIRS, [None] * len(drives)),
+        measure(drives, NUM_TESTED_CONFIDENCE_PAIRS, held_out),
         measure_overlap(model, of_training, NUM_OVERLAP_PAIRS, seed),
         measure_overlap(model, drives, NUM_TESTED_OVERLAP_PAIRS, seed + 1, anchors=held_out),
     )
@@ -313,18 +307,15 @@ def _examples(rows: Sequence[Row], kind: str) -> Examples:
         and (kind != "of_scans" or features_of(row, "of_weak_scans") is None)
         and (kind == "of_elements" or not row.get("is_end"))
     ]
-    features = np.array([features_of(row, kind) for row in chosen], float).reshape(-1, len(KINDS[kind]))
-    gaps = np.array([lookalike_gap(row, kind) for row in chosen], float)
     label = "is_right_of_clouds" if kind in OF_CLOUDS else "is_right"
-    is_right = np.array([row[label] for row in chosen], bool)
-    place = np.array([row["place"] for row in chosen], int)
-    return Examples(place, features, is_right, np.asarray(lookalike_share(gaps)))
+    return _gathered(chosen, [column_of(kind, name) for name in KINDS[kind]], label, f"lookalike_gap_{kind}")
 
 
-def lookalike_gap(row: Row, kind: str) -> float:
-    """Returns the lead of a pair over other places that look alike, infinite where none does."""
-    gap = row.get(f"lookalike_gap_{kind}")
-    return np.inf if gap is None else gap
+def _gathered(rows: Sequence[Row], columns: Sequence[str], label: str, lookalike_gap: str = "") -> Examples:
+    features = np.array([[row[name] for name in columns] for row in rows], float).reshape(-1, len(columns))
+    place, is_right = (np.array([row.get(name, 0) for row in rows]) for name in ("place", label))
+    gaps = np.array([row.get(lookalike_gap, np.inf) for row in rows], float)
+    return Examples(place, features, is_right.astype(bool), expit(gaps))
 
 
 def rate_pair(calibration: Calibration, row: Row, *, of_clouds: bool) -> float:
@@ -333,7 +324,7 @@ def rate_pair(calibration: Calibration, row: Row, *, of_clouds: bool) -> float:
     features = {kind: features_of(row, kind) for kind in kinds}
     known = {kind: np.asarray(values) for kind, values in features.items() if values is not None}
     evidence = MatchEvidence(np.asarray(features_of(row, "of_clouds")), None)
-    evidence = evidence._replace(**known, lookalike_gap=lookalike_gap(row, kinds[0]))
+    evidence = evidence._replace(**known, lookalike_gap=row.get(f"lookalike_gap_{kinds[0]}", np.inf))
     return float(calibrated_probability(calibration, evidence))
 
 
@@ -348,8 +339,8 @@ def fit_overlap(rows: Sequence[Row], tested: Sequence[Row] | None = None) -> tup
         The regression; the AUC and the Brier score of it, and of the head where that was measured; and the probability
         and the label of the tested pairs.
     """
-    examples = _matches(rows)
-    fitted, found = fit_held_out(OVERLAP_FEATURES, examples, None if tested is None else _matches(tested))
+    others = None if tested is None else _gathered(tested, OVERLAP_FEATURES, "is_overlap")
+    fitted, found = fit_held_out(OVERLAP_FEATURES, _gathered(rows, OVERLAP_FEATURES, "is_overlap"), others)
     numbers: Row = {"num_overlap_pairs": len(rows), "num_tested_overlap_pairs": len(found[1])}
     probabilities = {"overlap": found[0]}
     if tested and "head" in tested[0]:
@@ -359,12 +350,6 @@ def fit_overlap(rows: Sequence[Row], tested: Sequence[Row] | None = None) -> tup
         numbers[f"brier_{name}"] = metrics.brier_score(probability, found[1])
         numbers["brier_of_a_constant_overlap"] = float(found[1].var())
     return fitted, numbers, found
-
-
-def _matches(rows: Sequence[Row]) -> Examples:
-    features = np.array([[row[name] for name in OVERLAP_FEATURES] for row in rows], float)
-    places, is_overlap = (np.array([row.get(name, 0) for row in rows]) for name in ("place", "is_overlap"))
-    return Examples(places, features.reshape(-1, len(OVERLAP_FEATURES)), is_overlap.astype(bool), np.ones(len(rows)))
 
 
 def fit_held_out(
@@ -380,13 +365,16 @@ def fit_held_out(
     Returns:
         The regression, and the probabilities and the labels of the tested examples.
     """
-    place, features, labels, shares = examples
-    fitted = fit_logistic(names, features, labels, shares)
+    place, *of_examples = examples
+
+    def fit(rows: Bool[np.ndarray, " n"] | slice) -> LogisticModel:
+        return LogisticModel(names, *fit_weights(*(values[rows] for values in of_examples)))
+
+    fitted = fit(slice(None))
     if tested is not None:
         return fitted, (tested.shares * logistic_probability(fitted, tested.features), tested.is_right)
     found = np.empty(len(place))
     for one in np.unique(place):
         part = place == one
-        without = fit_logistic(names, features[~part], labels[~part], shares[~part])
-        found[part] = shares[part] * logistic_probability(without, features[part])
-    return fitted, (found, labels)
+        found[part] = examples.shares[part] * logistic_probability(fit(~part), examples.features[part])
+    return fitted, (found, examples.is_right)

@@ -207,31 +207,15 @@ def calibrated_probability(calibration: Calibration, evidence: MatchEvidence) ->
     Returns:
         In [0, 1].
     """
-    if evidence.of_weak_scans is not None and calibration.of_weak_scans is not None:
-        probability = logistic_probability(calibration.of_weak_scans, evidence.of_weak_scans)
-        is_clear = evidence.of_weak_scans[WEAK_FEATURES.index("facing_gap_root")] >= math.sqrt(CLEAR_FACING_GAP)
+    kinds = ("of_weak_scans", "of_scans", "of_elements", "of_clouds")
+    fitting = (one for one in kinds if getattr(evidence, one) is not None and getattr(calibration, one) is not None)
+    kind = next(fitting)
+    probability = logistic_probability(getattr(calibration, kind), getattr(evidence, kind))
+    if kind == "of_weak_scans":
+        is_clear = getattr(evidence, kind)[WEAK_FEATURES.index("facing_gap_root")] >= math.sqrt(CLEAR_FACING_GAP)
         return float(probability if is_clear else np.minimum(probability, CORRIDOR_CONFIDENCE))
-    if evidence.of_scans is not None:
-        probability = logistic_probability(calibration.of_scans, evidence.of_scans)
-    elif evidence.of_elements is not None and calibration.of_elements is not None:
-        probability = logistic_probability(calibration.of_elements, evidence.of_elements)
-    else:
-        probability = logistic_probability(calibration.of_clouds, evidence.of_clouds)
-    return float(lookalike_share(evidence.lookalike_gap) * probability)
-
-
-def lookalike_share(lookalike_gap: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """Computes the share of the probability that a place keeps beside the best other one that looks alike.
-
-    One of two places under which the scans agree is right; the odds are those of their scores.
-
-    Args:
-        lookalike_gap: lead in log odds over the best other place.
-
-    Returns:
-        In [0, 1]; 1 for an infinite lead.
-    """
-    return np.asarray(expit(lookalike_gap))
+    # One of two places under which the scans agree is right; the odds are those of their scores.
+    return float(expit(evidence.lookalike_gap) * probability)
 
 
 def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f"]) -> Float[np.ndarray, "*n"]:
@@ -247,44 +231,22 @@ def logistic_probability(model: LogisticModel, features: Float[np.ndarray, "*n f
     return np.asarray(expit(np.asarray(features, np.float64) @ np.asarray(model.weights) + model.bias))
 
 
-def fit_logistic(
-    names: tuple[str, ...],
-    features: Float[np.ndarray, "n f"],
-    is_right: Bool[np.ndarray, " n"],
-    shares: Float[np.ndarray, " n"] | float = 1.0,
-) -> LogisticModel:
-    """Fits a logistic model by maximum likelihood, with a small ridge on standardised weights.
-
-    Args:
-        names: names of the features.
-        features: features of held-out registrations.
-        is_right: True for right registrations.
-        shares: factors of the probability, in (0, 1], as of places that look alike in `calibrated_probability`.
-
-    Returns:
-        The model; its probability times the share is the fitted probability.
-
-    Raises:
-        ValueError: if all are right, or none.
-    """
-    weights, bias = fit_weights(features, is_right, shares)
-    return LogisticModel(names, tuple(map(float, weights)), bias)
-
-
 def fit_weights(
     features: Float[np.ndarray, "n f"],
     is_right: Bool[np.ndarray, " n"],
     shares: Float[np.ndarray, " n"] | float = 1.0,
-) -> tuple[Float[np.ndarray, " f"], float]:
-    """Fits the weights and the constant of a logistic model; see `fit_logistic`.
+) -> tuple[tuple[float, ...], float]:
+    """Fits the weights and the constant of a logistic model by maximum likelihood.
+
+    A small ridge on the standardised weights keeps them finite.
 
     Args:
-        features: features of examples.
-        is_right: True for right examples.
-        shares: factors of the probability.
+        features: features of held-out registrations.
+        is_right: True for right ones.
+        shares: factors of the probability, in (0, 1], as of places that look alike in `calibrated_probability`.
 
     Returns:
-        Weights and constant.
+        Weights and constant; the probability of the model times the share is the fitted probability.
 
     Raises:
         ValueError: if all are right, or none.
@@ -307,7 +269,7 @@ def fit_weights(
 
     found = minimize(loss, np.zeros(standard.shape[1]), jac=True, method="L-BFGS-B").x
     weights = found[:-1] / scale
-    return weights, float(found[-1] - weights @ mean)
+    return tuple(weights.tolist()), float(found[-1] - weights @ mean)
 
 
 def with_confidence(match: Registration, evidence: MatchEvidence, calibration: Calibration | None) -> Registration:

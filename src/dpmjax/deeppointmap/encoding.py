@@ -1,44 +1,53 @@
-"""Encoding: raw scans to their descriptors; many in chunks of one size, so that one program is compiled."""
+"""Encoding: raw scans to their descriptors, and to scans that are ready for registrations.
+
+Many scans are encoded in chunks of one size, so that one program is compiled.
+"""
 
 from __future__ import annotations
 
 import functools
 import itertools
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.checks import as_host_points, require_positive, require_some, require_type, runs_on_host
+from dpmjax.checks import as_host_points, require_type, require_value, runs_on_host
 from dpmjax.deeppointmap.model import Model, encode_pyramid
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry.pyramid import build_pyramid_on_host
 from dpmjax.geometry.shells import without_shell
 from dpmjax.kept_programs import kept_jit
 from dpmjax.reading import read_path
+from dpmjax.scans.lidar import Scan, measure_scan
 from dpmjax.scans.preprocess import preprocess_scan_on_host
 from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, RawScan
 
-# Number of scans, or of pairs, in one call of a compiled program.
+# Number of scans in one call of a compiled program.
 CHUNK = 4
+
+# Number of threads that measure and verify scans while JAX encodes and matches others.
+NUM_THREADS = 2
+
+# A raw scan, a prepared scan, or descriptors of a scan or of a map.
+ScanOrCloud = DescriptorCloud | Scan | RawScan
 
 
 @runs_on_host("call encode_pyramid on geometry.build_pyramid there")
-def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: int | None = None) -> DescriptorCloud:
+def encode(model: Model, points: RawScan, *, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes a raw scan to descriptors, preprocessing included (DeepPointMap section 3.1).
 
-    Raises a `ValueError` if the points are no real numbers (n, 3), if the scale is not positive, or if `num_elements`
-    is out of range. Warns if hardly any point is in range: the points are then probably not in metres.
+    Raises a `ValueError` if the points are no real numbers (n, 3), or if `num_elements` is out of range. Warns if
+    hardly any point is in range: the points are then probably not in metres.
 
     Args:
         model: its configuration includes the preprocessing.
         points: (n, 3), metres, in the frame of the lidar, or their file; points that are not finite are dropped.
-        scale: factor by which the points are enlarged first, for rooms. All scans that are compared
-            or merged must share it; positions, and poses for `merge_clouds`, are then in metres times this factor.
         num_elements: number of surface elements, from that of the descriptors to that of the points of the first stage
             of `model.config.pyramid`. Elements beyond the descriptors have no features, and make `register` of two
             clouds more exact. None for the descriptors alone, which are surface elements too.
@@ -48,14 +57,11 @@ def encode(model: Model, points: RawScan, *, scale: float = 1.0, num_elements: i
         farthest points. The mask of an empty scan is all False.
     """
     require_type("model", model, Model, "load_model")
-    pyramid = pyramid_of_scan(points, model.config, scale=scale)
-    return encode_pyramid(model, pyramid, num_elements=num_elements)
+    return encode_pyramid(model, pyramid_of_scan(points, model.config), num_elements=num_elements)
 
 
 @runs_on_host("call encode_pyramid on geometry.build_pyramid there")
-def encode_scans(
-    model: Model, scans: Sequence[RawScan] | Path, *, scale: float = 1.0, num_elements: int | None = None
-) -> DescriptorCloud:
+def encode_scans(model: Model, scans: Sequence[RawScan] | Path, *, num_elements: int | None = None) -> DescriptorCloud:
     """Encodes many raw scans; they may have different numbers of points.
 
     Raises a `ValueError` if there is no scan, or if points are no real numbers (n, 3).
@@ -63,7 +69,6 @@ def encode_scans(
     Args:
         model: encoder and configuration.
         scans: points in metres, each in the frame of its lidar, or their files; or a folder of scans.
-        scale: see `encode`.
         num_elements: see `encode`.
 
     Returns:
@@ -71,9 +76,55 @@ def encode_scans(
     """
     require_type("model", model, Model, "load_model")
     drive: Sequence[RawScan] = read_path(scans, "io.open_lidar_sequence")
-    require_some("scans", drive)
-    pyramids = (pyramid_of_scan(points, model.config, scale=scale) for points in drive)
+    require_value(len(drive) > 0, "scans", "at least one", "none")
+    pyramids = (pyramid_of_scan(points, model.config) for points in drive)
     return jax.tree.map(jnp.asarray, encode_pyramids(model, pyramids, num_elements=num_elements))
+
+
+def descriptors_of(scan: DescriptorCloud | Scan) -> DescriptorCloud:
+    """Returns the descriptors of a prepared scan, or the cloud itself; a `ValueError` refuses a scan without any."""
+    cloud = scan.descriptors if isinstance(scan, Scan) else scan
+    if cloud is None:
+        raise ValueError("scan: expected descriptors, got a scan that is not encoded; call prepare_scan")
+    return cloud
+
+
+def prepare_scan(model: Model, points: RawScan) -> Scan:
+    """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
+
+    Raises a `ValueError` if the points are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        points: (n, 3), metres, in the frame of the lidar, or their file; points that are not finite are dropped.
+
+    Returns:
+        Descriptors, surface and free space.
+    """
+    return prepare_scans(model, [points])[0]
+
+
+def prepare_scans(model: Model, scans: Iterable[RawScan]) -> list[Scan]:
+    """Prepares scans in their order; threads measure their surfaces while JAX encodes.
+
+    Raises a `ValueError` if the points of a scan are no real numbers (n, 3).
+
+    Args:
+        model: encoder and configuration.
+        scans: points in metres, each in the frame of its lidar.
+
+    Returns:
+        The prepared scans.
+    """
+    # Threads run NumPy only: compiled programs need threads of JAX, and several may wait for each other.
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        clouds, measured = [], []
+        for scan in scans:
+            points = cast(RawScan, read_path(scan, "io.read_lidar_file"))
+            pyramid = pyramid_of_scan(points, model.config)
+            measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification.surface))
+            clouds.append(encode_pyramid(model, pyramid))
+        return [future.result()._replace(descriptors=cloud) for cloud, future in zip(clouds, measured, strict=True)]
 
 
 def encode_pyramids(
@@ -91,9 +142,11 @@ def encode_pyramids(
     """
     parts, num, remaining = [], 0, iter(pyramids)
     while some := list(itertools.islice(remaining, CHUNK)):
-        parts.append(_encode_chunk(model, stack_chunk(some), num_elements=num_elements))
         num += len(some)
-    return join_chunks(parts, num)
+        filled = some + some[-1:] * (CHUNK - len(some))
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
+        parts.append(jax.device_get(_encode_chunk(model, stacked, num_elements=num_elements)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *parts)
 
 
 def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
@@ -103,44 +156,38 @@ def valid_points(points: RawScan) -> Float[np.ndarray, "n 3"]:
     return as_host_points("points", points)
 
 
-def pyramid_of_scan(points: RawScan, config: ModelConfig, *, scale: float = 1.0) -> PointPyramid:
+def pyramid_of_scan(points: RawScan, config: ModelConfig) -> PointPyramid:
     """Computes the first half of `encode` on the host: preprocessing, normalisation and the point pyramid.
 
-    Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
+    Raises a `ValueError` if the points are no real numbers (n, 3).
 
     Args:
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
         config: preprocessing, pyramid, and scale of its coordinates.
-        scale: factor by which the points are enlarged first.
 
     Returns:
         The pyramid, in normalised coordinates.
     """
-    return pyramid_of_cloud(thin_scan(points, config, scale=scale), config)
+    return pyramid_of_cloud(thin_scan(points, config), config)
 
 
-def thin_scan(points: RawScan, config: ModelConfig, *, scale: float = 1.0) -> PointCloud:
+def thin_scan(points: RawScan, config: ModelConfig) -> PointCloud:
     """Preprocesses a raw scan for the encoder, on the host.
 
     Args:
         points: (n, 3), metres, in the frame of the lidar; points that are not finite are dropped.
         config: preprocessing.
-        scale: factor by which the points are enlarged first.
 
     Returns:
-        The remaining points, metres times the scale; arrays of NumPy.
+        The remaining points, metres; arrays of NumPy.
 
     Raises:
-        ValueError: if the points are no real numbers (n, 3), or if the scale is not positive.
+        ValueError: if the points are no real numbers (n, 3).
     """
-    require_positive("scale", scale)
-    array, mask = (points.points, points.mask) if isinstance(points, PointCloud) else (points, None)
-    array = as_host_points("points", array)
-    if mask is None:
-        array = without_shell(array)
-    if scale != 1:
-        array = array * np.float32(scale)
-    return preprocess_scan_on_host(array, None if mask is None else np.asarray(mask), config.preprocess)
+    if isinstance(points, PointCloud):
+        array = as_host_points("points", points.points)
+        return preprocess_scan_on_host(array, np.asarray(points.mask), config.preprocess)
+    return preprocess_scan_on_host(without_shell(as_host_points("points", points)), None, config.preprocess)
 
 
 def pyramid_of_cloud(cloud: PointCloud, config: ModelConfig, *, num_threads: int = 2) -> PointPyramid:
@@ -161,17 +208,6 @@ def pyramid_of_cloud(cloud: PointCloud, config: ModelConfig, *, num_threads: int
 @kept_jit("num_elements")
 def _encode_chunk(model: Model, pyramids: Any, *, num_elements: int | None) -> DescriptorCloud:
     return jax.lax.map(functools.partial(encode_pyramid, model, num_elements=num_elements), pyramids)
-
-
-def stack_chunk(items: list[Any]) -> Any:
-    """Stacks up to `CHUNK` trees of arrays; the last is repeated to fill the chunk."""
-    filled = items + [items[-1]] * (CHUNK - len(items))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
-
-
-def join_chunks(parts: Sequence[Any], num: int) -> Any:
-    """Joins the results of chunks as arrays of NumPy: there, another number of parts compiles nothing."""
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:num], *jax.device_get(parts))
 
 
 def pooled_vector(cloud: DescriptorCloud) -> Float[np.ndarray, " d"]:

@@ -183,35 +183,6 @@ def correlate(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> tuple[Des
 
 
 @jax.jit
-def overlap_logit(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
-    """Predicts the logit of the overlap probability.
-
-    Args:
-        model: encoder and decoder.
-        a: a correlated cloud.
-        b: the second correlated cloud.
-
-    Returns:
-        The logit.
-    """
-    return decode(model, a, b, part="overlap_logit")
-
-
-@jax.jit
-def similarity_features(model: Model, correlated: DescriptorCloud) -> Float[Array, "m c"]:
-    """Computes features whose cosine is the similarity of two descriptors.
-
-    Args:
-        model: encoder and decoder.
-        correlated: a correlated cloud.
-
-    Returns:
-        One row for each descriptor.
-    """
-    return decode(model, correlated.features, part="similarity_head")
-
-
-@jax.jit
 def descriptor_similarity(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, "m n"]:
     """Computes the similarity of all pairs of descriptors (DeepPointMap section 3.2).
 
@@ -223,7 +194,7 @@ def descriptor_similarity(model: Model, a: DescriptorCloud, b: DescriptorCloud) 
     Returns:
         Cosines in [-1, 1]; 0 for a descriptor whose features are 0.
     """
-    first, second = (unit_rows(similarity_features(model, cloud)) for cloud in (a, b))
+    first, second = (unit_rows(decode(model, cloud.features, part="similarity_head")) for cloud in (a, b))
     return jnp.matmul(first, second.T, precision=lax.Precision.HIGHEST)
 
 

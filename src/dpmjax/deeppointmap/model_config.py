@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from dpmjax.checks import require_one_of, require_positive, require_value
@@ -12,7 +12,6 @@ from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry.consensus import ConsensusConfig
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.nets.decoder import DecoderConfig
-from dpmjax.nets.layers import ComputeDtype
 from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans.preprocess import PreprocessConfig
 
@@ -61,18 +60,6 @@ class ModelConfig:
     def num_descriptors(self) -> int:
         """Number of descriptors of a scan."""
         return self.pyramid.stages[-1 - self.pyramid.num_interpolations].num_points
-
-    def with_compute_dtype(self, compute_dtype: ComputeDtype) -> ModelConfig:
-        """Changes the type of the matrix products; geometry stays in float32.
-
-        Args:
-            compute_dtype: "float32" or "bfloat16".
-
-        Returns:
-            A new configuration.
-        """
-        encoder = replace(self.encoder, compute_dtype=compute_dtype)
-        return replace(self, encoder=encoder, decoder=replace(self.decoder, compute_dtype=compute_dtype))
 
 
 def model_preset(name: str) -> ModelConfig:

@@ -8,8 +8,9 @@ surface elements that face the axis decide.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import count, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -66,6 +67,9 @@ FACING_VISIBLE = 0.2
 
 HYPOTHESES_AT_ONCE = 4
 
+# Rows of motions that no descriptors support.
+UNSUPPORTED = repeat(None)
+
 # Motions that differ by less end in the same place.
 DISTINCT_M, DISTINCT_RAD = 2.0, math.radians(5.0)
 
@@ -106,14 +110,13 @@ def choose_motion(source: Scan, target: Scan, T_target_source: Poses, config: Ve
     """
     pair, hypotheses = _Pair(source, target, config), np.asarray(T_target_source, float)
     tried, lookalikes = list[VerifiedMotion](), list[VerifiedMotion]()
-    for some in pair.candidates(hypotheses):
-        tried += pair.aligned(some, COARSE)
-        tried.sort(key=_badness)
+    for rows, T in pair.candidates(hypotheses):
+        tried = _best_first([*tried, *pair.aligned(rows, T, COARSE)])
         if tried[0].verification.score > CLEAR_SCORE:
             lookalikes = pair.lookalikes(tried[0].T_target_source)
             break
-    finalists, remaining = pair.aligned(tried[:NUM_FINE], FINE), tried[NUM_FINE:]
-    lookalikes = pair.aligned(lookalikes[:NUM_FINE], FINE)
+    finalists, remaining = pair.refined(tried[:NUM_FINE]), tried[NUM_FINE:]
+    lookalikes = pair.refined(lookalikes[:NUM_FINE])
     axes = wall_axis(source.surface), wall_axis(target.surface)
     num_slid = 0
     if is_weak := weak_share(*axes) < config.max_weak_share:
@@ -121,7 +124,7 @@ def choose_motion(source: Scan, target: Scan, T_target_source: Poses, config: Ve
         num_slid = len(starts)
         slid = align_on_host(source.surface, target.surface, starts, COARSE).T_target_source
         order = np.argsort(-pair.facing_elements(axes, slid), kind="stable")
-        finalists += pair.aligned([_Candidate(None, T) for T in slid[order[:NUM_SLID_FINE]]], FINE)
+        finalists += pair.aligned(UNSUPPORTED, slid[order[:NUM_SLID_FINE]], FINE)
     motions = [*lookalikes, *finalists, *remaining]
     T = np.stack([motion.T_target_source for motion in motions])
     scores = np.array([motion.verification.score for motion in motions])
@@ -140,13 +143,8 @@ def choose_motion(source: Scan, target: Scan, T_target_source: Poses, config: Ve
     return chosen._replace(verification=found._replace(facing_gap=facing_gap, lookalike_gap=lookalike_gap))
 
 
-def _badness(motion: VerifiedMotion) -> float:
-    return -motion.verification.score
-
-
-class _Candidate(NamedTuple):
-    row: int | None
-    T_target_source: Pose
+def _best_first(motions: list[VerifiedMotion]) -> list[VerifiedMotion]:
+    return sorted(motions, key=lambda motion: -motion.verification.score)
 
 
 class _Pair(NamedTuple):
@@ -155,18 +153,16 @@ class _Pair(NamedTuple):
     target: Scan
     config: VerificationConfig
 
-    def candidates(self, T_target_source: Poses) -> Iterator[list[_Candidate]]:
+    def candidates(self, T_target_source: Poses) -> Iterator[tuple[Iterable[int | None], Poses]]:
         """Yields hypotheses in batches; from the second on, they alternate with motions of the correlated views."""
-        hypotheses = [_Candidate(row, T) for row, T in enumerate(T_target_source)]
-        yield hypotheses[:HYPOTHESES_AT_ONCE]
-        searched: list[_Candidate] = []
+        yield count(), T_target_source[:HYPOTHESES_AT_ONCE]
+        searched = T_target_source[:0]
         if self.config.views.num_motions > 0:
-            found = correlate_views(self.source.surface, self.target.surface, self.config.views)
-            searched = [_Candidate(None, T) for T in found]
-        further = hypotheses[HYPOTHESES_AT_ONCE:]
-        for start in range(0, max(len(searched), len(further)), HYPOTHESES_AT_ONCE):
-            some = slice(start, start + HYPOTHESES_AT_ONCE)
-            yield from filter(None, (searched[some], further[some]))
+            searched = correlate_views(self.source.surface, self.target.surface, self.config.views)
+        for start in range(0, max(len(searched), len(T_target_source) - HYPOTHESES_AT_ONCE), HYPOTHESES_AT_ONCE):
+            end = start + HYPOTHESES_AT_ONCE
+            yield UNSUPPORTED, searched[start:end]
+            yield count(end), T_target_source[end : end + HYPOTHESES_AT_ONCE]
 
     def lookalikes(self, T_target_source: Pose) -> list[VerifiedMotion]:
         """Returns aligned motions to other places under which the views look alike, too, the best first."""
@@ -174,20 +170,23 @@ class _Pair(NamedTuple):
             return []
         views = ViewCorrelationConfig(self.config.num_lookalikes)
         found = correlate_views(self.source.surface, self.target.surface, views, beside=T_target_source)
-        similar = self.aligned([_Candidate(None, T) for T in found], COARSE)
-        others = [one for one in similar if _is_apart(one.T_target_source[None], T_target_source)[0]]
-        return sorted(others, key=_badness)
+        similar = self.aligned(UNSUPPORTED, found, COARSE)
+        return _best_first([one for one in similar if _is_apart(one.T_target_source[None], T_target_source)[0]])
+
+    def refined(self, motions: Sequence[VerifiedMotion]) -> list[VerifiedMotion]:
+        """Aligns motions finely, and verifies them again."""
+        rows, T = [motion.row for motion in motions], [motion.T_target_source for motion in motions]
+        return self.aligned(rows, np.reshape(T, (-1, 4, 4)), FINE)
 
     def aligned(
-        self, candidates: Sequence[_Candidate | VerifiedMotion], levels: tuple[AlignmentLevel, ...]
+        self, rows: Iterable[int | None], T_target_source: Poses, levels: tuple[AlignmentLevel, ...]
     ) -> list[VerifiedMotion]:
-        """Aligns the surfaces of both scans from each candidate, and verifies the motions."""
-        if not candidates:
+        """Aligns the surfaces of both scans from each motion, and verifies the results."""
+        if len(T_target_source) == 0:
             return []
-        starts = np.stack([candidate.T_target_source for candidate in candidates])
-        T = align_on_host(self.source.surface, self.target.surface, starts, levels).T_target_source
+        T = align_on_host(self.source.surface, self.target.surface, T_target_source, levels).T_target_source
         verified = verify_motions(self.source, self.target, T, self.config)
-        return [VerifiedMotion(one.row, *rest) for one, *rest in zip(candidates, T, verified, strict=True)]
+        return list(map(VerifiedMotion, rows, T, verified))
 
     def facing_elements(self, axes: Sequence[WallAxis], T_target_source: Poses) -> Float[np.ndarray, " s"]:
         """Counts elements that face the weak axis and meet; those in free space and unmet visible ones are deducted."""

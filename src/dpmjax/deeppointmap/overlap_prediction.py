@@ -10,6 +10,7 @@ their head.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -19,21 +20,19 @@ from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import require_pairs, runs_on_host
 from dpmjax.deeppointmap.confidence import OverlapEvidence
-from dpmjax.deeppointmap.encoding import encode, encode_scans
+from dpmjax.deeppointmap.encoding import ScanOrCloud, descriptors_of, encode_scans
 from dpmjax.deeppointmap.matching import MAX_OFFSET_M, MatchConfig, best_pairs, dual_softmax
-from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, overlap_logit, predict_offsets, unit_rows
-from dpmjax.deeppointmap.prepared_scans import ScanOrCloud, descriptors_of
+from dpmjax.deeppointmap.model import Model, correlate, decode, descriptor_similarity, predict_offsets, unit_rows
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import directions_of
 from dpmjax.geometry.consensus import ConsensusConfig, find_consensus
 from dpmjax.kept_programs import kept_jit
 from dpmjax.scans.lidar import Scan
-from dpmjax.types import DescriptorCloud, RawScan
+from dpmjax.types import DescriptorCloud
 
 # Scans that are nearer to each other overlap.
 OVERLAP_M = 20.0
 
-MATCHING = MatchConfig(pair_ratio=1.0)
 # A quarter of the work of a registration: only the two best motions count.
 CONSENSUS = ConsensusConfig(num_seeds=48, num_rounds=3, num_motions=2)
 
@@ -58,33 +57,25 @@ def overlap(model: Model, source: ScanOrCloud, target: ScanOrCloud) -> Float[Arr
     places. Where overlap is rarer, the probability is too high. A model without calibration uses the trained head of
     its decoder, as published ones do (DeepPointMap section 3.2).
 
-    Raises a `ValueError` if the model has neither, or if the points are no real numbers (n, 3). It is also raised if
-    features have another width than the model, or if the scans have different scales.
+    Raises a `ValueError` if the model has neither, if the points are no real numbers (n, 3), or if features have
+    another width than the model.
 
     Args:
         model: encoder and decoder.
-        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud. Distances are in metres
-            times the scale of the scans.
+        source: a raw scan (n, 3) in metres, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; the order matters a little.
 
     Returns:
         The probability; 0 where a scan is empty or a feature is not finite.
     """
-    require_overlap(model)
-    _require_one_scale(source, target)
-    clouds = [
-        descriptors_of(scan if isinstance(scan, DescriptorCloud | Scan) else encode(model, scan))
-        for scan in (source, target)
-    ]
-    return overlap_probability(model, *(cloud.described for cloud in clouds))
+    return overlap_pairs(model, [source], [target])[0]
 
 
 @runs_on_host("call correlate there")
 def overlap_pairs(model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Float[Array, " n"]:
     """Predicts the overlap probability of many pairs as `overlap` does; each scan is encoded once.
 
-    Raises a `ValueError` if the model has neither a calibration nor a trained head. It is also raised if the lengths
-    differ or are 0, or if the scans of a pair have different scales.
+    Raises a `ValueError` if the model has neither a calibration nor a trained head, or if the lengths differ or are 0.
 
     Args:
         model: encoder and decoder.
@@ -108,7 +99,7 @@ def require_overlap(model: Model) -> None:
         ValueError: if the model has neither a fitted regression nor a trained head.
     """
     if model.config.overlap is None and "overlap" not in model.config.trained:
-        missing = "expected a regression of overlap or a trained overlap head, got neither"
+        missing = "expected a trained overlap head or a regression of overlap, got neither"
         raise ValueError(f"model: {missing}; run `dpmjax train --stages overlap --weights FILE --data ...`")
 
 
@@ -203,10 +194,8 @@ def head_probability(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> Fl
     Raises:
         ValueError: if the head is not trained, or if the features have another width than the model.
     """
-    if "overlap" not in model.config.trained:
-        command = "run `dpmjax train --stages overlap --weights FILE --data ...`"
-        raise ValueError(f"model: expected a trained overlap head, got one as it began; {command}")
-    return _probability(overlap_logit(model, *correlate(model, a, b)), a, b)
+    require_overlap(replace(model, config=replace(model.config, overlap=None)))
+    return _probability(decode(model, *correlate(model, a, b), part="overlap_logit"), a, b)
 
 
 def _probability(logit: Float[Array, ""], a: DescriptorCloud, b: DescriptorCloud) -> Float[Array, ""]:
@@ -214,30 +203,17 @@ def _probability(logit: Float[Array, ""], a: DescriptorCloud, b: DescriptorCloud
     return jnp.where(is_known, jax.nn.sigmoid(jnp.where(is_known, logit, 0)), 0)
 
 
-def _require_one_scale(source: ScanOrCloud, target: ScanOrCloud) -> None:
-    """Refuses scans of two scales; that of a descriptor cloud is unknown, that of a raw scan is 1."""
-    scans = [scan for scan in (source, target) if not isinstance(scan, DescriptorCloud)]
-    scales = {scan.scale if isinstance(scan, Scan) else 1.0 for scan in scans}
-    if len(scales) > 1:
-        raise ValueError(f"target: expected the scale of the source, got scales {min(scales):g} and {max(scales):g}")
-
-
 def _apply_to_pairs(function: Any, model: Model, sources: Sequence[ScanOrCloud], targets: Sequence[ScanOrCloud]) -> Any:
     """Applies a function of one pair to all pairs; each scan is encoded once."""
     require_pairs(sources, targets)
-    for source, target in zip(sources, targets, strict=True):
-        _require_one_scale(source, target)
-    clouds: dict[int, DescriptorCloud] = {}
-    raw: dict[int, RawScan] = {}
-    for scan in (*sources, *targets):
-        if isinstance(scan, DescriptorCloud | Scan):
-            clouds[id(scan)] = descriptors_of(scan).described
-        else:
-            raw[id(scan)] = scan
+    scans: dict[int, Any] = {id(scan): scan for scan in (*sources, *targets)}
+    raw = {key: scan for key, scan in scans.items() if not isinstance(scan, DescriptorCloud | Scan)}
     if raw:
-        encoded = jax.device_get(encode_scans(model, list(raw.values())).described)
-        clouds |= {key: jax.tree.map(lambda leaf, row=row: leaf[row], encoded) for row, key in enumerate(raw)}
-    pairs = [(clouds[id(source)], clouds[id(target)]) for source, target in zip(sources, targets, strict=True)]
+        encoded = jax.device_get(encode_scans(model, list(raw.values())))
+        scans |= {key: jax.tree.map(lambda leaf, row=row: leaf[row], encoded) for row, key in enumerate(raw)}
+    pairs = [
+        [descriptors_of(scans[id(scan)]).described for scan in pair] for pair in zip(sources, targets, strict=True)
+    ]
     # One by one: a pair takes a CPU 24 ms, and most calls of SLAM have one or two.
     results = jax.device_get([_apply_to_pair(function, model, *pair) for pair in pairs])
     return jax.tree.map(lambda *values: np.stack(values), *results)
@@ -254,7 +230,7 @@ def _best_motion(
 ) -> dict[str, Float[Array, ""]]:
     # The fields of `OverlapEvidence` that depend on the best motion.
     a, b = correlated
-    pairs = best_pairs(similarity, a.mask, b.mask, config=MATCHING)
+    pairs = best_pairs(similarity, a.mask, b.mask, config=MatchConfig(pair_ratio=1.0))
     rows, columns = pairs.source_indices, pairs.target_indices
     features_a, features_b = a.features[rows], b.features[columns]
     offsets = predict_offsets(model, features_a, features_b, directions_of(a)[rows])
@@ -269,6 +245,7 @@ def _best_motion(
     moved = rigid.transform_points(T, a.positions)
     apart = jnp.where(is_pair, jnp.sum((moved[:, None] - b.positions[None]) ** 2, axis=2), jnp.inf)
     meets = [jnp.min(apart, axis=axis) < MET_M**2 for axis in (1, 0)]
+    centre = jnp.stack([_mean(column, is_inlier) for column in points.T[:2]])
     similarity_there = jnp.take_along_axis(similarity, jnp.argmin(apart, axis=1)[:, None], axis=1)[:, 0]
     return {
         "support": support[0],
@@ -277,17 +254,12 @@ def _best_motion(
         "distance_m": jnp.minimum(jnp.linalg.norm(T[:3, 3]), MAX_DISTANCE_M),
         "met_share": (_mean(meets[0], a.mask) + _mean(meets[1], b.mask)) / 2,
         "met_similarity": _mean(similarity_there, meets[0]),
-        "spread_m": _spread(points[:, :2], is_inlier),
+        "spread_m": jnp.sqrt(_mean(jnp.sum((points[:, :2] - centre) ** 2, axis=1), is_inlier)),
     }
 
 
 def _mean(values: Array, mask: Bool[Array, " n"]) -> Float[Array, ""]:
     return jnp.sum(jnp.where(mask, values, 0)) / jnp.maximum(jnp.sum(mask), 1)
-
-
-def _spread(points: Float[Array, "n d"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    centre = jnp.stack([_mean(column, mask) for column in points.T])
-    return jnp.sqrt(_mean(jnp.sum((points - centre) ** 2, axis=1), mask))
 
 
 def _mean_direction(cloud: DescriptorCloud) -> Float[Array, " c"]:
@@ -299,11 +271,9 @@ def _quantile_of_best(
     values: Float[Array, "m n"], rows: Bool[Array, " m"], columns: Bool[Array, " n"], quantile: float
 ) -> Float[Array, ""]:
     """Returns a quantile of the row maxima and of the column maxima, the mean of both."""
-    sides = ((jnp.max(values, axis=1), rows), (jnp.max(values, axis=0), columns))
-    return (_quantile(*sides[0], quantile) + _quantile(*sides[1], quantile)) / 2
-
-
-def _quantile(values: Float[Array, " n"], mask: Bool[Array, " n"], quantile: float) -> Float[Array, ""]:
-    ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
-    place = jnp.floor(quantile * (jnp.sum(mask) - 1)).astype(int)
-    return jnp.where(jnp.any(mask), ordered[jnp.maximum(place, 0)], 0)
+    total = jnp.zeros(())
+    for axis, mask in ((1, rows), (0, columns)):
+        ordered = jnp.sort(jnp.where(mask, jnp.max(values, axis=axis), jnp.inf))
+        place = jnp.floor(quantile * (jnp.sum(mask) - 1)).astype(int)
+        total += jnp.where(jnp.any(mask), ordered[jnp.maximum(place, 0)], 0)
+    return total / 2

@@ -1,26 +1,70 @@
-"""Registration of scans and maps without a first guess, the same from either side."""
+"""Registration of scans and maps without a first guess: hypotheses from descriptors, verified by the scans.
+
+Two scans are registered the same from either side. Without a model, the scans alone suggest motions.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
+from scipy.special import expit
 
 from dpmjax.checks import require_pairs, require_type, runs_on_host
-from dpmjax.deeppointmap.matching import MatchConfig
-from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.prepared_scans import ScanOrCloud, is_verified_pair, prepare_each
-from dpmjax.deeppointmap.scan_registration import num_elements_of, register_each
+from dpmjax.deeppointmap.confidence import (
+    CORRIDOR_CONFIDENCE,
+    MAX_SCORE,
+    MatchEvidence,
+    gather_evidence,
+    with_confidence,
+)
+from dpmjax.deeppointmap.encoding import (
+    NUM_THREADS,
+    ScanOrCloud,
+    descriptors_of,
+    encode,
+    prepare_scans,
+    valid_points,
+)
+from dpmjax.deeppointmap.matching import MatchConfig, match_hypotheses
+from dpmjax.deeppointmap.model import Model, correlate, descriptor_similarity, predict_offsets
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion, verify_elements
+from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry import rigid
-from dpmjax.scans.lidar import Scan
-from dpmjax.types import DescriptorCloud, Registration
+from dpmjax.geometry.bearing import directions_of
+from dpmjax.kept_programs import kept_jit
+from dpmjax.reading import read_path
+from dpmjax.scans.align import LEVELS, align_on_host
+from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
+from dpmjax.scans.pair_registration import PairEvidence, ScanRegistration
+from dpmjax.scans.pairs import nearest_planes
+from dpmjax.scans.sizes import relative_size
+from dpmjax.scans.weak_directions import WeakDirection, plane_information, weakest_direction
+from dpmjax.types import DescriptorCloud, Pose, Poses, RawScan, Registration, Verification
 
 # Probability from which one way is enough: of 517 such motions of real pairs two were wrong.
 SURE_PROBABILITY = 0.9
+
+# Number of surface elements of a scan that is registered with a cloud.
+NUM_ELEMENTS = 1024
+
+# Fewer descriptors fit each other by chance: any two sets of three points have a motion.
+MIN_DESCRIPTORS = 20
+
+# Largest confidence of a motion between scans of another size: 4 % of a street are half a metre.
+OTHER_SIZE_CONFIDENCE = np.float32(0.8)
+
+# Fields of `Registration` that are 0 for a motion that no pairs of descriptors support.
+OF_THE_INLIERS = ("confidence", "mean_score", "support", "num_inliers", "is_inlier")
+
+# Two scans that are ready for a registration.
+ReadyPair = tuple[DescriptorCloud | Scan, DescriptorCloud | Scan]
 
 
 @runs_on_host("call correlate and weighted_svd there")
@@ -29,9 +73,7 @@ def register(
     source: ScanOrCloud,
     target: ScanOrCloud,
     *,
-    config: MatchConfig | None = None,
     refine: bool | None = None,
-    scale: float = 1.0,
 ) -> Registration:
     """Registers two scans or maps without a first guess (DeepPointMap section 3.2).
 
@@ -49,13 +91,10 @@ def register(
         model: encoder and decoder.
         source: a raw scan (n, 3) in metres or its file, a scan from `prepare_scan`, or a descriptor cloud.
         target: the same; a scan can be registered with a map.
-        config: choice of pairs and inliers; None takes that of the model.
         refine: True ends with a fine point-to-plane alignment, of two scans or else of the surface elements of both
             clouds, if they have some. False returns the motion of the short alignment that verified it for two
             scans, else that of the descriptors. None is True with a calibrated model; published weights give the
             published motion.
-        scale: factor by which raw scans are enlarged for the encoder, or by which the scans of descriptors were.
-            Prepared scans have their own. The result is in metres.
 
     Returns:
         `T_target_source`, `confidence`, `rmse` and the pairs. The confidence of a calibrated model
@@ -68,10 +107,10 @@ def register(
         With fewer than three distinct pairs, `rmse` is infinite.
 
     Raises:
-        ValueError: if the model is none, the points are no real numbers (n, 3), features have another width than the
-            model, the scale is not positive, or both have another scale.
+        ValueError: if the model is none, the points are no real numbers (n, 3), or features have another width than the
+            model.
     """
-    return _register_either_way(model, [(source, target)], config=config, refine=refine, scale=scale)[0]
+    return _register_either_way(model, [(source, target)], refine=refine)[0]
 
 
 @runs_on_host("call correlate and weighted_svd there")
@@ -80,9 +119,7 @@ def register_pairs(
     sources: Sequence[ScanOrCloud],
     targets: Sequence[ScanOrCloud],
     *,
-    config: MatchConfig | None = None,
     refine: bool | None = None,
-    scale: float = 1.0,
 ) -> Registration:
     """Registers many pairs as `register` does; a scan that is in several pairs is prepared once.
 
@@ -90,9 +127,7 @@ def register_pairs(
         model: encoder and decoder.
         sources: raw scans, prepared scans or descriptor clouds; clouds must have one capacity.
         targets: the same, one for each source.
-        config: see `register`.
         refine: see `register`.
-        scale: see `register`; all raw scans share one.
 
     Returns:
         All fields with a leading axis, in the order of the pairs.
@@ -103,38 +138,51 @@ def register_pairs(
     """
     require_pairs(sources, targets)
     pairs = list(zip(sources, targets, strict=True))
-    if len({any(isinstance(scan, DescriptorCloud) for scan in pair) for pair in pairs}) > 1:
+    if len({_are_scans(pair) for pair in pairs}) > 1:
         raise ValueError("sources, targets: expected scans in all pairs, or a descriptor cloud in each, got both")
-    found = _register_either_way(model, pairs, config=config, refine=refine, scale=scale)
+    found = _register_either_way(model, pairs, refine=refine)
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *jax.device_get(found))
 
 
 def _register_either_way(
-    model: Model,
-    pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]],
-    *,
-    refine: bool | None,
-    scale: float,
-    **options: MatchConfig | None,
+    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], *, refine: bool | None
 ) -> list[Registration]:
     """Registers each pair one way, and unsure pairs both ways. Without calibration, the given way is the only one."""
     require_type("model", model, Model, "load_model")
+    ready = _prepared(model, pairs, refine=_refines(model, refine))
     if model.config.calibration is None:
-        return register_each(model, pairs, refine=refine, scale=scale, **options)
-    settings: dict[str, Any] = {"refine": refine, "scale": scale, **options}
-    ready = prepare_each(model, pairs, scale, num_elements=num_elements_of(model, refine=refine))
-    uses = [(*pair, is_verified_pair(pair)) for pair in pairs]
-    prepared = [(ready[id(source), use], ready[id(target), use]) for source, target, use in uses]
-    is_turned = [_order(source) > _order(target) for source, target in prepared]
-    one_way = [pair[::-1] if turned else pair for pair, turned in zip(prepared, is_turned, strict=True)]
-    found = register_each(model, one_way, **settings)
+        return register_each(model, ready, refine=refine)
+    is_turned = [_order(source) > _order(target) for source, target in ready]
+    one_way = [pair[::-1] if turned else pair for pair, turned in zip(ready, is_turned, strict=True)]
+    found = register_each(model, one_way, refine=refine)
     unsure = [row for row, one in enumerate(found) if one.confidence < SURE_PROBABILITY]
-    for row, other in zip(
-        unsure, register_each(model, [one_way[row][::-1] for row in unsure], **settings), strict=True
-    ):
+    others = register_each(model, [one_way[row][::-1] for row in unsure], refine=refine)
+    for row, other in zip(unsure, others, strict=True):
         if other.confidence > found[row].confidence:
             found[row] = inverse_registration(other)
     return [inverse_registration(one) if turned else one for one, turned in zip(found, is_turned, strict=True)]
+
+
+def _prepared(model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], *, refine: bool) -> list[ReadyPair]:
+    """Prepares each raw scan once; beside clouds a scan needs its descriptors alone."""
+    raw = {id(scan): scan for pair in pairs for scan in pair if not isinstance(scan, DescriptorCloud | Scan)}
+    made: list[DescriptorCloud] | list[Scan]
+    if all(map(_are_scans, pairs)):
+        made = prepare_scans(model, raw.values())
+    else:
+        num_elements = min(NUM_ELEMENTS, model.config.pyramid.stages[0].num_points) if refine else None
+        made = [encode(model, scan, num_elements=num_elements) for scan in raw.values()]
+    ready = dict(zip(raw, made, strict=True))
+    return [cast(ReadyPair, tuple(ready.get(id(scan), scan) for scan in pair)) for pair in pairs]
+
+
+def _are_scans(pair: tuple[ScanOrCloud, ScanOrCloud]) -> bool:
+    """Returns True where both sides are scans, so that their surfaces can verify a motion."""
+    return not any(isinstance(scan, DescriptorCloud) for scan in pair)
+
+
+def _refines(model: Model, refine: bool | None) -> bool:
+    return model.config.calibration is not None if refine is None else refine
 
 
 def _order(scan: Scan | DescriptorCloud) -> tuple[int, float]:
@@ -160,3 +208,215 @@ def inverse_registration(found: Registration) -> Registration:
         direction, size = T[:3, :3] @ found.weak_direction, 1 / found.relative_size
         swapped = replace(swapped, weak_direction=direction, relative_size=size)
     return swapped
+
+
+def register_each(model: Model, pairs: Sequence[ReadyPair], *, refine: bool | None = None) -> list[Registration]:
+    """Registers pairs from source to target alone; threads verify one pair while JAX matches the next.
+
+    Args:
+        model: encoder and decoder.
+        pairs: prepared scans or descriptor clouds.
+        refine: see `register`.
+
+    Returns:
+        One registration for each pair.
+
+    Raises:
+        ValueError: see `register`.
+    """
+    refine, verification = _refines(model, refine), model.config.verification
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        started = []
+        for source, target in pairs:
+            clouds = descriptors_of(source), descriptors_of(target)
+            hypotheses = match_clouds(model, *clouds, config=model.config.matching)
+            if min(int(np.sum(cloud.described.mask)) for cloud in clouds) < MIN_DESCRIPTORS:
+                motion = pool.submit(_unregistered, source, target)
+            elif isinstance(source, Scan) and isinstance(target, Scan):
+                motion = pool.submit(_verified, source, target, hypotheses, verification, refine=refine)
+            elif refine and all(cloud.normals is not None for cloud in clouds):
+                motion = pool.submit(_refined, *clouds, hypotheses, model)
+            else:
+                motion = pool.submit(_RegisteredMotion, 0, np.asarray(hypotheses.T_target_source[0]))
+            started.append((hypotheses, motion))
+        return [_as_registration(model, hypotheses, motion.result()) for hypotheses, motion in started]
+
+
+def match_clouds(
+    model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig
+) -> Registration:
+    """Correlates two descriptor clouds and estimates the best distinct motions between them.
+
+    Args:
+        model: encoder and decoder.
+        source: uncorrelated descriptors.
+        target: the same.
+        config: choice of pairs, inliers and hypotheses.
+
+    Returns:
+        All hypotheses, with a leading axis, as arrays of NumPy on the host.
+    """
+    return jax.device_get(trace_match(model, source.described, target.described, config=config))
+
+
+def register_clouds(model: Model, source: DescriptorCloud, target: DescriptorCloud) -> tuple[Pose, MatchEvidence]:
+    """Registers two clouds of surface elements as `register` does, and keeps the features of the confidence.
+
+    Args:
+        model: encoder and decoder.
+        source: descriptors of a scan with surface elements.
+        target: the same of the second scan.
+
+    Returns:
+        T_target_source, and the features from which `register` computes the confidence.
+    """
+    hypotheses = match_clouds(model, source, target, config=model.config.matching)
+    motion = _refined(source, target, hypotheses, model)
+    return motion.T_target_source, gather_evidence(hypotheses, motion.row, None, motion.elements, motion.num_elements)
+
+
+def distinct_motions(hypotheses: Registration) -> Poses:
+    """Returns the motions of the hypotheses that any pair supports; at least one.
+
+    Args:
+        hypotheses: hypotheses from `match_clouds`.
+
+    Returns:
+        T_target_source in float64, best first.
+    """
+    num_motions = max(1, int((hypotheses.support > 0).sum()))
+    return np.asarray(hypotheses.T_target_source[:num_motions], np.float64)
+
+
+class _RegisteredMotion(NamedTuple):
+    """Chosen and refined motion of one pair, in metres; the confidence rests on the evidence before the refinement."""
+
+    row: int | None
+    T_target_source: Pose
+    evidence: Verification | None = None
+    verification: Verification | None = None
+    weak: WeakDirection | None = None
+    size: float = 1.0
+    elements: Verification | None = None
+    num_elements: int = 0
+
+
+def _unregistered(*scans: DescriptorCloud | Scan) -> _RegisteredMotion:
+    """Returns the identity, with all fields that a registration of two scans has."""
+    if any(isinstance(scan, DescriptorCloud) for scan in scans):
+        return _RegisteredMotion(None, np.eye(4))
+    return _RegisteredMotion(
+        None, np.eye(4), None, Verification(0.0, 0.0, 0.0, 0.0), WeakDirection(np.zeros(3), np.inf)
+    )
+
+
+def _verified(
+    source: Scan, target: Scan, hypotheses: Registration, config: VerificationConfig, *, refine: bool
+) -> _RegisteredMotion:
+    """Chooses the motion of two scans by their surfaces and free space, and refines it on request."""
+    chosen = choose_motion(source, target, distinct_motions(hypotheses), config)
+    final = refine_motion(source, target, chosen, config) if refine else chosen
+    T = final.T_target_source
+    weak = weakest_direction(source.surface, target.surface, T, config.plane_radius_m)
+    size = relative_size(source.surface, target.surface, T)
+    return _RegisteredMotion(chosen.row, T, chosen.verification, final.verification, weak, size)
+
+
+def _refined(
+    source: DescriptorCloud, target: DescriptorCloud, hypotheses: Registration, model: Model
+) -> _RegisteredMotion:
+    """Refines the best motion of two descriptor clouds by their surface elements, and compares these under it."""
+    # The elements alone cannot choose among hypotheses: in a corridor, or after a half-turn, wrong ones meet the same
+    # number of planes.
+    T_target_source, agreement = np.array(hypotheses.T_target_source[0], np.float64), None
+    num_elements = min(int(np.sum(cloud.mask)) for cloud in (source, target))
+    if hypotheses.num_inliers[0] > 0 and np.isfinite(T_target_source).all():
+        scans = measured_elements(source.elements), measured_elements(target.elements)
+        surfaces = scans[0].surface, scans[1].surface
+        T_target_source = align_on_host(*surfaces, T_target_source[None], LEVELS).T_target_source[0]
+        # A map of several scans was not seen from one place: it has no free space of its own.
+        if max(len(cloud.features) for cloud in (source, target)) <= model.config.num_descriptors:
+            agreement = verify_elements(*scans, T_target_source, model.config.verification)
+    return _RegisteredMotion(0, T_target_source, elements=agreement, num_elements=num_elements)
+
+
+def _as_registration(model: Model, hypotheses: Registration, motion: _RegisteredMotion) -> Registration:
+    """Joins the hypothesis that was chosen, its motion and its verification, and adds the confidence."""
+    row = motion.row
+    evidence = gather_evidence(hypotheses, row, motion.evidence, motion.elements, motion.num_elements)
+    match = jax.tree.map(lambda leaf: jnp.asarray(leaf[row or 0]), hypotheses)
+    if row is None:
+        none = {name: jnp.zeros_like(getattr(match, name)) for name in OF_THE_INLIERS}
+        match = replace(match, rmse=jnp.full_like(match.rmse, jnp.inf), **none)
+    T = jnp.asarray(motion.T_target_source, match.T_target_source.dtype)
+    match = replace(match, T_target_source=T, verification=motion.verification)
+    if motion.weak is not None:
+        direction, sigma_m, size = (jnp.asarray(value, T.dtype) for value in (*motion.weak, motion.size))
+        match = replace(match, weak_direction=direction, weak_sigma_m=sigma_m, relative_size=size)
+    match = with_confidence(match, evidence, model.config.calibration)
+    # A motion cannot be right if the scans are of another size.
+    is_limited = motion.size != 1 and model.config.calibration is not None
+    return replace(match, confidence=jnp.minimum(match.confidence, OTHER_SIZE_CONFIDENCE)) if is_limited else match
+
+
+@kept_jit("config")
+def trace_match(model: Model, source: DescriptorCloud, target: DescriptorCloud, *, config: MatchConfig) -> Registration:
+    """Matches two clouds as `match_clouds` does, inside a compiled program.
+
+    Args:
+        model: encoder and decoder.
+        source: uncorrelated descriptors.
+        target: the same.
+        config: choice of pairs, inliers and hypotheses.
+
+    Returns:
+        All hypotheses, with a leading axis.
+    """
+    source, target = correlate(model, source, target)
+    similarity = descriptor_similarity(model, source, target)
+
+    def offsets(source_rows: Array, target_rows: Array) -> tuple[Array, Array]:
+        a, b = source.features[source_rows], target.features[target_rows]
+        of_source, of_target = directions_of(source)[source_rows], directions_of(target)[target_rows]
+        return predict_offsets(model, a, b, of_source), predict_offsets(model, b, a, of_target)
+
+    return match_hypotheses(source, target, similarity, offsets, config=config)
+
+
+@runs_on_host("call icp there")
+def register_surfaces(source: RawScan, target: RawScan) -> ScanRegistration:
+    """Registers two lidar scans without a first guess and without a model, as `register` does without descriptors.
+
+    Args:
+        source: (n, 3) points in metres, in the frame of the lidar, z up, or their file; points that are not finite are
+            dropped.
+        target: the same.
+
+    Returns:
+        The motion, and the probability that it is right within 2 m and 5 degrees, by the agreement of the scans.
+
+    Raises:
+        ValueError: the points are no real numbers (n, 3).
+    """
+    config = VerificationConfig()
+    given = (cast(RawScan, read_path(scan, "io.read_lidar_file")) for scan in (source, target))
+    ends = tuple(measure_scan(valid_points(points), config.surface) for points in given)
+    chosen = choose_motion(ends[0], ends[1], np.eye(4)[None], config)
+    T = refine_motion(ends[0], ends[1], chosen, config).T_target_source
+    agreement, surfaces = chosen.verification, (ends[0].surface, ends[1].surface)
+    direction, sigma = weakest_direction(*surfaces, T, config.plane_radius_m)
+    pairs = nearest_planes(*surfaces, T[None], config.plane_radius_m, config.num_samples).take(0)
+    confidence = float(expit(min(agreement.score, MAX_SCORE)) * expit(agreement.lookalike_gap))
+    return ScanRegistration(
+        T_target_source=T,
+        confidence=min(confidence, CORRIDOR_CONFIDENCE) if agreement.num_slid else confidence,
+        evidence=PairEvidence(
+            score=agreement.score,
+            lead=float(min(agreement.gap, agreement.lookalike_gap)),
+            visible=agreement.visible_share,
+            sigma=float(sigma),
+        ),
+        weak_direction=np.asarray(direction),
+        weak_sigma=float(sigma),
+        information=plane_information(pairs.take(pairs.is_paired), T),
+    )

@@ -28,9 +28,6 @@ SPARSE_SHARE = 0.5
 # Surfaces whose normals are nearer to the vertical are level.
 LEVEL_COSINE = 0.8
 
-# Number of threads that measure and verify scans while JAX encodes and matches others.
-NUM_THREADS = 2
-
 
 @dataclass(frozen=True)
 class EvidenceWeights:
@@ -174,10 +171,8 @@ def evidence_shares(
 def _both_sides(
     source: Scan, target: Scan, T_target_source: Poses, config: VerificationConfig
 ) -> tuple[ComparedScan, ComparedScan]:
-    return (
-        compare_scans(source, target, T_target_source, config),
-        compare_scans(target, source, rigid.inverse(T_target_source), config),
-    )
+    forward = compare_scans(source, target, T_target_source, config)
+    return forward, compare_scans(target, source, rigid.inverse(T_target_source), config)
 
 
 def _evidence(sides: Sequence[ComparedScan]) -> Float[np.ndarray, "s 6"]:

@@ -26,6 +26,7 @@ from dpmjax.types import AnyArray
 DEGENERATE_IN_EPS = 32
 
 
+@jax.jit
 def weighted_svd(
     source: Float[AnyArray, "n d"], target: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]
 ) -> Float[Array, "d1 d1"]:
@@ -53,14 +54,8 @@ def weighted_svd(
     target, weights = as_points("target", target), as_float("weights", weights)
     require_shape("target", target, source.shape)
     require_shape("weights", weights, source.shape[:1])
-    return _weighted_svd(source, target, weights)
-
-
-@jax.jit
-def _weighted_svd(source: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
-    motion: jax.Array = _motion(
-        source, target, usable_weights(jnp.where(is_usable(source) & is_usable(target), weights, 0))
-    )
+    weights = usable_weights(jnp.where(is_usable(source) & is_usable(target), weights, 0))
+    motion: jax.Array = _motion(source, target, weights)
     return motion
 
 

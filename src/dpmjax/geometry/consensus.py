@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_float, as_mask, as_points, require_count, require_shape
+from dpmjax.checks import as_float, as_mask, as_points, require_fields, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import motions_of_weights
 from dpmjax.geometry.traced import is_usable
@@ -51,8 +51,7 @@ class ConsensusConfig:
     num_motions: int = 24
 
     def __post_init__(self) -> None:
-        for name in ("num_seeds", "num_rounds", "num_motions"):
-            require_count(name, getattr(self, name))
+        require_fields(self, "num_seeds", "num_rounds", "num_motions", low=1)
 
 
 @flax.struct.dataclass
@@ -71,6 +70,7 @@ class Consensus:
     support: Float[Array, "*b h"]
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def find_consensus(
     source: Float[AnyArray, "k 3"],
     target: Float[AnyArray, "k 3"],
@@ -98,25 +98,21 @@ def find_consensus(
     """
     source, target = as_points("source", source, dimensions=(3,)), as_points("target", target, dimensions=(3,))
     require_shape("target", target, source.shape)
-    mask = as_mask("mask", mask, source.shape[:1])
+    is_there: Bool[Array, " k"] = as_mask("mask", mask, source.shape[:1])
     if len(source) == 0:
         num, dtype = config.num_motions, source.dtype
         motions = jnp.tile(jnp.eye(4, dtype=dtype), (num, 1, 1))
         return Consensus(motions, jnp.zeros((num, 0), bool), jnp.zeros(num, dtype))
-    return _find_consensus(*lax.stop_gradient((source, target)), mask, config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, config: ConsensusConfig) -> Consensus:
-    mask = mask & is_usable(source) & is_usable(target)
-    source, target = (as_float("points", jnp.where(mask[:, None], points, 0)) for points in (source, target))
-    agreement, worth = _second_order(source, target, mask)
+    source, target = lax.stop_gradient((source, target))
+    is_there = is_there & is_usable(source) & is_usable(target)
+    source, target = (as_float("points", jnp.where(is_there[:, None], points, 0)) for points in (source, target))
+    agreement, worth = _second_order(source, target, is_there)
     _, seeds = lax.top_k(jnp.sum(agreement, axis=1), min(config.num_seeds, len(source)))
     strength, partners = lax.top_k(agreement[seeds], min(NUM_PARTNERS, len(source)))
     rows = jnp.arange(len(seeds))
     weights = jnp.zeros((len(seeds), len(source)), source.dtype)
     weights = weights.at[rows[:, None], partners].set(strength > 0).at[rows, seeds].set(1)
-    motions = motions_of_weights(source, target, jnp.where(mask, weights, 0))
+    motions = motions_of_weights(source, target, jnp.where(is_there, weights, 0))
 
     def refit(_: Int[Array, ""], motions: Array) -> Array:
         weights = worth * _closeness(motions, source, target)
@@ -126,10 +122,10 @@ def _find_consensus(source: jax.Array, target: jax.Array, mask: jax.Array, *, co
 
     motions = lax.fori_loop(0, config.num_rounds, refit, motions)
     supports = jnp.sum(worth * _closeness(motions, source, target), axis=1)
-    chosen, supports = _distinct(motions, supports, source, mask, config)
+    chosen, supports = _distinct(motions, supports, source, is_there, config)
     motions = motions[chosen]
     closeness = _closeness(motions, source, target)
-    return Consensus(motions, mask & (closeness > 0) & (supports > 0)[:, None], supports)
+    return Consensus(motions, is_there & (closeness > 0) & (supports > 0)[:, None], supports)
 
 
 def _distinct(

@@ -52,9 +52,32 @@ def k_nearest(
     Raises:
         ValueError: the shapes do not match, or k is below 1.
     """
-    queries, points = _checked_pair(queries, points)
+    queries, points = as_points("queries", queries), as_points("points", points)
+    dim = queries.shape[1]
+    require_value(points.shape[1] == dim, "points", f"{dim} columns like queries", points.shape[1])
     require_count("k", k)
     return _k_nearest(queries, points, as_mask("mask", mask, points.shape[:1]), k=k)
+
+
+@functools.partial(jax.jit, static_argnames="k")
+def _k_nearest(queries: jax.Array, points: jax.Array, mask: jax.Array, *, k: int) -> Neighbours:
+    if points.shape[0] == 0:
+        points, mask = jnp.zeros((1, points.shape[1]), points.dtype), jnp.zeros(1, bool)
+    mask = mask & is_usable(points)
+    num_found = min(k, points.shape[0])
+    arguments, search = (*lax.stop_gradient((queries, points)), mask), functools.partial(_search_top_k, k=num_found)
+    # A reduction over pairs does not vectorise on a CPU; a loop over points, all queries at once, is six times faster,
+    # and another three times where the best ones stay in registers for some points.
+    one = functools.partial(lax.platform_dependent, cpu=_loop_over_points, default=search)
+    indices, is_found = one(*arguments) if num_found == 1 else search(*arguments)
+    is_found = is_found & is_usable(queries)[:, None]
+    indices = jnp.where(is_found, indices, 0)
+    # Distances once more, from the few points that were found: so their gradient costs (m, k) and not (m, n).
+    difference = jnp.where(is_found[..., None], queries[:, None] - points[indices], 0)
+    squared = jnp.where(is_found, jnp.sum(difference**2, axis=-1), jnp.inf)
+    padding = ((0, 0), (0, k - num_found))
+    squared = jnp.pad(squared, padding, constant_values=jnp.inf)
+    return Neighbours(jnp.pad(indices, padding), squared, jnp.pad(is_found, padding))
 
 
 def radius_search(
@@ -82,48 +105,12 @@ def radius_search(
     Raises:
         ValueError: the shapes do not match, `max_neighbours` is below 1, or `radius` is not above 0.
     """
-    queries, points = _checked_pair(queries, points)
     require_count("max_neighbours", max_neighbours)
     require_positive("radius", radius)
-    mask = as_mask("mask", mask, points.shape[:1])
-    return _radius_search(queries, points, mask, jnp.asarray(radius, queries.dtype), k=max_neighbours)
-
-
-def _checked_pair(queries: AnyArray, points: AnyArray) -> tuple[jax.Array, jax.Array]:
-    queries, points = as_points("queries", queries), as_points("points", points)
-    require_value(
-        queries.shape[1] == points.shape[1], "points", f"{queries.shape[1]} columns like queries", points.shape[1]
-    )
-    return queries, points
-
-
-@functools.partial(jax.jit, static_argnames="k")
-def _k_nearest(queries: jax.Array, points: jax.Array, mask: jax.Array, *, k: int) -> Neighbours:
-    if points.shape[0] == 0:
-        points, mask = jnp.zeros((1, points.shape[1]), points.dtype), jnp.zeros(1, bool)
-    mask = mask & is_usable(points)
-    num_found = min(k, points.shape[0])
-    arguments, search = (*lax.stop_gradient((queries, points)), mask), functools.partial(_search_top_k, k=num_found)
-    # A reduction over pairs does not vectorise on a CPU; a loop over points, all queries at once, is six times faster,
-    # and another three times where the best ones stay in registers for some points.
-    one = functools.partial(lax.platform_dependent, cpu=_loop_over_points, default=search)
-    indices, is_found = one(*arguments) if num_found == 1 else search(*arguments)
-    is_found = is_found & is_usable(queries)[:, None]
-    indices = jnp.where(is_found, indices, 0)
-    # Distances once more, from the few points that were found: so their gradient costs (m, k) and not (m, n).
-    difference = jnp.where(is_found[..., None], queries[:, None] - points[indices], 0)
-    squared = jnp.where(is_found, jnp.sum(difference**2, axis=-1), jnp.inf)
-    padding = ((0, 0), (0, k - num_found))
-    squared = jnp.pad(squared, padding, constant_values=jnp.inf)
-    return Neighbours(jnp.pad(indices, padding), squared, jnp.pad(is_found, padding))
-
-
-@functools.partial(jax.jit, static_argnames="k")
-def _radius_search(queries: jax.Array, points: jax.Array, mask: jax.Array, radius: jax.Array, *, k: int) -> Neighbours:
-    near = _k_nearest(queries, points, mask, k=k)
-    is_within = near.mask & (near.squared_distances <= radius**2)
-    squared = jnp.where(is_within, near.squared_distances, jnp.inf)
-    return Neighbours(jnp.where(is_within, near.indices, 0), squared, is_within)
+    near = k_nearest(queries, points, max_neighbours, mask)
+    squared = near.squared_distances
+    is_within = near.mask & (squared <= jnp.asarray(radius, squared.dtype) ** 2)
+    return Neighbours(jnp.where(is_within, near.indices, 0), jnp.where(is_within, squared, jnp.inf), is_within)
 
 
 def _loop_over_points(
@@ -160,16 +147,14 @@ def _search_top_k(
     return lax.map(search, queries, batch_size=chunk)
 
 
-WAIT_POLICY = "OMP_WAIT_POLICY"
-if WAIT_POLICY in os.environ:
-    import small_gicp
-else:
-    # Its threads would wait in a loop for milliseconds after each search, on cores that JAX needs by then. OpenMP reads
-    # the policy once, when the library is loaded.
-    os.environ[WAIT_POLICY] = "PASSIVE"
-    import small_gicp
+# Its threads would wait in a loop for milliseconds after each search, on cores that JAX needs by then. OpenMP reads the
+# policy once, when the library is loaded.
+_GIVEN = os.environ.get("OMP_WAIT_POLICY")
+os.environ["OMP_WAIT_POLICY"] = _GIVEN or "PASSIVE"
+import small_gicp  # noqa: E402
 
-    del os.environ[WAIT_POLICY]
+if _GIVEN is None:
+    del os.environ["OMP_WAIT_POLICY"]
 
 
 class HostTree:

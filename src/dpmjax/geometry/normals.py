@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import as_mask, as_points, require_count, require_positive, require_value
+from dpmjax.checks import as_mask, as_points, require_count, require_value
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.planes import fit_planes
 from dpmjax.geometry.traced import is_usable
@@ -60,9 +60,8 @@ def image_normals(
     return np.where(is_surface[..., None], normals / length[..., None], 0), is_surface
 
 
-def estimate_normals(
-    points: Float[AnyArray, "n d"], k: int, mask: Bool[AnyArray, " n"] | None = None, radius: float | None = None
-) -> Normals:
+@functools.partial(jax.jit, static_argnames="k")
+def estimate_normals(points: Float[AnyArray, "n d"], k: int, mask: Bool[AnyArray, " n"] | None = None) -> Normals:
     """The direction in which the k nearest points (the point itself among them) spread least.
 
     In 3-D a neighbourhood on one line has no normal of its own: it gets one that is normal to the line, flatness 0.
@@ -73,33 +72,23 @@ def estimate_normals(
         k: number of neighbours; more average more noise away and round more corners.
         mask: False for points that are not there; they may hold anything. A point with a coordinate that
             is not a number from -1e15 to 1e15 is not there either.
-        radius: neighbours farther away than this do not count; unlimited by default.
 
     Returns:
         A unit normal for each point, how flat its neighbourhood is, and where there is one.
 
     Raises:
-        ValueError: the shapes do not match, k is below d, or `radius` is not above 0.
+        ValueError: the shapes do not match, or k is below d.
     """
     points = as_points("points", points, dimensions=(2, 3))
     require_count("k", k)
     require_value(k >= points.shape[1], "k", f"at least {points.shape[1]} neighbours in {points.shape[1]}-D", k)
-    if radius is not None:
-        require_positive("radius", radius)
-    mask = as_mask("mask", mask, points.shape[:1])
-    limit = jnp.asarray(jnp.inf if radius is None else radius, points.dtype)
-    return _estimate_normals(points, mask, limit, k=k)
-
-
-@functools.partial(jax.jit, static_argnames="k")
-def _estimate_normals(points: jax.Array, mask: jax.Array, radius: jax.Array, *, k: int) -> Normals:
-    mask = mask & is_usable(points)
-    points = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
-    near = k_nearest(points, points, k, mask)
-    weights = (near.mask & (near.squared_distances <= radius**2)).astype(points.dtype)
+    is_there: Bool[Array, " n"] = as_mask("mask", mask, points.shape[:1]) & is_usable(points)
+    points = jnp.where(is_there[:, None], lax.stop_gradient(points), 0)
+    near = k_nearest(points, points, k, is_there)
+    weights = near.mask.astype(points.dtype)
     covariance, spread = _covariance(points, near, weights)
     # Equal coordinates leave only rounding behind; scaled to its own size, the covariance is safe to decompose.
-    is_valid = mask & (jnp.sum(weights, axis=1) >= points.shape[1]) & (spread > 0)
+    is_valid = is_there & (jnp.sum(weights, axis=1) >= points.shape[1]) & (spread > 0)
     covariance = jnp.where(is_valid[:, None, None], covariance / jnp.where(is_valid, spread, 1)[:, None, None], 0)
     normals, flatness = _smallest_axis_2d(covariance) if points.shape[1] == 2 else _smallest_axis_3d(covariance)
     faces_away = jnp.sum(normals * points, axis=1) > 0

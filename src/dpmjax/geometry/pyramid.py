@@ -10,12 +10,13 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
+import fpsample
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dpmjax.checks import as_mask, as_points, require_count, require_positive, require_value
+from dpmjax.checks import as_mask, as_points, require_count, require_fields, require_positive, require_value
 from dpmjax.geometry.neighbours import HostTree, k_nearest
 from dpmjax.geometry.sampling import farthest_point_sample
 from dpmjax.geometry.traced import LARGEST_COORDINATE, is_usable
@@ -48,8 +49,7 @@ class PyramidStage:
     num_neighbours: int
 
     def __post_init__(self) -> None:
-        require_count("num_points", self.num_points)
-        require_count("num_neighbours", self.num_neighbours)
+        require_fields(self, "num_points", "num_neighbours", low=1)
         require_count("len(radii)", len(self.radii))
         for radius in self.radii:
             require_positive("radii", radius)
@@ -81,6 +81,7 @@ class PyramidConfig:
         require_value(is_falling, "stages", "no stage to have more points than the one before", counts)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def build_pyramid(
     points: Float[AnyArray, "n 3"], mask: Bool[AnyArray, " n"] | None, config: PyramidConfig
 ) -> PointPyramid:
@@ -102,12 +103,7 @@ def build_pyramid(
         ValueError: there are no points, or the shapes do not match.
     """
     points = as_points("points", points, dimensions=(3,))
-    return _build_pyramid(points, as_mask("mask", mask, points.shape[:1]), config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _build_pyramid(points: jax.Array, mask: jax.Array, *, config: PyramidConfig) -> PointPyramid:
-    mask = mask & is_usable(points)
+    mask = as_mask("mask", mask, points.shape[:1]) & is_usable(points)
     points = jnp.where(mask[:, None], points, 0)
     levels = [PyramidLevel(points, mask, jnp.zeros(0, jnp.int32), ())]
     num_valid = jnp.sum(mask)
@@ -244,10 +240,6 @@ def _sample_by_buckets(points: Float[np.ndarray, "n 3"], num_samples: int) -> In
         return None
     ranges = np.sqrt(np.sum(points.astype(np.float64) ** 2, axis=1))
     if ranges[0] < ranges.max() or ranges[0] == 0:
-        return None
-    try:
-        import fpsample
-    except ImportError:
         return None
     # The package counts its start in the order of its own tree, where the outermost point of the negative side comes
     # first. So a far point is put opposite to point 0 (mirrored to the positive side: distances stay), sampling starts

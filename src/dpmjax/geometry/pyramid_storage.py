@@ -7,16 +7,18 @@ rounded to 1/32,767 of the largest coordinate (2 mm at 60 m).
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from dpmjax.checks import require_value
 from dpmjax.geometry import rigid
-from dpmjax.geometry.pyramid import PyramidConfig, interpolation_weights
+from dpmjax.geometry.pyramid import PyramidConfig, build_pyramid_on_host, interpolation_weights
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
 MAX_STORED_POINTS = 1 << 16
@@ -44,81 +46,79 @@ class StoredPyramid:
     interpolation: tuple[UInt[AnyArray, "*b _m 3"], ...]
 
 
+@functools.cache
+def _empty(config: PyramidConfig, capacity: int) -> StoredPyramid:
+    """Returns the stored pyramid of a scan without points: its arrays have the types and shapes of all."""
+    nothing = np.zeros((capacity, 3), np.float32)
+    return store_pyramid(build_pyramid_on_host(nothing, np.zeros(capacity, bool), config))
+
+
 def record_type(config: PyramidConfig, capacity: int) -> np.dtype:
     """Returns the type of one pyramid in a file.
 
     Args:
-        config: sizes of the pyramid.
-        capacity: rows of level 0.
+        config: stages.
+        capacity: capacity of level 0.
 
     Returns:
-        A structured type of NumPy.
+        A structured type with a field for each array of a stored pyramid.
 
     Raises:
-        ValueError: if row numbers of this many points exceed 16 bits.
+        ValueError: the capacity has no room in 16 bits.
     """
     require_value(capacity <= MAX_STORED_POINTS, "capacity", f"at most {MAX_STORED_POINTS}", capacity)
-    fields: list[Any] = [
-        ("num_points", "<i4"),
-        ("unit", "<f4"),
-        ("points", "<i2", (capacity, 3)),
-        ("samples", "<u2", (config.stages[0].num_points,)),
-    ]
-    for number, stage in enumerate(config.stages):
-        shape = (stage.num_points, stage.num_neighbours)
-        fields += [(_neighbours(number, block), "<u2", shape) for block in range(len(stage.radii))]
-    for step in range(config.num_interpolations):
-        fields.append((f"interpolation_{step}", "<u2", (config.stages[-2 - step].num_points, 3)))
-    return np.dtype(fields)
+    leaves = jax.tree_util.tree_leaves_with_path(_empty(config, capacity))
+    names = (jax.tree_util.keystr(path, simple=True, separator="_") for path, _ in leaves)
+    return np.dtype([(name, leaf.dtype, leaf.shape) for name, (_, leaf) in zip(names, leaves, strict=True)])
 
 
-def pack_pyramid(pyramid: PointPyramid, record: np.void) -> None:
-    """Writes a pyramid into a record of a file.
+def store_pyramid(pyramid: PointPyramid) -> StoredPyramid:
+    """Rounds a pyramid to small integers.
 
     Args:
-        pyramid: one scan; the valid points of level 0 stand in front.
-        record: record of `record_type`.
+        pyramid: pyramid from `build_pyramid_on_host`; the valid points of level 0 must stand in front.
+
+    Returns:
+        The stored pyramid, arrays of NumPy.
 
     Raises:
-        ValueError: if a masked point stands before a valid one.
+        ValueError: a masked point stands in front of a valid one.
     """
-    level = pyramid.levels[0]
-    mask, points = np.asarray(level.mask), np.asarray(level.positions)
+    first, *levels = pyramid.levels
+    mask, points = np.asarray(first.mask), np.asarray(first.positions)
     num_points = int(mask.sum())
     if not mask[:num_points].all():
         raise ValueError("pyramid: expected the valid points of level 0 in front, got masked ones among them")
     unit = np.abs(points[:num_points]).max(initial=np.finfo(np.float32).tiny) / LARGEST
-    record["num_points"], record["unit"] = num_points, unit
-    record["points"] = np.rint(np.where(mask[:, None], points, 0) / unit)
-    record["samples"] = pyramid.levels[1].sample_indices
-    for number, level in enumerate(pyramid.levels[1:]):
-        for block, rows in enumerate(level.neighbours):
-            record[_neighbours(number, block)] = rows
-    for step, interpolation in enumerate(pyramid.interpolation):
-        record[f"interpolation_{step}"] = interpolation.indices
+
+    def rows(values: Any) -> np.ndarray:
+        return np.asarray(values).astype(np.uint16)
+
+    return StoredPyramid(
+        num_points=np.asarray(num_points, np.int32),
+        unit=np.asarray(unit, np.float32),
+        points=np.rint(np.where(mask[:, None], points, 0) / unit).astype(np.int16),
+        samples=rows(levels[0].sample_indices),
+        neighbours=tuple(tuple(map(rows, level.neighbours)) for level in levels),
+        interpolation=tuple(rows(step.indices) for step in pyramid.interpolation),
+    )
 
 
 def stored_pyramids(records: np.ndarray, config: PyramidConfig) -> StoredPyramid:
     """Returns records of a file as one tree of arrays.
 
     Args:
-        records: (s,) of `record_type`.
-        config: sizes of the pyramids.
+        records: records of `record_type`.
+        config: stages.
 
     Returns:
-        The pyramids, stacked.
+        The arrays, with the axes of the records in front.
     """
-
-    def field(name: str) -> np.ndarray:
-        return np.ascontiguousarray(records[name])
-
-    neighbours = tuple(
-        tuple(field(_neighbours(number, block)) for block in range(len(stage.radii)))
-        for number, stage in enumerate(config.stages)
+    structure = jax.tree.structure(_empty(config, records["points"].shape[-2]))
+    stored: StoredPyramid = jax.tree.unflatten(
+        structure, [np.ascontiguousarray(records[name]) for name in records.dtype.names or ()]
     )
-    interpolation = tuple(field(f"interpolation_{step}") for step in range(config.num_interpolations))
-    num_points, unit, points, samples = map(field, ("num_points", "unit", "points", "samples"))
-    return StoredPyramid(num_points, unit, points, samples, neighbours, interpolation)
+    return stored
 
 
 def sampled_positions(
@@ -170,7 +170,3 @@ def _interpolation(fine: PyramidLevel, coarse: PyramidLevel, stored: UInt[AnyArr
     squared: Array = jnp.sum((fine.positions[:, None] - coarse.positions[indices]) ** 2, axis=-1)
     is_used = (jnp.arange(indices.shape[1]) < jnp.sum(coarse.mask)) & jnp.asarray(fine.mask)[:, None]
     return Interpolation(indices, interpolation_weights(squared, is_used))
-
-
-def _neighbours(stage: int, block: int) -> str:
-    return f"neighbours_{stage}_{block}"

@@ -68,19 +68,6 @@ def inverse(T_a_b: Any) -> Any:
     return xp.concatenate([top, T_a_b[..., dim:, :]], axis=-2)
 
 
-def compose(T_a_b: Float[AnyArray, "*#n d d"], T_b_c: Float[AnyArray, "*#n d d"]) -> Float[Array, "*n d d"]:
-    """Chains two motions, at full precision on every device.
-
-    Args:
-        T_a_b: maps b to a; leading axes broadcast.
-        T_b_c: maps c to b.
-
-    Returns:
-        `T_a_c`, T_a_b @ T_b_c.
-    """
-    return jnp.matmul(T_a_b, T_b_c, precision=jax.lax.Precision.HIGHEST)
-
-
 @jax.jit
 def exp(tangent: Float[AnyArray, "... k"]) -> Float[Array, "... d1 d1"]:
     """Makes the motion of a twist; the gradient is right at zero too.

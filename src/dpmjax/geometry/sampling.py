@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from dpmjax.geometry.traced import is_usable, with_axes_of
 from dpmjax.types import AnyArray
 
 
+@partial(jax.jit, static_argnames="num_samples")
 def farthest_point_sample(
     points: Float[AnyArray, "n d"], num_samples: int, mask: Bool[AnyArray, " n"] | None = None
 ) -> Int[Array, " s"]:
@@ -40,7 +41,28 @@ def farthest_point_sample(
     if points.shape[0] == 0:
         raise ValueError("points: expected at least one point to choose from, got none")
     require_count("num_samples", num_samples)
-    return _farthest_point_sample(points, as_mask("mask", mask, points.shape[:1]), num_samples=num_samples)
+    mask = as_mask("mask", mask, points.shape[:1])
+    num_points, dim = points.shape
+    mask = mask & is_usable(points)
+    cleared = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
+    columns = [cleared[:, axis] for axis in range(dim)]
+    rows = jnp.arange(num_points, dtype=jnp.int32)
+    first = jnp.argmax(mask).astype(jnp.int32)
+
+    # Squared distances are compared as integers: bits of floats that are not negative sort like the floats, and on a
+    # CPU only a maximum of integers uses the width of the processor (twelve times faster). -1: out of the race.
+    def choose(step: Int[Array, ""], state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        distance_bits, chosen = state
+        last = chosen[step - 1]
+        to_last = _as_bits(sum((column - column[last]) ** 2 for column in columns))
+        distance_bits = jnp.where(rows == last, -1, jnp.minimum(distance_bits, to_last))
+        largest = jnp.max(distance_bits)
+        farthest = jnp.min(jnp.where(distance_bits == largest, rows, num_points))
+        return distance_bits, chosen.at[step].set(jnp.where(largest >= 0, farthest, first))
+
+    unseen = with_axes_of(points, _as_bits(jnp.full(num_points, jnp.inf, points.dtype)))
+    chosen = with_axes_of(points, jnp.full(num_samples, first, jnp.int32))
+    return lax.fori_loop(1, num_samples, choose, (jnp.where(mask, unseen, -1), chosen))[1]
 
 
 def voxel_sample(
@@ -67,33 +89,6 @@ def voxel_sample(
     require_positive("voxel_size", voxel_size)
     mask = as_mask("mask", mask, points.shape[:1])
     return _voxel_sample(points, mask, jnp.asarray(voxel_size, points.dtype))
-
-
-@functools.partial(jax.jit, static_argnames="num_samples")
-def _farthest_point_sample(
-    points: Float[Array, "n d"], mask: Bool[Array, " n"], *, num_samples: int
-) -> Int[Array, " s"]:
-    num_points, dim = points.shape
-    mask = mask & is_usable(points)
-    cleared = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
-    columns = [cleared[:, axis] for axis in range(dim)]
-    rows = jnp.arange(num_points, dtype=jnp.int32)
-    first = jnp.argmax(mask).astype(jnp.int32)
-
-    # Squared distances are compared as integers: bits of floats that are not negative sort like the floats, and on a
-    # CPU only a maximum of integers uses the width of the processor (twelve times faster). -1: out of the race.
-    def choose(step: Int[Array, ""], state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        distance_bits, chosen = state
-        last = chosen[step - 1]
-        to_last = _as_bits(sum((column - column[last]) ** 2 for column in columns))
-        distance_bits = jnp.where(rows == last, -1, jnp.minimum(distance_bits, to_last))
-        largest = jnp.max(distance_bits)
-        farthest = jnp.min(jnp.where(distance_bits == largest, rows, num_points))
-        return distance_bits, chosen.at[step].set(jnp.where(largest >= 0, farthest, first))
-
-    unseen = with_axes_of(points, _as_bits(jnp.full(num_points, jnp.inf, points.dtype)))
-    chosen = with_axes_of(points, jnp.full(num_samples, first, jnp.int32))
-    return lax.fori_loop(1, num_samples, choose, (jnp.where(mask, unseen, -1), chosen))[1]
 
 
 def _as_bits(values: jax.Array | int) -> jax.Array:

@@ -100,6 +100,7 @@ def _unit(vectors: Float[Array, "n c"]) -> Float[Array, "n c"]:
     return jnp.where(is_zero, 0, scaled / length)
 
 
+@jax.jit
 def offset_loss(
     predicted: Float[AnyArray, "n d"], true: Float[AnyArray, "n d"], mask: Bool[AnyArray, " n"] | None = None
 ) -> Float[Array, ""]:
@@ -125,16 +126,12 @@ def offset_loss(
     """
     predicted, true = as_points("predicted", predicted), as_float("true", true)
     require_shape("true", true, predicted.shape)
-    return _offset_loss(predicted, true, as_mask("mask", mask, predicted.shape[:1]))
-
-
-@jax.jit
-def _offset_loss(predicted: jax.Array, true: jax.Array, mask: jax.Array) -> jax.Array:
-    residuals = jnp.where(mask[:, None], predicted, 0) - jnp.where(mask[:, None], true, 0)
-    inverse = _inverse_covariance(lax.stop_gradient(residuals), mask)
+    is_there: jax.Array = as_mask("mask", mask, predicted.shape[:1])
+    residuals = jnp.where(is_there[:, None], predicted, 0) - jnp.where(is_there[:, None], true, 0)
+    inverse = _inverse_covariance(lax.stop_gradient(residuals), is_there)
     # Differences of products, summed over the last axis: a short contraction in full precision everywhere.
     squared = jnp.sum(residuals * jnp.matmul(residuals, inverse, precision=lax.Precision.HIGHEST), axis=1)
-    return jnp.sum(safe_sqrt(squared)) / jnp.maximum(jnp.sum(mask), 1)
+    return jnp.sum(safe_sqrt(squared)) / jnp.maximum(jnp.sum(is_there), 1)
 
 
 def _inverse_covariance(residuals: Float[Array, "n d"], mask: Bool[Array, " n"]) -> Float[Array, "d d"]:

@@ -48,16 +48,12 @@ def chamfer_distance(
     if max_distance is not None:
         require_positive("max_distance", max_distance)
     limit = jnp.asarray(jnp.inf if max_distance is None else max_distance, a.dtype)
-    return _chamfer_distance(
-        a, b, as_mask("mask_a", mask_a, a.shape[:1]), as_mask("mask_b", mask_b, b.shape[:1]), limit
-    )
+    mask_a, mask_b = as_mask("mask_a", mask_a, a.shape[:1]), as_mask("mask_b", mask_b, b.shape[:1])
+    total: Array = _mean_distance(a, b, mask_a, mask_b, limit) + _mean_distance(b, a, mask_b, mask_a, limit)
+    return total
 
 
 @jax.jit
-def _chamfer_distance(a: jax.Array, b: jax.Array, mask_a: jax.Array, mask_b: jax.Array, limit: jax.Array) -> jax.Array:
-    return _mean_distance(a, b, mask_a, mask_b, limit) + _mean_distance(b, a, mask_b, mask_a, limit)
-
-
 def _mean_distance(
     queries: Float[Array, "n d"],
     points: Float[Array, "m d"],
@@ -71,6 +67,7 @@ def _mean_distance(
     return jnp.sum(jnp.minimum(safe_sqrt(squared), limit)) / jnp.maximum(jnp.sum(is_counted), 1)
 
 
+@jax.jit
 def occupancy_loss(
     logits: Float[AnyArray, "..."], labels: Float[AnyArray, "..."], weights: Float[AnyArray, "..."]
 ) -> Float[Array, ""]:
@@ -94,11 +91,6 @@ def occupancy_loss(
         sizes = zip(reversed(array.shape), reversed(logits.shape), strict=False)
         is_right = array.ndim <= logits.ndim and all(size in (1, whole) for size, whole in sizes)
         require_value(is_right, name, f"a shape that broadcasts to {logits.shape}", array.shape)
-    return _occupancy_loss(logits, labels, weights)
-
-
-@jax.jit
-def _occupancy_loss(logits: jax.Array, labels: jax.Array, weights: jax.Array) -> jax.Array:
     weights = jnp.broadcast_to(usable_weights(weights), logits.shape)
     labels = jnp.broadcast_to(labels, logits.shape)
     is_counted = weights > 0

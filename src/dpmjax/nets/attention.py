@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.nets.layers import ComputeDtype, TwoLayers, layer_norm, linear
+from dpmjax.nets.layers import TwoLayers, layer_norm, linear
 
 EMBEDDING_TEMPERATURE = 10_000.0
 
@@ -74,13 +74,13 @@ def _attend_head(queries: jax.Array, keys: jax.Array, values: jax.Array, *, bias
 
     @jax.checkpoint
     def of_block(query: jax.Array) -> jax.Array:
-        logits = _product("cn,cm->nm", keys, query) + bias[:, None]
+        logits = jnp.einsum("cn,cm->nm", keys, query) + bias[:, None]
         # Finite even without any key, so that masked keys have a share of exactly zero.
         largest = jnp.max(lax.stop_gradient(logits), axis=0, initial=jnp.finfo(jnp.float32).min)
         shares = jnp.exp(logits - largest)
         total = jnp.sum(shares, axis=0)
         # Divided after the product: (c, m) numbers instead of (n, m).
-        return _product("cn,nm->cm", values, shares.astype(values.dtype)) / jnp.where(total > 0, total, 1)
+        return jnp.einsum("cn,nm->cm", values, shares) / jnp.where(total > 0, total, 1)
 
     return _one_after_the_other(of_block, queries)
 
@@ -92,22 +92,16 @@ def _one_after_the_other(function: Callable[..., jax.Array], *arrays: jax.Array)
     )
 
 
-def _product(subscripts: str, a: jax.Array, b: jax.Array) -> jax.Array:
-    return jnp.einsum(subscripts, a, b, preferred_element_type=jnp.float32)
-
-
 class PairAttention(nn.Module):
     """Attention with several heads on a pair of clouds: self-attention or cross-attention.
 
     Attributes:
         num_heads: divides the number of channels.
         is_crossed: True for cross attention between both clouds; False for self-attention.
-        compute_dtype: type of the matrix products.
     """
 
     num_heads: int
     is_crossed: bool
-    compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
     def __call__(
@@ -123,11 +117,10 @@ class PairAttention(nn.Module):
             Mixed features, row for row.
         """
         num_rows, num_channels = features.shape
-        dtype = jnp.dtype(self.compute_dtype)
         # One matrix for queries, keys and values, side by side.
         kernel = self.param("in_kernel", nn.initializers.lecun_normal(), (num_channels, 3 * num_channels))
         bias = self.param("in_bias", nn.initializers.zeros_init(), (3 * num_channels,))
-        mapped = jnp.matmul(features.astype(dtype), kernel.astype(dtype)) + bias.astype(dtype)
+        mapped = jnp.matmul(features.astype(jnp.float32), kernel) + bias
         mapped = mapped.reshape(num_rows, 3, self.num_heads, num_channels // self.num_heads)
         queries, keys, values = (jnp.split(mapped[:, part], [masks[0].size]) for part in range(3))
         contexts = [*zip(keys, values, masks, strict=True)]
@@ -135,7 +128,7 @@ class PairAttention(nn.Module):
             contexts.reverse()
         mixed = [attend(query, *context) for query, context in zip(queries, contexts, strict=True)]
         rows = jnp.concatenate(mixed).reshape(num_rows, num_channels)
-        return linear(num_channels, self.compute_dtype, "out")(rows).astype(jnp.float32)
+        return linear(num_channels, "out")(rows)
 
 
 class AttentionLayer(nn.Module):
@@ -147,11 +140,9 @@ class AttentionLayer(nn.Module):
 
     Attributes:
         num_heads: heads of both attentions.
-        compute_dtype: type of the matrix products.
     """
 
     num_heads: int
-    compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
     def __call__(
@@ -170,13 +161,13 @@ class AttentionLayer(nn.Module):
         Returns:
             New features, row for row.
         """
-        num_channels, dtype = features.shape[1], self.compute_dtype
+        num_channels = features.shape[1]
         x = features if embeddings is None else features + embeddings
-        x += PairAttention(self.num_heads, False, dtype, name="self_attention")(x, masks)
+        x += PairAttention(self.num_heads, False, name="self_attention")(x, masks)
         x = layer_norm("self_norm")(x)
         if embeddings is not None:
             x += embeddings
-            x += PairAttention(self.num_heads, True, dtype, name="cross_attention")(x, masks)
+            x += PairAttention(self.num_heads, True, name="cross_attention")(x, masks)
             x = layer_norm("cross_norm")(x)
-        x += TwoLayers(num_channels, num_channels, dtype, name="network")(x)
+        x += TwoLayers(num_channels, num_channels, name="network")(x)
         return layer_norm("network_norm")(x)

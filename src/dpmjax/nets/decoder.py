@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.checks import require_fields, require_value
 from dpmjax.nets.attention import AttentionLayer, embed_positions
-from dpmjax.nets.layers import ComputeDtype, TwoLayers, linear, require_compute_dtype
+from dpmjax.nets.layers import TwoLayers, linear
 from dpmjax.types import DescriptorCloud
 
 
@@ -26,41 +26,24 @@ class DecoderConfig:
         model_channels: channels of a correlated descriptor; at least 6.
         num_layers: number of attention layers.
         num_heads: heads of each attention; divides `model_channels`.
-        shares_layers: True for the same weights in all layers, as in the paper; False for the published networks.
         is_crossed: True as in the published networks: positions are embedded, and descriptors attend to those of both
             clouds. With False they attend to the features of their own cloud alone, which describe the surroundings
             already. The result then depends on one cloud and not on positions, and training needs fewer steps.
         predicts_offsets: False leaves all offsets at 0, as in `tiny` and `small`, and in the ablation of Table 2.
-        compute_dtype: type of the matrix products.
     """
 
     input_channels: int = 128
     model_channels: int = 256
     num_layers: int = 3
     num_heads: int = 8
-    shares_layers: bool = False
     is_crossed: bool = True
     predicts_offsets: bool = True
-    compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:
         require_fields(self, "input_channels", "num_layers", "num_heads", low=1)
         num, num_heads = self.model_channels, self.num_heads
         is_right = num >= 6 and num % num_heads == 0
         require_value(is_right, "model_channels", f"at least 6 and a multiple of num_heads = {num_heads}", num)
-        require_compute_dtype(self.compute_dtype)
-
-
-class Head(nn.Module):
-    """Common part of the heads.
-
-    Attributes:
-        num_channels: channels of one descriptor.
-        compute_dtype: type of the matrix products.
-    """
-
-    num_channels: int
-    compute_dtype: ComputeDtype = "float32"
 
 
 class LinearOfPair(nn.Module):
@@ -68,11 +51,9 @@ class LinearOfPair(nn.Module):
 
     Attributes:
         num_features: channels of the result.
-        compute_dtype: type of the matrix products.
     """
 
     num_features: int
-    compute_dtype: ComputeDtype
 
     @nn.compact
     def __call__(
@@ -92,17 +73,18 @@ class LinearOfPair(nn.Module):
         shape = (2 * num_channels, self.num_features)
         kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
         bias = self.param("bias", nn.initializers.zeros_init(), (self.num_features,))
-        dtype = jnp.dtype(self.compute_dtype)
-        first, second, kernel, bias = (x.astype(dtype) for x in (first, second, kernel, bias))
+        first, second = first.astype(jnp.float32), second.astype(jnp.float32)
         of_second = jnp.matmul(second, kernel[num_channels:])
         return jnp.matmul(first, kernel[:num_channels]) + (of_second if rows is None else of_second[rows]) + bias
 
 
-class OffsetHead(Head):
+class OffsetHead(nn.Module):
     """Predicts the offset from a descriptor to its partner (DeepPointMap section 3.2, figure 2d).
 
     Three linear layers of halving width run beside a linear short cut; a linear map to three coordinates follows.
     """
+
+    num_channels: int
 
     @nn.compact
     def __call__(
@@ -118,15 +100,17 @@ class OffsetHead(Head):
         Returns:
             Offsets in metres, in the frame that the features are relative to.
         """
-        x = nn.relu(LinearOfPair(self.num_channels, self.compute_dtype, name="linear_0")(features, partners, rows))
-        x = nn.relu(linear(self.num_channels // 2, self.compute_dtype, "linear_1")(x))
-        x = linear(self.num_channels // 4, self.compute_dtype, "linear_2")(x)
-        short_cut = LinearOfPair(self.num_channels // 4, self.compute_dtype, name="short_cut")(features, partners, rows)
-        return linear(3, "float32", "output")(nn.relu(x + short_cut).astype(jnp.float32))
+        x = nn.relu(LinearOfPair(self.num_channels, name="linear_0")(features, partners, rows))
+        x = nn.relu(linear(self.num_channels // 2, "linear_1")(x))
+        x = linear(self.num_channels // 4, "linear_2")(x)
+        short_cut = LinearOfPair(self.num_channels // 4, name="short_cut")(features, partners, rows)
+        return linear(3, "output")(nn.relu(x + short_cut))
 
 
-class OverlapHead(Head):
+class OverlapHead(nn.Module):
     """Predicts the overlap of two clouds (DeepPointMap section 3.2, figure 2e)."""
+
+    num_channels: int
 
     @nn.compact
     def __call__(
@@ -143,9 +127,9 @@ class OverlapHead(Head):
         Returns:
             The logit.
         """
-        network = TwoLayers(self.num_channels, self.num_channels, self.compute_dtype, name="network")
+        network = TwoLayers(self.num_channels, self.num_channels, name="network")
         means = [_masked_mean(network(x), mask) for x, mask in zip(features, masks, strict=True)]
-        classifier = TwoLayers(2 * self.num_channels, 1, "float32", name="classifier")
+        classifier = TwoLayers(2 * self.num_channels, 1, name="classifier")
         return classifier(jnp.concatenate(means))[0]
 
 
@@ -161,14 +145,13 @@ class DescriptorDecoder(nn.Module):
     def setup(self) -> None:
         """Makes all parts, so that each method finds its own."""
         config = self.config
-        channels, dtype = config.model_channels, config.compute_dtype
-        self.projection = linear(channels, dtype, "projection")
-        num_different = 1 if config.shares_layers else config.num_layers
-        self.layers = [AttentionLayer(config.num_heads, dtype, name=f"layer_{i}") for i in range(num_different)]
-        self.similarity_head = TwoLayers(channels, channels, dtype)
-        self.offset_head = OffsetHead(channels, dtype)
-        self.overlap_head = OverlapHead(channels, dtype)
-        self.coarse_head = TwoLayers(config.input_channels, config.input_channels, dtype)
+        channels = config.model_channels
+        self.projection = linear(channels, "projection")
+        self.layers = [AttentionLayer(config.num_heads, name=f"layer_{i}") for i in range(config.num_layers)]
+        self.similarity_head = TwoLayers(channels, channels)
+        self.offset_head = OffsetHead(channels)
+        self.overlap_head = OverlapHead(channels)
+        self.coarse_head = TwoLayers(config.input_channels, config.input_channels)
 
     def correlate(self, a: DescriptorCloud, b: DescriptorCloud) -> tuple[DescriptorCloud, DescriptorCloud]:
         """Relates each descriptor to others by attention: to those of both clouds, or of its own (`is_crossed`).
@@ -185,9 +168,9 @@ class DescriptorDecoder(nn.Module):
         embeddings = None
         if self.config.is_crossed:
             embeddings = embed_positions(jnp.concatenate([a.positions, b.positions]), self.config.model_channels)
-        x = self.projection(jnp.concatenate([a.features, b.features])).astype(jnp.float32)
-        for i in range(self.config.num_layers):
-            x = self.layers[i % len(self.layers)](x, embeddings, masks)
+        x = self.projection(jnp.concatenate([a.features, b.features]))
+        for layer in self.layers:
+            x = layer(x, embeddings, masks)
         features_a, features_b = jnp.split(x, [a.mask.size])
         return _cleared(replace(a, features=features_a)), _cleared(replace(b, features=features_b))
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dpmjax.checks import require_fields, require_one_of, require_some
+from dpmjax.checks import require_fields, require_one_of
 
 # Xavier-uniform with the gain of ReLU, as in the published networks.
 HE_LIKE = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")
@@ -133,9 +133,8 @@ class OccupancyConfig:
 
     def __post_init__(self) -> None:
         require_one_of("kind", self.kind, ("mlp", "resmlp", "grid"))
-        require_some("resolutions", self.resolutions)
         expected = tuple(self.resolutions[0] * 2**level for level in range(len(self.resolutions)))
-        if self.resolutions != expected or self.resolutions[0] % 2:
+        if not expected or self.resolutions != expected or expected[0] % 2:
             raise ValueError(f"resolutions: expected an even number and its doubles, got {self.resolutions}")
 
     @property

@@ -59,7 +59,9 @@ def maximum_of_normalised(
 def _maximum_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
     # With n = x / |x| of the winners: dn = (dx - n * mean over channels of (x . dx) / |x|) / |x|.
     of_points, offsets, kernel, neighbours, scale = primals
-    to_points, to_offsets, to_kernel, _, to_scale = (None if _is_zero(tangent) else tangent for tangent in tangents)
+    to_points, to_offsets, to_kernel, _, to_scale = (
+        None if isinstance(tangent, SymbolicZero) else tangent for tangent in tangents
+    )
     winner, normalised, inverse = _winners(of_points, offsets, kernel, jnp.asarray(neighbours), scale)
     won = jnp.arange(len(winner))[:, None], winner
     # Parts of x . dx that are one number for each point, that are one vector for each point, and of pairs.
@@ -88,10 +90,6 @@ def _maximum_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[j
         shrink = inverse**2 * _sum(of_pairs) / winner.shape[1]
         tangent = tangent + scale * (inverse[won] * _sum(change) - normalised * shrink[won])
     return normalised * scale, tangent
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, SymbolicZero)
 
 
 def _sum(parts: list[jax.Array]) -> jax.Array:

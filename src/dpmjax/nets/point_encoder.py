@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.checks import require_fields, require_one_of
 from dpmjax.geometry.bearing import ray_directions, to_ray_frame, wall_normals
-from dpmjax.nets.layers import ComputeDtype, layer_norm, linear, require_compute_dtype
+from dpmjax.nets.layers import layer_norm, linear
 from dpmjax.nets.neighbourhood import maximum_of_normalised
 from dpmjax.types import AnyArray, Interpolation, PointPyramid, PyramidLevel
 
@@ -37,19 +37,16 @@ class EncoderConfig:
             networks, which learn rotations by augmentation. With "local" it lies along and across the normal of the
             wall at each point. Descriptors are then invariant to rotations of the scan about the vertical, and offsets
             between descriptors are predicted in these frames, too.
-        compute_dtype: type of the matrix products over features.
     """
 
     stem_channels: int = 16
     expansion: int = 4
     output_channels: int = 128
     frame: Frame = "lidar"
-    compute_dtype: ComputeDtype = "float32"
 
     def __post_init__(self) -> None:
         require_fields(self, "stem_channels", "expansion", "output_channels", low=1)
         require_one_of("frame", self.frame, get_args(Frame))
-        require_compute_dtype(self.compute_dtype)
 
 
 class NeighbourhoodMaximum(nn.Module):
@@ -57,11 +54,9 @@ class NeighbourhoodMaximum(nn.Module):
 
     Attributes:
         num_features: channels of the result.
-        compute_dtype: type of the product over features; the product over offsets is float32.
     """
 
     num_features: int
-    compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
     def __call__(
@@ -84,10 +79,7 @@ class NeighbourhoodMaximum(nn.Module):
         norm_bias = self.param("norm_bias", nn.initializers.zeros_init(), (num_features,))
         # The norm removes the mean over channels; removing it from the weights is cheaper.
         kernel, bias = kernel - kernel.mean(axis=1, keepdims=True), bias - bias.mean()
-        dtype = jnp.dtype(self.compute_dtype)
-        from_features = jnp.matmul(
-            features.astype(dtype), kernel[:-3].astype(dtype), preferred_element_type=jnp.float32
-        )
+        from_features = jnp.matmul(features.astype(jnp.float32), kernel[:-3])
         # relu grows with its argument, so it may follow the maximum.
         maximum = maximum_of_normalised(from_features + bias, offsets, kernel[-3:], neighbours, scale)
         return nn.relu(maximum + norm_bias)
@@ -116,11 +108,11 @@ class InvertedResidual(nn.Module):
         Returns:
             New features of the level.
         """
-        num_features, dtype = features.shape[1], self.config.compute_dtype
-        x = NeighbourhoodMaximum(num_features, dtype, name="neighbourhood")(features, offsets, neighbours)
-        x = linear(num_features * self.config.expansion, dtype, "expand")(x)
+        num_features = features.shape[1]
+        x = NeighbourhoodMaximum(num_features, name="neighbourhood")(features, offsets, neighbours)
+        x = linear(num_features * self.config.expansion, "expand")(x)
         x = nn.relu(layer_norm("expand_norm")(x))
-        x = linear(num_features, dtype, "contract")(x)
+        x = linear(num_features, "contract")(x)
         return nn.relu(layer_norm("contract_norm")(x) + features)
 
 
@@ -155,7 +147,7 @@ class Stage(nn.Module):
             offsets = jnp.asarray(positions[level.neighbours[block]] - level.positions[:, None]) / self.radii[block]
             return offsets if directions is None else to_ray_frame(offsets, directions[:, None])
 
-        abstraction = NeighbourhoodMaximum(self.num_features, self.config.compute_dtype, name="set_abstraction")
+        abstraction = NeighbourhoodMaximum(self.num_features, name="set_abstraction")
         x = abstraction(features, offsets(finer.positions, 0), level.neighbours[0])
         for block in range(1, len(self.radii)):
             residual = InvertedResidual(self.config, name=f"inverted_residual_{block - 1}")
@@ -197,11 +189,9 @@ class FeaturePropagation(nn.Module):
 
     Attributes:
         num_features: channels of the result.
-        compute_dtype: type of the matrix products.
     """
 
     num_features: int
-    compute_dtype: ComputeDtype = "float32"
 
     @nn.compact
     def __call__(
@@ -220,7 +210,7 @@ class FeaturePropagation(nn.Module):
         interpolated = jnp.einsum("nk,nkd->nd", interpolation.weights, coarse[interpolation.indices])
         x = jnp.concatenate([fine, interpolated], axis=-1)
         for layer in range(2):
-            x = linear(self.num_features, self.compute_dtype, f"linear_{layer}")(x)
+            x = linear(self.num_features, f"linear_{layer}")(x)
             x = nn.relu(layer_norm(f"norm_{layer}")(x))
         return x
 
@@ -252,7 +242,7 @@ class PointEncoder(nn.Module):
         seen = jnp.asarray(levels[0].positions)
         if config.frame == "local":
             seen = seen * jnp.array([0, 0, 1])  # heights
-        features = [linear(config.stem_channels, "float32", "stem")(seen)]
+        features = [linear(config.stem_channels, "stem")(seen)]
         for stage, radii in enumerate(self.radii):
             module = Stage(config.stem_channels * 2 ** (stage + 1), radii, config, name=f"stage_{stage}")
             features.append(module(features[-1], levels[stage], levels[stage + 1]))
@@ -262,6 +252,6 @@ class PointEncoder(nn.Module):
             interpolation = replace(interpolation, weights=jnp.asarray(interpolation.weights, jnp.float32))
             fine = features.pop()
             num_features = config.output_channels if step == num_steps - 1 else fine.shape[1]
-            propagation = FeaturePropagation(num_features, config.compute_dtype, name=f"propagation_{step}")
+            propagation = FeaturePropagation(num_features, name=f"propagation_{step}")
             x = propagation(fine, x, interpolation)
         return jnp.where(pyramid.levels[-1 - num_steps].mask[:, None], x, 0)

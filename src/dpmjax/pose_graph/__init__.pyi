@@ -1,9 +1,9 @@
-from .covariances import pose_covariances as pose_covariances
 from .dense import DenseSolution as DenseSolution
 from .dense import solve_dense as solve_dense
 from .free_nodes import FreeNodes as FreeNodes
 from .free_nodes import describe_free_nodes as describe_free_nodes
 from .free_nodes import find_free_nodes as find_free_nodes
+from .free_nodes import pose_covariances as pose_covariances
 from .graph import Edges as Edges
 from .graph import PoseGraph as PoseGraph
 from .graph import label_parts as label_parts

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dpmjax.checks import as_float, as_mask, require_count
-from dpmjax.geometry.implicit import solution_tangent
-from dpmjax.geometry.traced import with_axes_of
+from dpmjax.geometry.traced import solution_tangent, with_axes_of
 from dpmjax.pose_graph.graph import Edges
 from dpmjax.pose_graph.residuals import as_arrays, joined_nodes, move, normal_blocks
 from dpmjax.types import AnyArray
@@ -42,6 +41,7 @@ class DenseSolution(NamedTuple):
     converged: Bool[Array, ""]
 
 
+@partial(jax.jit, static_argnames="num_steps")
 def solve_dense(
     poses: Float[AnyArray, "n *s"],
     edges: Edges,
@@ -80,14 +80,10 @@ def solve_dense(
     require_count("num_steps", num_steps)
     start, edges = as_arrays(poses, edges, edge_mask)
     fixed = jnp.arange(len(poses)) == 0 if is_fixed is None else as_mask("is_fixed", is_fixed, (len(poses),))
-    found = _solve_dense(start, edges, fixed, num_steps=num_steps)
-    return found._replace(poses=jnp.where(joined_nodes(start, edges), found.poses, as_float("poses", poses)))
-
-
-@partial(jax.jit, static_argnames="num_steps")
-def _solve_dense(poses: Array, edges: Edges, is_fixed: Array, *, num_steps: int) -> DenseSolution:
-    found, converged = _solve(num_steps, poses, edges, is_fixed)
-    return DenseSolution(found, normal_blocks(found, edges)[0].sum(), converged > 0)
+    found, converged = _solve(num_steps, start, edges, fixed)
+    chi2 = normal_blocks(found, edges)[0].sum()
+    poses = jnp.where(joined_nodes(start, edges), found, as_float("poses", poses))
+    return DenseSolution(poses, chi2, converged > 0)
 
 
 class _State(NamedTuple):

@@ -1,4 +1,7 @@
-"""Nodes that the edges leave free: those of parts that no edge joins, and those with motions that no edge measures."""
+"""Certainty of the nodes of a pose graph: marginal covariances, and the nodes that no edge holds.
+
+Nodes are free if no edge joins their part to others, or if no edge measures one of their motions.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from dpmjax.checks import runs_on_host
 from dpmjax.pose_graph.graph import Floats, PoseGraph, label_parts
 from dpmjax.pose_graph.normal_equations import BlockPattern, factorise, linearise
 
@@ -47,12 +51,11 @@ def describe_free_nodes(found: Sequence[FreeNodes]) -> str:
     >>> describe_free_nodes([FreeNodes((7, 9), ("heading",))])
     'no edge measures heading of nodes 7, 9'
     """
-    parts = [f"{', '.join(free.axes)} of node{'s' * (len(free.ids) > 1)} {_first(free.ids)}" for free in found[:3]]
+    parts = []
+    for ids, axes in found[:3]:
+        more = f" and {len(ids) - 3} more" * (len(ids) > 3)
+        parts.append(f"{', '.join(axes)} of node{'s' * (len(ids) > 1)} {', '.join(map(str, ids[:3]))}{more}")
     return "no edge measures " + "; ".join([*parts, *[f"and {len(found) - 3} more such groups"] * (len(found) > 3)])
-
-
-def _first(ids: Sequence[int]) -> str:
-    return ", ".join(map(str, ids[:3])) + (f" and {len(ids) - 3} more" if len(ids) > 3 else "")
 
 
 def find_free_nodes(graph: PoseGraph) -> tuple[FreeNodes, ...]:
@@ -101,28 +104,62 @@ def _has_full_rank(information: Floats) -> NDArray[np.bool_]:
 
 def _free_motions(graph: PoseGraph, held: NDArray[np.bool_]) -> Bool[np.ndarray, "n d"]:
     """Returns True for the axes in which a node moves in the null space of the normal equations."""
-    edges, axes = graph.edges, graph.tangent_size
-    still = np.zeros((len(graph.poses), axes))
+    nothing = np.zeros((len(held), graph.tangent_size), bool)
     if held.all():
-        return still > 0
-    pattern = BlockPattern.create(np.stack([edges.target, edges.source], axis=1), held)
-    matrix = pattern.matrix(linearise(graph.poses, still, edges).blocks)
+        return nothing
+    pattern = BlockPattern.create(graph.ends, held)
+    matrix = pattern.matrix(linearise(graph.poses, graph.edges).blocks)
     diagonal = matrix.diagonal()
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = (sp.diags(scale) @ matrix @ sp.diags(scale)).tocsc()
     factors = factorise(scaled, np.full(len(scale), _ADDED), "NATURAL")
     if not (factors.U.diagonal() < _LEAST_PIVOT).any():
-        return still > 0
+        return nothing
     # Inverse iteration: what stays of random vectors lies in the null space.
     probes = np.random.default_rng(0).normal(size=(len(scale), _NUM_PROBES))
     for _ in range(3):
         probes = factors.solve(probes)
         probes /= np.linalg.norm(probes, axis=0)
-    motion = np.abs(pattern.to_nodes(scale[:, None] * probes, axes)).max(axis=2)
-    return _is_share(motion)
-
-
-def _is_share(motion: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
-    """Returns True for axes with a share of the motion of their node, and of that of the graph."""
+    motion = np.abs(pattern.to_nodes(scale[:, None] * probes, graph.tangent_size)).max(axis=2)
     of_node = motion.max(axis=1, keepdims=True)
     return np.asarray((motion > _LEAST_SHARE * of_node) & (of_node > _LEAST_SHARE * motion.max()))
+
+
+# Number of nodes whose columns of the inverse are solved at once: more take more memory.
+_BATCH = 64
+
+
+@runs_on_host("invert the normal equations of pose_graph.residuals there")
+def pose_covariances(graph: PoseGraph) -> Float[np.ndarray, "n d d"]:
+    """Computes the marginal covariance of each pose at the present poses, the inverse of J^T W J.
+
+    They are as right as the information of the edges. The held nodes (`PoseGraph.held_nodes`) are certain: all
+    covariances are relative to them, in each connected part. Runs on the host.
+
+    Args:
+        graph: an optimised graph, in the plane or in space.
+
+    Returns:
+        (n, 3, 3) or (n, 6, 6) covariances of the step in the frame of each pose, translation first, metres and
+        radians. They are zero for held nodes, and infinite for nodes that the edges leave free.
+
+    Raises:
+        ValueError: an array is traced.
+    """
+    held, size = graph.held_nodes(), graph.tangent_size
+    covariances = np.zeros((len(held), size, size))
+    pattern = BlockPattern.create(graph.ends, held)
+    matrix = pattern.matrix(linearise(graph.poses, graph.edges).blocks)
+    try:
+        factors = factorise(matrix, np.zeros(matrix.shape[0]), "NATURAL")
+    except RuntimeError:
+        covariances[~held] = np.inf
+        return covariances
+    for begin in range(0, len(pattern.free_nodes), _BATCH):
+        nodes = pattern.free_nodes[begin : begin + _BATCH]
+        rows = begin * size + np.arange(len(nodes) * size)
+        units = np.zeros((matrix.shape[0], len(rows)))
+        units[rows, np.arange(len(rows))] = 1.0
+        columns = factors.solve(units)[rows].reshape(len(nodes), size, len(nodes), size)
+        covariances[nodes] = columns[np.arange(len(nodes)), :, np.arange(len(nodes))]
+    return covariances

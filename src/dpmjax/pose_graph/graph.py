@@ -132,6 +132,11 @@ class PoseGraph:
         """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return TANGENT_SIZE[self.poses.shape[1:]]
 
+    @property
+    def ends(self) -> Indices:
+        """Target and source of each edge (e, 2)."""
+        return np.stack([self.edges.target, self.edges.source], axis=1)
+
     def held_nodes(self) -> NDArray[np.bool_]:
         """Finds the nodes that an optimisation does not move.
 

@@ -37,25 +37,26 @@ class Linearisation(NamedTuple):
     gradient: Floats
 
 
-def linearise(poses: Floats, step: Floats, edges: Edges) -> Linearisation:
-    """Moves the poses and linearises all edges there.
+def linearise(poses: Floats, edges: Edges, step: Floats | None = None) -> Linearisation:
+    """Linearises all edges at poses, or at those after a step.
 
     The numbers of nodes and edges are rounded up to powers of two, so that few programs are compiled.
 
     Args:
         poses: (n, 3) or (n, 4, 4).
-        step: (n, 3) or (n, 6) steps in the frame of each pose.
         edges: measured relative poses.
+        step: (n, 3) or (n, 6) steps in the frame of each pose; None for none.
 
     Returns:
         The edges at the moved poses.
     """
     num_nodes, num_edges = len(poses), len(edges.source)
     identity, zero = np.zeros(3) if poses.ndim == 2 else np.eye(4), np.zeros(edges.information.shape[1:])
+    step = np.zeros((num_nodes, len(zero))) if step is None else step
     fills = (np.int64(0), np.int64(0), identity, zero)
     padded = Edges(*(_padded(values, fill) for values, fill in zip(edges, fills, strict=True)))
     with jax.enable_x64(True):
-        arrays = _linearise(_padded(poses, identity), _padded(step, np.zeros(step.shape[1])), padded)
+        arrays = _linearise(_padded(poses, identity), _padded(step, zero[0]), padded)
         moved, *of_edges = (np.asarray(x) for x in arrays)
     return Linearisation(moved[:num_nodes], *(x[:num_edges] for x in of_edges))
 

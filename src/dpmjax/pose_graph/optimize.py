@@ -140,14 +140,12 @@ def optimize_pose_graph(
     config = config or PoseGraphConfig()
     require_value((np.asarray(trust) > 0).all(), "trust", "numbers above 0", "others")
     width = np.full(len(graph.edges.source), config.outlier_chi2 or np.inf) * trust
-    nodes = np.stack([graph.edges.target, graph.edges.source], axis=1)
-    pattern = BlockPattern.create(nodes, graph.held_nodes())
-    still = np.zeros((len(graph.poses), graph.tangent_size))
-    at = linearise(graph.poses, still, graph.edges)
+    pattern = BlockPattern.create(graph.ends, graph.held_nodes())
+    at = linearise(graph.poses, graph.edges)
     chi2_initial = float(at.chi2.sum())
     require_value(np.isfinite(chi2_initial), "graph", "residuals of finite length", "NaN or infinity")
     if config.is_chordal_start and len(graph.edges.source):
-        chordal = linearise(chordal_poses(graph, pattern), still, graph.edges)
+        chordal = linearise(chordal_poses(graph, pattern), graph.edges)
         at = chordal if _cost(chordal.chi2, width) < _cost(at.chi2, width) else at
     state = _State(at, _FIRST_DAMPING, 1.0 if config.outlier_chi2 is None else _FIRST_WIDENING)
     iterations = 0
@@ -185,7 +183,7 @@ def _iterate(state: _State, graph: PoseGraph, pattern: BlockPattern, width: Floa
     if np.isfinite(step).all():
         if is_narrow and state.before is None and step @ right + step @ (extra * step) <= small:
             return state._replace(is_converged=True)
-        trial = linearise(at.poses, pattern.to_nodes(step, graph.tangent_size), graph.edges)
+        trial = linearise(at.poses, graph.edges, pattern.to_nodes(step, graph.tangent_size))
         decrease = cost - _cost(trial.chi2, width)
     if decrease >= 0:
         return _State(trial, max(0.1 * state.damping, _LEAST_DAMPING), widening, is_narrow and decrease <= small)

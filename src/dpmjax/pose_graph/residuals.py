@@ -23,6 +23,7 @@ from dpmjax.pose_graph.graph import TANGENT_SIZE, Edges
 from dpmjax.types import AnyArray
 
 
+@jax.jit
 def residuals(
     poses: Float[AnyArray, "n *s"], edges: Edges, edge_mask: Bool[AnyArray, " e"] | None = None
 ) -> Float[Array, "e d"]:
@@ -48,12 +49,7 @@ def residuals(
     >>> residuals(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.75]]), edges).tolist()
     [[0.0, 0.0, 0.25]]
     """
-    return _residuals(*as_arrays(poses, edges, edge_mask))
-
-
-@jax.jit
-def _residuals(poses: Float[Array, "n *s"], edges: Edges) -> Float[Array, "e d"]:
-    return _log(_differences(poses, edges)[0])
+    return _log(_differences(*as_arrays(poses, edges, edge_mask))[0])
 
 
 def as_arrays(
@@ -152,7 +148,7 @@ def move(poses: Array, step: Float[Array, "n d"]) -> Array:
     Returns:
         `T_world_node`.
     """
-    return se2.compose(poses, step) if poses.ndim == 2 else rigid.compose(poses, rigid.exp(step))
+    return se2.compose(poses, step) if poses.ndim == 2 else rigid.matmul(poses, rigid.exp(step))
 
 
 def _differences(poses: Array, edges: Edges) -> tuple[Array, Array]:
@@ -163,7 +159,7 @@ def _differences(poses: Array, edges: Edges) -> tuple[Array, Array]:
 
 def _relative(target: Array, source: Array) -> Array:
     """Returns the poses of the sources in the frames of the targets."""
-    return se2.relative(target, source) if source.ndim == 2 else rigid.compose(rigid.inverse(target), source)
+    return se2.relative(target, source) if source.ndim == 2 else rigid.matmul(rigid.inverse(target), source)
 
 
 def _log(difference: Array) -> Float[Array, "e d"]:

@@ -13,11 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 from dpmjax.checks import as_float, as_mask, as_points, require_shape
 from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
-from dpmjax.geometry.implicit import solution_tangent
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
 from dpmjax.geometry.rigid import safe_sqrt
-from dpmjax.geometry.traced import is_usable, with_axes_of
+from dpmjax.geometry.traced import is_usable, solution_tangent, with_axes_of
 from dpmjax.types import AnyArray, with_short_repr
 
 _NORMAL_NEIGHBOURS = 6
@@ -176,7 +175,7 @@ def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: A
         T, _, count = carry
         pairs = _find_pairs(source, target, normals, T)
         if metric == "plane":
-            T_new = rigid.compose(_step_to_planes(pairs, rigid.transform_points(T, centre)[0]), T)
+            T_new = rigid.matmul(_step_to_planes(pairs, rigid.transform_points(T, centre)[0]), T)
         else:
             T_new = jnp.where(pairs.weights.any(), weighted_svd(source.points, pairs.matched, pairs.weights), T)
         change = jnp.linalg.norm(rigid.transform_points(T_new, source.points) - pairs.points, axis=-1)
@@ -200,7 +199,7 @@ def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, A
     scales = jnp.where(jnp.arange(dim * (dim + 1) // 2) < dim, 1.0, of_angles).astype(T.dtype)
 
     def moved(step: Array) -> Array:
-        return rigid.compose(_about(scales * step, centre), T)
+        return rigid.matmul(_about(scales * step, centre), T)
 
     def balance(step: Array, source_points: Array, target_points: Array) -> Array:
         clouds = source._replace(points=source_points), target._replace(points=target_points)

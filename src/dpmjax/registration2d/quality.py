@@ -70,8 +70,9 @@ _MAX_CONTRADICTION = 0.055
 # Most consecutive scans that fit no other scan in a trusted map. Lines of another moment and covered lenses are single
 # scans; more of them in sequence are a part of the way that is not registered, and what follows may be displaced.
 _MAX_ALONE = 2
-# Largest standard deviation of a scan's position relative to the map, typical ranges.
-_MAX_DEVIATION = 0.02
+# Largest standard deviation of a scan's position relative to the map, typical ranges. Of 39 right maps of made passages
+# with odometry, 30 are trusted with 0.02 and 38 with this; a wrong one, of 18 without sound odometry, with 0.06.
+_MAX_DEVIATION = 0.04
 # Least information of a turn, for each beam, in typical ranges: between bare round walls it is 0.0003 to 0.0054, with a
 # range noise of up to 2 cm in 5 m; in seven logs and five simulated worlds 0.008 or more. Least information of a shift.
 _LEAST_TURN, _LEAST_SHIFT = 0.006, 1e-4

@@ -44,8 +44,8 @@ _LEAST_LOST = 3
 # such a run that are compared with its first one.
 _LEAST_SILENT, _MAX_COMPARED = 3, 8
 # A beam has changed by more than these standard deviations of the noise, and this share of the typical range; the
-# robot has stood where a smaller share of the beams has changed.
-_NOISE, _LEAST_CHANGE, _CHANGED_SHARE = 6.0, 0.01, 0.01
+# robot has stood where a smaller share of the beams has changed, in most scans.
+_NOISE, _LEAST_CHANGE, _CHANGED_SHARE, _MOST = 6.0, 0.01, 0.01, 0.8
 # Scans that are aligned at a time.
 _BLOCK = 1024
 # Range noise, in typical ranges, above which no two scans are equal.
@@ -127,11 +127,11 @@ def find_silent_steps(scans: ScanSet, odometry: Floats) -> Booleans:
     Returns:
         (n - 1,) True for the steps of a run in which the robot may have moved.
     """
-    is_seen = np.asarray(scans.mask).any(axis=1)
+    seen = np.flatnonzero(np.asarray(scans.mask).any(axis=1))
     stands = np.abs(np.diff(odometry, axis=0)).max(axis=1) < 1e-9
     is_silent = np.zeros(len(stands), np.bool_)
     for first, last in find_runs(stands, _LEAST_SILENT):
-        rows = first + np.flatnonzero(is_seen[first : last + 1])
+        rows = seen[(seen >= first) & (seen <= last)]
         if len(rows) > 1:
             rows = rows[spread_evenly(len(rows), _MAX_COMPARED)]
             is_silent[first:last] = not _has_stood(planar_scans(take_scans(scans, rows)))
@@ -143,11 +143,12 @@ def _has_stood(scans: PlanarScans) -> bool:
     ranges = np.linalg.norm(scans.points, axis=-1)
     off = np.abs(ranges[1:] - ranges[0]) > max(_NOISE * scans.noise, _LEAST_CHANGE * scans.typical_range)
     both = scans.mask[1:] & scans.mask[0]
-    if np.median((off & both).sum(axis=1) / np.maximum(both.sum(axis=1), 1)) < _CHANGED_SHARE:
+    changed = (off & both).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
+    if np.quantile(changed, _MOST) < _CHANGED_SHARE:
         return True
     others = np.arange(1, len(scans))
     slides = slide_steps(scans, np.zeros((len(others), 3)), pairs=(others, np.zeros_like(others)))
-    return bool(np.median((slides.scores > WEAK_SCORE) & ~slides.is_torn & ~slides.is_open) == 1)
+    return bool(((slides.scores > WEAK_SCORE) & ~slides.is_torn & ~slides.is_open).mean() >= _MOST)
 
 
 def take_scans(scans: ScanSet, rows: Indices) -> ScanSet:

@@ -193,7 +193,7 @@ def _agreements(
     def at(T: Float[Array, "4 4"]) -> Agreement:
         def against(T_last_ref: Any, points_ref: Any, surface_ref: Any) -> Agreement:
             other = Views(PixelSample(points_ref, everything), surface_ref)
-            return both_ways(rigid.compose(rigid.inverse(T_last_ref), T), view, other, pinhole, tolerance)
+            return both_ways(rigid.matmul(rigid.inverse(T_last_ref), T), view, other, pinhole, tolerance)
 
         agreements = jax.vmap(against)(*references[:3])
         return Agreement(*((references.weights * values).sum() for values in agreements))

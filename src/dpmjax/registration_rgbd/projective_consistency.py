@@ -150,7 +150,7 @@ def consistency_of_pairs(
 
     def compare(offset: Int[Array, ""]) -> Agreement:
         other = (jnp.arange(count) + offset) % count
-        T_other_camera = rigid.compose(rigid.inverse(T_world_camera[other]), T_world_camera)
+        T_other_camera = rigid.matmul(rigid.inverse(T_world_camera[other]), T_world_camera)
         others = PixelSample(sample.points[other], sample.mask[other])
         agreements = jax.vmap(both_ways, in_axes=(0, 0, 0, None, None))(
             T_other_camera, Views(sample, surfaces), Views(others, surfaces[other]), scans.pinhole, tolerance

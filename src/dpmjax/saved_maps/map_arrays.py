@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int8
 from numpy.typing import NDArray
 
-from dpmjax.deeppointmap.prepared_scans import MAX_COMPONENT, CompactElements, CompactImage, CompactScan, round_features
+from dpmjax.deeppointmap.compact_scans import MAX_COMPONENT, CompactElements, CompactImage, CompactScan, round_features
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.slam.keyframe_map import EdgeKind, Keyframe, KeyframeMap, MapEdge, MapOrigin, edge_arrays
 

@@ -56,8 +56,7 @@ class Scan(NamedTuple):
     Attributes:
         surface: points, normals and a tree, metres, in the frame of the lidar.
         image: range image, the free space.
-        descriptors: descriptors of the scan, positions in metres times `scale`; None before it is encoded.
-        scale: factor by which the points were enlarged for the encoder.
+        descriptors: descriptors of the scan, positions in metres; None before it is encoded.
         thinned: points that range and voxel leave, outliers among them: input of the encoder; None if none is needed.
         extent_m: median range of the thinned points.
         weak_axis: unit vector along a corridor, which few walls face, in the frame of the lidar; None elsewhere.
@@ -66,7 +65,6 @@ class Scan(NamedTuple):
     surface: Surface
     image: RangeImage
     descriptors: DescriptorCloud | None = None
-    scale: float = 1.0
     thinned: HostTree | None = None
     extent_m: float = 0.0
     weak_axis: Float[np.ndarray, "3"] | None = None

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near, orthonormal, turn_rad
 from dpmjax.scans.lidar import Scan

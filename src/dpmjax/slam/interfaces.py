@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.scans.lidar import Scan
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.keyframe_map import MapOrigin, Submap

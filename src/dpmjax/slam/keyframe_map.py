@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_positive
-from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
+from dpmjax.deeppointmap.compact_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.slam.config import SlamConfig

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dpmjax.deeppointmap.prepared_scans import CompactScan, expand_elements
+from dpmjax.deeppointmap.compact_scans import CompactScan, expand_elements
 from dpmjax.geometry import rigid
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.se3 import turn_rad

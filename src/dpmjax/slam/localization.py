@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_fields, runs_on_host
+from dpmjax.deeppointmap.compact_scans import CompactScan
 from dpmjax.deeppointmap.model import Model
-from dpmjax.deeppointmap.prepared_scans import CompactScan
 from dpmjax.geometry.se3 import are_near, orthonormal
 from dpmjax.reading import read_path
 from dpmjax.slam.interfaces import Match, SlamMethods

@@ -16,14 +16,14 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from dpmjax.checks import require_type
+from dpmjax.deeppointmap.compact_scans import CompactScan, compact_scan, expand_elements, expand_scan
 from dpmjax.deeppointmap.confidence import gather_evidence, with_confidence
-from dpmjax.deeppointmap.encoding import pooled_vector, pyramid_of_cloud
+from dpmjax.deeppointmap.encoding import descriptors_of, pooled_vector, pyramid_of_cloud
 from dpmjax.deeppointmap.matching import MatchConfig, merge_clouds, thin_merged
 from dpmjax.deeppointmap.model import Model, encode_pyramid, model_fingerprint
 from dpmjax.deeppointmap.motion_choice import ELEMENT_RADIUS_M, REFINEMENT
 from dpmjax.deeppointmap.overlap_prediction import overlap_pairs, require_overlap
-from dpmjax.deeppointmap.prepared_scans import CompactScan, compact_scan, descriptors_of, expand_elements, expand_scan
-from dpmjax.deeppointmap.scan_registration import distinct_motions, match_clouds, register_each
+from dpmjax.deeppointmap.registration import distinct_motions, match_clouds, register_each
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.align import align_on_host
 from dpmjax.scans.lidar import Scan

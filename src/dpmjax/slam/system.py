@@ -17,7 +17,7 @@ from jaxtyping import Float
 from dpmjax.checks import as_host_points, require_shape, require_type, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.geometry import rigid
-from dpmjax.pose_graph.covariances import pose_covariances
+from dpmjax.pose_graph.free_nodes import pose_covariances
 from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path

@@ -15,18 +15,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from dpmjax.deeppointmap.encoding import pooled_vector
+from dpmjax.deeppointmap.encoding import descriptors_of, pooled_vector, prepare_scans
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
-from dpmjax.deeppointmap.prepared_scans import RawScan, descriptors_of, prepare_scans
-from dpmjax.deeppointmap.scan_registration import register_each
+from dpmjax.deeppointmap.registration import register_each
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.scans.lidar import Scan
 from dpmjax.slam.joint import refine_jointly, scans_in_reach
-from dpmjax.types import Pose, Poses
+from dpmjax.types import Pose, Poses, RawScan
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
 # ones that are registered: fewer leave scans alone, more take longer.

@@ -65,8 +65,8 @@ def test_samples_of_a_drive_with_wrong_poses_have_better_labels() -> None:
     errors = []
     for given_poses, refines in ((poses, False), (wrong, False), (wrong, True)):
         store = ScanStore([prepare_drive(replace(true, T_world_lidar=given_poses), config)])
-        with SampleMaker(store, replace(config, refines_labels=refines), seed=0) as maker:
-            motions = np.concatenate([maker(step).groups.T_target_source[0] for step in range(2)])
+        maker = SampleMaker(store, replace(config, refines_labels=refines), seed=0)
+        motions = np.concatenate([maker(step).groups.T_target_source[0] for step in range(2)])
         errors.append(motions[:, :3, 3])
     given, refined = (np.linalg.norm(error - errors[0], axis=1).mean() for error in errors[1:])
     assert given > 0.1

@@ -48,11 +48,8 @@ def test_a_training_that_stops_and_continues_equals_an_unbroken_one(whole) -> No
     toy.assert_trees_equal(second.progress, whole[0].progress)
 
 
-def test_prepared_scans_and_drives_train_the_same_model(whole, tmp_path) -> None:
-    for scans, cache in ((toy.store(), None), ([toy.drive()], tmp_path)):
-        trained = dpmjax.train(scans, TRAINING, cache=cache)
-        toy.assert_trees_equal(trained.model.params, whole[0].model.params)
-    assert list(tmp_path.glob("*.npy"))
+def test_prepared_scans_and_drives_train_the_same_model(whole) -> None:
+    toy.assert_trees_equal(dpmjax.train(toy.store(), TRAINING).model.params, whole[0].model.params)
 
 
 @pytest.mark.slow
@@ -64,12 +61,6 @@ def test_training_runs_with_64_bits_and_keeps_parameters_float32(float64) -> Non
     assert num_steps(trained) == 3
     assert all(leaf.dtype == np.float32 and np.isfinite(leaf).all() for leaf in params)
     assert any(np.any(a != b) for a, b in zip(params, start, strict=True))
-
-
-def test_a_cache_for_prepared_scans_is_refused(tmp_path) -> None:
-    with pytest.raises(ValueError, match="cache: expected None"):
-        dpmjax.train(toy.store(), TRAINING, cache=tmp_path)
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_best_model_is_that_of_the_best_score(whole) -> None:

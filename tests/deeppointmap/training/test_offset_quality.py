@@ -8,7 +8,7 @@ import pytest
 
 from dpmjax.deeppointmap import ObjectiveConfig
 from dpmjax.deeppointmap.model import correlate, predict_offsets
-from dpmjax.deeppointmap.training.offset_quality import WallOffsets, offset_r2, wall_offsets
+from dpmjax.deeppointmap.training.evaluation import WallOffsets, offset_r2, wall_offsets
 from dpmjax.geometry import rigid
 from dpmjax.types import DescriptorCloud
 from tests.tolerances import ACCUMULATED

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import SampleMaker, ScanStore, init_model, prepare_drive, stored_bytes, training_preset
+from dpmjax.deeppointmap import (
+    PreparedDrive,
+    SampleMaker,
+    ScanStore,
+    TrainingConfig,
+    find_prepared,
+    init_model,
+    prepare_drive,
+    prepare_variants,
+    prepared_path,
+    store_scans,
+    stored_bytes,
+    training_preset,
+)
 from dpmjax.deeppointmap.training.preparation import scan_records
 from dpmjax.deeppointmap.training.step import encode_sample
 from dpmjax.geometry import rigid
@@ -29,11 +43,18 @@ def short(*, num_scans: int = 4, bad: int | None = None) -> LidarSequence:
     return replace(drive, read_scan=read_scan)
 
 
+def kept(drive: LidarSequence, config: TrainingConfig, folder: Path, *, seed: int = 0) -> PreparedDrive:
+    """The drive with its file, which is made unless it is there."""
+    path = prepared_path(drive, config, folder, seed)
+    scans = prepare_variants(drive, range(len(drive)), config, seed)
+    return find_prepared(path, drive.T_world_lidar) or store_scans(path, drive.T_world_lidar, scans, config)
+
+
 def test_a_kept_file_is_read_instead_of_made_again(tmp_path) -> None:
     in_memory = prepare_drive(short(), toy.TRAINING)
-    made = prepare_drive(short(), toy.TRAINING, folder=tmp_path)
+    made = kept(short(), toy.TRAINING, tmp_path)
     made_at = made.pyramids.stat().st_mtime_ns
-    found = prepare_drive(short(), toy.TRAINING, folder=tmp_path)
+    found = kept(short(), toy.TRAINING, tmp_path)
     assert (found.pyramids, found.pyramids.stat().st_mtime_ns) == (made.pyramids, made_at)
     np.testing.assert_array_equal(np.load(found.pyramids), in_memory.pyramids)
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".npy"]
@@ -42,14 +63,14 @@ def test_a_kept_file_is_read_instead_of_made_again(tmp_path) -> None:
 def test_other_scans_or_settings_are_another_file(tmp_path) -> None:
     moving = replace(toy.TRAINING, augment=replace(toy.TRAINING.augment, max_yaw_rad=1.0))
     dropping = replace(toy.TRAINING, augment=replace(toy.TRAINING.augment, max_drop_ratio=0.1))
-    first = prepare_drive(short(), toy.TRAINING, folder=tmp_path).pyramids
-    assert prepare_drive(short(), moving, folder=tmp_path).pyramids == first
+    first = prepared_path(short(), toy.TRAINING, tmp_path, 0)
+    assert prepared_path(short(), moving, tmp_path, 0) == first
     for drive, config, seed in ((short(), dropping, 0), (short(num_scans=3), toy.TRAINING, 0), (short(), moving, 1)):
-        assert prepare_drive(drive, config, folder=tmp_path, seed=seed).pyramids != first
+        assert prepared_path(drive, config, tmp_path, seed) != first
 
 
 def test_a_bad_scan_is_empty_and_named(tmp_path) -> None:
-    prepared = [prepare_drive(short(bad=2), toy.TRAINING, folder=tmp_path) for _ in range(2)]
+    prepared = [kept(short(bad=2), toy.TRAINING, tmp_path) for _ in range(2)]
     assert prepared[0].bad == prepared[1].bad == {"2": "cut off; leave it out."}
     store = ScanStore(prepared[:1])
     scans, _ = store.read(np.arange(4), toy.TRAINING, np.random.default_rng(0))
@@ -77,9 +98,8 @@ FRESH = replace(toy.TRAINING, num_variants=0, thins_as_in_use=False)
 
 
 @pytest.mark.slow
-def test_scans_that_are_prepared_anew_need_no_file_and_depend_on_seed_and_step_alone(tmp_path) -> None:
-    prepared = prepare_drive(short(bad=2), FRESH, folder=tmp_path)
-    assert not list(tmp_path.iterdir())
+def test_scans_that_are_prepared_anew_need_no_file_and_depend_on_seed_and_step_alone() -> None:
+    prepared = prepare_drive(short(bad=2), FRESH)
     assert stored_bytes(FRESH) == 0
     makers = [SampleMaker(ScanStore([prepared]), FRESH, seed=0) for _ in range(2)]
     toy.assert_trees_equal(makers[0](1), makers[1](1))
@@ -107,7 +127,7 @@ def test_shuffled_points_are_another_choice_of_each_voxel_and_drops_come_before_
 
 
 def test_the_size_of_prepared_scans_is_that_of_their_files(tmp_path) -> None:
-    path = prepare_drive(short(), toy.TRAINING, folder=tmp_path).pyramids
+    path = kept(short(), toy.TRAINING, tmp_path).pyramids
     assert 0 <= path.stat().st_size - 4 * stored_bytes(toy.TRAINING) < 16_384  # the header of the file
     assert round(stored_bytes(replace(training_preset("paper"), num_variants=4)) / 1e6, 2) == 3.29
     assert round(stored_bytes(training_preset("small")) / 1e6, 2) == 0.51

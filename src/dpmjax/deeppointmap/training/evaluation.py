@@ -1,66 +1,39 @@
-"""Evaluation while training: registration of held-out pairs of maps, and their offsets."""
+"""Evaluation while training: registration of held-out pairs of scans by their descriptors, and their offsets.
+
+Offsets are measured along the normal of the wall, along the wall, and up, in metres. Along a wall nothing fixes an
+offset, because a wall looks the same further on; and the height alone can make the loss small.
+"""
 
 from __future__ import annotations
 
-import functools
 import operator
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.deeppointmap.encoding import encode_pyramids, pyramid_of_cloud, thin_scan
-from dpmjax.deeppointmap.evaluation_pairs import draw_rows_apart, scan_distances, true_poses, turn_scan
-from dpmjax.deeppointmap.matching import merge_clouds, thinned_mask
-from dpmjax.deeppointmap.model import Model
+from dpmjax.deeppointmap.evaluation import draw_scan_pairs, true_poses, turn_scan
+from dpmjax.deeppointmap.model import Model, correlate, predict_offsets
 from dpmjax.deeppointmap.model_config import ModelConfig
-from dpmjax.deeppointmap.scan_registration import trace_match
-from dpmjax.deeppointmap.training.offset_quality import WallOffsets, offset_r2, wall_offsets
+from dpmjax.deeppointmap.registration import trace_match
+from dpmjax.deeppointmap.training.objective import ObjectiveConfig, training_pairs
 from dpmjax.deeppointmap.training.preparation import read_or_note
 from dpmjax.geometry import rigid
+from dpmjax.geometry.bearing import directions_of, ray_directions, to_ray_frame
 from dpmjax.metrics.poses import RegistrationRecall, registration_recall
 from dpmjax.sequences import LidarSequence
-from dpmjax.types import DescriptorCloud, PointCloud, PointPyramid, Pose, Poses, Registration
+from dpmjax.types import AnyArray, DescriptorCloud, PointCloud, PointPyramid, Pose, Poses, Registration, SurfaceElements
 
-PAIR_STREAM = 3103
-# Maps or pairs that one compiled program evaluates in turn.
+YAW_STREAM = 3103
+# Bands of distance of the pairs.
+BANDS = ("near", "middle")
+# Pairs that one compiled program evaluates in turn.
 PAIRS_AT_ONCE = 10
-# Largest distance of the scans of an evaluated map from its first scan.
-MAP_RADIUS_M = 10.0
-
-
-_merge_all = jax.jit(jax.vmap(merge_clouds))
-
-
-class PairKind(NamedTuple):
-    """Distances and sizes of the pairs of an evaluation.
-
-    Attributes:
-        min_distance_m: least distance between the two scans, or between the first scans of the two maps.
-        max_distance_m: largest such distance.
-        num_scans: number of scans in each of the two maps; 1 for pairs of scans.
-    """
-
-    min_distance_m: float = 2.0
-    max_distance_m: float = 10.0
-    num_scans: int = 1
-
-
-class Pairs(NamedTuple):
-    """Pairs of one kind.
-
-    Attributes:
-        kind: distances and sizes of the pairs.
-        sources: (p, s) scans of the first map of each pair; the first scan is its frame.
-        targets: (p, s) scans of the second map.
-    """
-
-    kind: PairKind
-    sources: Int[np.ndarray, "p s"]
-    targets: Int[np.ndarray, "p s"]
 
 
 class EvaluationPairs(NamedTuple):
@@ -70,103 +43,81 @@ class EvaluationPairs(NamedTuple):
         scans: all scans, thinned, each turned by a random yaw.
         pyramids: their pyramids.
         T_world_scan: (n, 4, 4) true poses after the yaw, float64 metres.
-        pairs: pairs of each kind.
+        pairs: rows of the source and the target of each pair, by band of distance.
     """
 
     scans: list[PointCloud]
     pyramids: list[PointPyramid]
     T_world_scan: Poses
-    pairs: tuple[Pairs, ...]
+    pairs: dict[str, Int[np.ndarray, "p 2"]]
 
-    def true_motions(self, pairs: Pairs) -> Poses:
-        """Computes the true motions of pairs.
+    def true_motions(self, band: str) -> Poses:
+        """Computes the true motions of the pairs of a band.
 
         Args:
-            pairs: pairs of these scans.
+            band: a key of `pairs`.
 
         Returns:
             Target from source, metres.
         """
-        poses = self.T_world_scan
-        return rigid.inverse(poses[pairs.targets[:, 0]]) @ poses[pairs.sources[:, 0]]
+        sources, targets = self.T_world_scan[self.pairs[band].T]
+        return rigid.inverse(targets) @ sources
 
 
 class Evaluation(NamedTuple):
     """Results of a model on evaluation pairs.
 
     Attributes:
-        recalls: errors and share of correct registrations of each kind.
-        matches: stacked registrations of each kind.
-        offset_r2: coefficients of determination of predicted offsets (`offset_r2`), all kinds together.
+        recalls: errors and share of correct registrations, by band.
+        matches: stacked registrations, by band.
+        offset_r2: coefficients of determination of predicted offsets (`offset_r2`), all bands together.
         clouds: descriptors of all scans, stacked.
     """
 
-    recalls: tuple[RegistrationRecall, ...]
-    matches: tuple[Registration, ...]
+    recalls: dict[str, RegistrationRecall]
+    matches: dict[str, Registration]
     offset_r2: Float[np.ndarray, " 3"]
     clouds: DescriptorCloud
 
 
 def draw_evaluation_pairs(
-    drives: Iterable[LidarSequence],
-    num_pairs: int,
-    config: ModelConfig,
-    *,
-    kinds: tuple[PairKind, ...] = (PairKind(),),
-    seed: int = 0,
+    drives: Iterable[LidarSequence], num_pairs: int, config: ModelConfig, *, seed: int = 0
 ) -> EvaluationPairs:
-    """Draws random pairs of scans of each drive.
+    """Draws random pairs of scans of each drive, near ones and farther ones.
 
     Args:
-        drives: scans with true poses; a drive without pairs of any kind is left out.
-        num_pairs: number of pairs of each kind of a drive; fewer where the drive has fewer.
+        drives: scans with true poses; a drive without pairs is left out.
+        num_pairs: number of pairs of each band of a drive; fewer where the drive has fewer.
         config: preprocessing and pyramid.
-        kinds: kinds of pairs.
         seed: seed of the draws.
 
     Returns:
-        The pairs, of the kinds of which some drive has one.
+        The pairs, of the bands of which some drive has one.
 
     Raises:
         ValueError: if a drive has no poses.
     """
     scans, poses = list[PointCloud](), list[Pose]()
-    found: dict[PairKind, list[tuple[np.ndarray, np.ndarray]]] = {kind: [] for kind in kinds}
+    found: dict[str, list[np.ndarray]] = {band: [] for band in BANDS}
     for drive in drives:
-        rng = np.random.default_rng([PAIR_STREAM, seed])
-        drawn = [_draw(drive, num_pairs, kind, rng) for kind in kinds]
-        if not any(len(sources) for sources, _ in drawn):
+        drawn = {band: draw_scan_pairs(drive, band, num_pairs, seed=seed) for band in BANDS}
+        if not any(map(len, drawn.values())):
             continue
-        for kind, (sources, targets) in zip(kinds, drawn, strict=True):
-            found[kind].append((sources + len(scans), targets + len(scans)))
+        for band, rows in drawn.items():
+            found[band].append(rows + len(scans))
+        rng = np.random.default_rng([YAW_STREAM, seed])
         for row, T in enumerate(true_poses(drive)):
             points, T_turned = turn_scan(read_or_note(drive, row, {}), T, rng)
             scans.append(thin_scan(points, config))
             poses.append(T_turned)
-    joined = (Pairs(kind, *map(np.concatenate, zip(*some, strict=True))) for kind, some in found.items() if some)
-    pairs = tuple(some for some in joined if len(some.sources))
-    pyramids = [pyramid_of_cloud(scan, config) for scan in scans]
-    return EvaluationPairs(scans, pyramids, np.reshape(poses, (-1, 4, 4)), pairs)
-
-
-def _draw(
-    drive: LidarSequence, num_pairs: int, kind: PairKind, rng: np.random.Generator
-) -> tuple[Int[np.ndarray, "p s"], Int[np.ndarray, "p s"]]:
-    distances = scan_distances(drive)
-    pairs = draw_rows_apart(distances, kind.min_distance_m, kind.max_distance_m, num_pairs, rng)
-
-    def maps(rows: Int[np.ndarray, " p"]) -> Int[np.ndarray, "p s"]:
-        is_near = (distances <= MAP_RADIUS_M) & ~np.eye(len(distances), dtype=bool)
-        # A scan without neighbours is repeated.
-        near = [np.flatnonzero(is_near[row]) if is_near[row].any() else np.array([row]) for row in rows]
-        others = [rng.choice(around, kind.num_scans - 1, len(around) < kind.num_scans - 1) for around in near]
-        return np.concatenate([rows[:, None], np.reshape(others, (len(rows), kind.num_scans - 1))], axis=1).astype(int)
-
-    return maps(pairs[:, 0]), maps(pairs[:, 1])
+    pairs = {band: np.concatenate(some) for band, some in found.items() if any(map(len, some))}
+    return EvaluationPairs(
+        scans, [pyramid_of_cloud(scan, config) for scan in scans], np.reshape(poses, (-1, 4, 4)), pairs
+    )
 
 
 def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
-    """Encodes each scan once, and registers all pairs.
+    """Encodes each scan once, and registers all pairs by their descriptors.
 
     Args:
         model: a model of the configuration that the pairs were drawn for.
@@ -176,16 +127,14 @@ def evaluate_registration(model: Model, pairs: EvaluationPairs) -> Evaluation:
         Errors, registrations, descriptors, and the accuracy of offsets.
     """
     clouds = encode_pyramids(model, pairs.pyramids)
-    matches, offsets, recalls = [], [], []
-    for some in pairs.pairs:
-        sides = [_maps(clouds, rows, pairs.T_world_scan) for rows in (some.sources, some.targets)]
-        motions = pairs.true_motions(some)
-        match, found = in_chunks(functools.partial(_register_all, model), *sides, motions.astype(np.float32))
-        matches.append(match)
-        offsets.append(found)
-        recalls.append(registration_recall(match.T_target_source, motions))
-    r2 = offset_r2(offsets if model.config.decoder.predicts_offsets else [])
-    return Evaluation(tuple(recalls), tuple(matches), r2, clouds)
+    recalls, matches, offsets = {}, {}, []
+    for band, rows in pairs.pairs.items():
+        sides = (jax.tree.map(operator.itemgetter(side), clouds) for side in rows.T)
+        motions = pairs.true_motions(band)
+        matches[band], wall = in_chunks(partial(_register_all, model), *sides, motions.astype(np.float32))
+        recalls[band] = registration_recall(matches[band].T_target_source, motions)
+        offsets.append(wall)
+    return Evaluation(recalls, matches, offset_r2(offsets if model.config.decoder.predicts_offsets else []), clouds)
 
 
 def in_chunks(function: Callable[..., Any], *trees: Any, at_once: int = PAIRS_AT_ONCE) -> Any:
@@ -220,10 +169,82 @@ def _register_all(
     return jax.lax.map(best_motion, (sources, targets, T_target_source))
 
 
-def _maps(clouds: DescriptorCloud, rows: Int[np.ndarray, "p s"], T_world_scan: Poses) -> DescriptorCloud:
-    T_map_scan = rigid.inverse(T_world_scan[rows[:, :1]]) @ T_world_scan[rows]
-    of_maps = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], clouds)
-    merged = in_chunks(_merge_all, of_maps, T_map_scan.astype(np.float32))
-    unions = zip(merged.positions, merged.mask, strict=True)
-    masks = [thinned_mask(positions, mask, clouds.mask.shape[1]) for positions, mask in unions]
-    return replace(merged, mask=np.stack(masks))
+TRAINED = ObjectiveConfig()
+
+# Normals at most 30 degrees from the horizontal belong to walls.
+MAX_NORMAL_HEIGHT = 0.5
+
+# Planarity of walls. Below, normals of vegetation and of edges count too; above, few walls are left in sparse scans.
+MIN_PLANARITY = 0.3
+
+
+class WallOffsets(NamedTuple):
+    """Predicted and true offsets of pairs of descriptors, in the frame of the wall of the first descriptor.
+
+    Attributes:
+        predicted: along the horizontal normal, along the wall, and up, metres.
+        true: the same of the true offsets.
+        mask: True for pairs within the radius whose first descriptor lies on an upright wall; others hold anything.
+    """
+
+    predicted: Float[AnyArray, "*p 3"]
+    true: Float[AnyArray, "*p 3"]
+    mask: Bool[AnyArray, "*p"]
+
+
+def offset_r2(parts: Sequence[WallOffsets]) -> Float[np.ndarray, " 3"]:
+    """Computes the coefficients of determination of predicted offsets, all parts together.
+
+    Args:
+        parts: offsets of any number of pairs of clouds.
+
+    Returns:
+        1 less the mean squared residual over the variance of the true offsets, along the normal of the wall, along the
+        wall, and up. NaN along an axis without variance, and without a pair.
+    """
+    pairs = [(np.asarray(part.predicted)[part.mask], np.asarray(part.true)[part.mask]) for part in parts]
+    if not sum(len(true) for _, true in pairs):
+        return np.full(3, np.nan)
+    predicted, true = (np.concatenate(some).astype(np.float64) for some in zip(*pairs, strict=True))
+    squared, variance = np.mean((predicted - true) ** 2, axis=0), np.var(true, axis=0)
+    return np.asarray(1 - np.divide(squared, variance, out=np.full(3, np.nan), where=variance > 0))
+
+
+def wall_offsets(
+    model: Model,
+    source: DescriptorCloud,
+    target: DescriptorCloud,
+    T_target_source: Array,
+    config: ObjectiveConfig = TRAINED,
+) -> WallOffsets:
+    """Predicts the offsets of all close descriptors of which the first lies on an upright wall.
+
+    Args:
+        model: encoder and decoder.
+        source: uncorrelated descriptors of a scan or a map, with normals.
+        target: the same.
+        T_target_source: the true motion, metres.
+        config: radius and number of close pairs.
+
+    Returns:
+        Offsets (m, k, 3) from the descriptors of the source.
+
+    Raises:
+        ValueError: if the source has no normals.
+    """
+    normals, is_wall = _walls(source)
+    source, target = source.described, target.described
+    correlated, others = correlate(model, source, target)
+    close, _ = training_pairs(source, target, T_target_source, config=config)
+    directions = directions_of(source)[:, None]
+    offsets = predict_offsets(model, correlated.features[:, None], others.features, directions, close.indices)
+    predicted, true = (to_ray_frame(values, normals[:, None]) for values in (offsets, close.offsets))
+    return WallOffsets(predicted, true, close.mask & is_wall[:, None])
+
+
+def _walls(cloud: DescriptorCloud) -> tuple[Float[Array, "m 2"], Bool[Array, " m"]]:
+    """Returns the horizontal normals of the descriptors, and True where they lie on upright walls."""
+    num_described = cloud.features.shape[0]
+    elements: SurfaceElements = jax.tree.map(lambda leaf: leaf[:num_described], cloud.elements)
+    is_upright = jnp.abs(elements.normals[:, 2]) <= MAX_NORMAL_HEIGHT
+    return ray_directions(elements.normals), is_upright & (elements.planarity >= MIN_PLANARITY)

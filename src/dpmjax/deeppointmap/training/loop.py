@@ -12,21 +12,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import flax.struct
 import jax
 import numpy as np
-from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig, layout_capacity
 from dpmjax.deeppointmap.training.overlap_stage import (
-    OverlapHooks,
     OverlapState,
     init_overlap,
     train_overlap,
@@ -192,7 +190,6 @@ def train(
     *,
     seed: int = 0,
     start: TrainingProgress | Model | None = None,
-    cache: Path | None = None,
     hooks: TrainingHooks | None = None,
 ) -> Trained:
     """Trains a model on drives with poses, on all devices, or continues a training (DeepPointMap section 3.3).
@@ -209,7 +206,6 @@ def train(
         seed: seed of parameters, samples and augmentation.
         start: progress to continue from, of which that of process 0 counts; or a model with the first parameters;
             None begins with random ones.
-        cache: folder where scans that are prepared here are kept for later calls; None keeps them in memory.
         hooks: evaluation, which chooses the best model, reports and stopping; None shows a bar, and
             `TrainingHooks()` nothing.
 
@@ -218,18 +214,15 @@ def train(
 
     Raises:
         ValueError: if there is no drive, or `start` is a model of another network. Also if a drive has no poses, no
-            readable scan, or no two scans at a distance of `config.sampling`. Also if all scans overlap or none do,
-            and if `cache` is given with prepared scans.
+            readable scan, or no two scans at a distance of `config.sampling`. Also if all scans overlap or none do.
         TrainingLostError: if the loss is not finite.
     """
-    if cache is not None and isinstance(drives, ScanStore):
-        raise ValueError("cache: expected None, because the scans of a ScanStore are prepared already")
     is_head_alone = "registration" not in config.stages
     # Calibrations belong to the parameters that they were fitted for; the head is not among them.
     kept = start.config if is_head_alone and isinstance(start, Model) else None
     config = replace(config, model=replace(config.model, calibration=None, overlap=None, trained=()))
     begun = start if isinstance(start, TrainingProgress) else begin_training(config, seed=seed, start=start)
-    store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, folder=cache, seed=seed)
+    store = drives if isinstance(drives, ScanStore) else prepare_drives(drives, config, seed=seed)
     if "overlap" in config.stages and (reason := why_no_overlap(store.table)) is not None:
         raise ValueError(f"drives: {reason}; leave the stage overlap out")
     if is_head_alone:
@@ -257,8 +250,10 @@ def _with_trained_head(
     num_steps = config.overlap.num_steps(len(store.table))
     if is_first():
         with progress_bar("train overlap", total=num_steps, unit="steps", is_shown=hooks is None) as bar:
-            shown = OverlapHooks(lambda *_: bar.update()) if hooks is None else OverlapHooks(stop=hooks.stop)
-            _, state = train_overlap(store, first.model, config, seed=seed, hooks=shown)
+            stop = int if hooks is None else hooks.stop
+            _, state = train_overlap(
+                store, first.model, config, seed=seed, on_report=lambda *_: bar.update(), stop=stop
+            )
     state = from_first(state)
     is_whole = int(state.step) >= num_steps
     model = _local(with_head(first.model, state.head, is_trained=is_whole))
@@ -273,17 +268,17 @@ def _run_steps(
     progress = place(from_first(start), mesh)
     step = make_step(config, mesh if jax.device_count() > 1 else None)
     speed, seen, stopped_by = Speed(), set[Layout](), 0
-    numbers = jax.process_index() * num_local + np.arange(num_local)
+    numbers = range(num_local * jax.process_index(), num_local * (jax.process_index() + 1))
     number, end = int(progress.state.step), int(progress.state.end)
-    with SampleMaker(store, config, seed=seed, numbers=numbers, num_in_step=jax.device_count()) as maker:
-        batches = maker.batches(number, max(end, config.num_steps))
+    maker = SampleMaker(store, config, seed, numbers=numbers, num_in_step=jax.device_count())
+    with closing(maker.batches(number, max(end, config.num_steps))) as batches:
         batch = next(batches) if number < end else None
         while batch is not None:
             stopped_by, left = map(int, from_first((int(hooks.stop()), hooks.steps_left(number))))
             if stopped_by:
                 break
             if left > 0 and (new_end := min(number + left, max(end, config.num_steps))) != end:
-                progress, end = replace(progress, state=_ended_at(progress.state, new_end, mesh)), new_end
+                progress, end = replace(progress, state=finish(progress.state, new_end - number)), new_end
             stage, layout = config.stage_at(number), config.layout_at(number, seed=seed)
             capacity = layout_capacity(layout, config.sampling)
             begun = time.perf_counter()
@@ -301,16 +296,6 @@ def _run_steps(
             if is_first():
                 hooks.on_report(StepRecord(number, stage, report, score, speed), progress)
     return progress, stopped_by, speed
-
-
-def _ended_at(state: TrainingState, end: int, mesh: Mesh) -> TrainingState:
-    planned = finish(state, end - int(state.step))
-    return replace(
-        state,
-        end=place(planned.end, mesh),
-        planned_at=place(planned.planned_at, mesh),
-        planned_progress=place(planned.planned_progress, mesh),
-    )
 
 
 def _timed(speed: Speed, seconds: float, num_scans: int) -> Speed:

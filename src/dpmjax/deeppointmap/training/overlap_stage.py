@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -20,9 +20,9 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from dpmjax.deeppointmap.encoding import pooled_vector
+from dpmjax.deeppointmap.evaluation import NO_OVERLAP_M, REVISIT_PATH_M
 from dpmjax.deeppointmap.model import Model, correlate, decode
 from dpmjax.deeppointmap.overlap_prediction import OVERLAP_M
-from dpmjax.deeppointmap.scan_evaluation import NO_OVERLAP_M, REVISIT_PATH_M
 from dpmjax.deeppointmap.training.curriculum import TrainingConfig
 from dpmjax.deeppointmap.training.evaluation import in_chunks
 from dpmjax.deeppointmap.training.sampling import NUM_ATTEMPTS, SampleScans, ScanTable
@@ -63,31 +63,15 @@ class OverlapRecord(NamedTuple):
 
     Attributes:
         step: number of steps done.
-        num_steps: number of steps of the stage.
         loss: binary cross entropy of the batch, before the step.
         accuracy: share of the pairs of the batch that the head classified right.
         learning_rate: learning rate of the step.
     """
 
     step: int
-    num_steps: int
     loss: float
     accuracy: float
     learning_rate: float
-
-
-@dataclass(frozen=True)
-class OverlapHooks:
-    """Functions that the stage calls.
-
-    Attributes:
-        on_report: gets the record and the state after each step.
-        stop: called before each step; any number but 0 ends the stage.
-    """
-
-    on_report: Callable[[OverlapRecord, OverlapState], object] = lambda _record, _state: None
-    # int() is 0: by default nothing ends the stage.
-    stop: Callable[[], int] = int
 
 
 class PairFeatures(NamedTuple):
@@ -104,9 +88,6 @@ class PairFeatures(NamedTuple):
     is_overlap: Bool[AnyArray, " p"]
 
 
-NO_HOOKS = OverlapHooks()
-
-
 def train_overlap(
     store: ScanStore,
     model: Model,
@@ -114,7 +95,8 @@ def train_overlap(
     *,
     seed: int = 0,
     start: OverlapState | None = None,
-    hooks: OverlapHooks = NO_HOOKS,
+    on_report: Callable[[OverlapRecord, OverlapState], object] = lambda _record, _state: None,
+    stop: Callable[[], int] = int,
 ) -> tuple[Model, OverlapState]:
     """Trains the overlap head of a model; all other parameters stay.
 
@@ -124,7 +106,8 @@ def train_overlap(
         config: settings of training.
         seed: seed of the pairs and of their augmentation.
         start: state to continue from; None begins with the head of the model.
-        hooks: reports and stopping.
+        on_report: gets the record and the state after each step.
+        stop: called before each step; any number but 0 ends the stage.
 
     Returns:
         The model, `config.trained` with "overlap" if the stage came to its end; and the last state.
@@ -136,10 +119,13 @@ def train_overlap(
         raise ValueError(f"store: {reason}")
     settings, state = config.overlap, init_overlap(model) if start is None else start
     num_steps = settings.num_steps(len(store.table))
+    schedule = optax.cosine_decay_schedule(
+        config.learning_rate, num_steps, config.final_learning_rate / config.learning_rate
+    )
     frozen = Model(model.params, replace(model.config, calibration=None, overlap=None, trained=()))
     pool = _make_pool(store, frozen, config, seed) if settings.pool_pairs and int(state.step) < num_steps else None
     for step in range(int(state.step), num_steps):
-        if hooks.stop():
+        if stop():
             break
         pairs = (
             _new_pairs(store, frozen, config, (seed, step)) if pool is None else _pool_batch(pool, config, seed, step)
@@ -147,11 +133,10 @@ def train_overlap(
         # Either scan may be the first.
         sides = np.random.default_rng([ORDER_STREAM, seed, step]).permutation(2)
         batch = PairFeatures(pairs.features[:, sides], pairs.mask[:, sides], pairs.is_overlap)
-        rate = _learning_rate(config, step, num_steps)
+        rate = settings.rate_share * float(schedule(step))
         state, loss, accuracy = _step(state, frozen, batch, rate, settings.rate_share * WEIGHT_DECAY)
-        hooks.on_report(OverlapRecord(step + 1, num_steps, float(loss), float(accuracy), rate), state)
-    is_trained = int(state.step) >= num_steps
-    return with_head(model, state.head, is_trained=is_trained), state
+        on_report(OverlapRecord(step + 1, float(loss), float(accuracy), rate), state)
+    return with_head(model, state.head, is_trained=int(state.step) >= num_steps), state
 
 
 def init_overlap(model: Model) -> OverlapState:
@@ -219,17 +204,20 @@ def draw_overlap_pairs(
     Returns:
         Rows of the scans of each pair.
     """
-    bands = ((0.0, OVERLAP_M), (OVERLAP_M, NO_OVERLAP_M), (NO_OVERLAP_M, np.inf), (OVERLAP_M, np.inf))
-    numbers = num_pairs - 2 * (num_pairs // 4), num_pairs // 4, num_pairs // 4
+    quarter, apart = num_pairs // 4, (OVERLAP_M, np.inf)
+    bands = {
+        (0.0, OVERLAP_M): num_pairs - 2 * quarter,
+        (OVERLAP_M, NO_OVERLAP_M): quarter,
+        (NO_OVERLAP_M, np.inf): quarter,
+    }
     anchors = np.arange(len(table)) if anchors is None else anchors
-    pairs: list[tuple[int, int]] = []
-    for band, number in zip(bands, numbers, strict=False):
+    pairs = []
+    for band, number in bands.items():
         for _ in range(number):
             found = _partner(table, band, anchors, rng)
             if found is None and band[0] > 0:
-                found = _partner(table, bands[-1], anchors, rng)
-            if found is not None:
-                pairs.append(found)
+                found = _partner(table, apart, anchors, rng)
+            pairs += [] if found is None else [found]
     return np.array(pairs, int).reshape(-1, 2)
 
 
@@ -296,9 +284,7 @@ def _pool_batch(pool: PairFeatures, config: TrainingConfig, seed: int, step: int
     """Returns the batch of a step; every pair is in one batch of an epoch."""
     num_pairs, size = len(pool.is_overlap), config.overlap.batch_pairs
     epochs, places = np.divmod(np.arange(step * size, (step + 1) * size), num_pairs)
-    orders = [
-        np.random.default_rng([ORDER_STREAM, seed, epoch, 1]).permutation(num_pairs) for epoch in np.unique(epochs)
-    ]
+    orders = [np.random.default_rng([ORDER_STREAM, seed, one, 1]).permutation(num_pairs) for one in np.unique(epochs)]
     rows = np.concatenate(orders)[places + num_pairs * (epochs - epochs[0])]
     return PairFeatures(*(column[rows] for column in pool))
 
@@ -380,11 +366,3 @@ def head_logits(model: Model, pairs: PairFeatures) -> Float[Array, " p"]:
         return jnp.asarray(decode(model, *clouds, part="overlap_logit"))
 
     return jax.vmap(one)(jnp.asarray(pairs.features, jnp.float32), jnp.asarray(pairs.mask))
-
-
-def _learning_rate(config: TrainingConfig, step: int, num_steps: int) -> float:
-    """Returns a cosine over the whole stage."""
-    schedule = optax.cosine_decay_schedule(
-        config.learning_rate, num_steps, config.final_learning_rate / config.learning_rate
-    )
-    return config.overlap.rate_share * float(schedule(step))

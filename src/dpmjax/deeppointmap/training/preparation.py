@@ -23,8 +23,9 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from dpmjax.deeppointmap.encoding import pyramid_of_cloud
+from dpmjax.deeppointmap.evaluation import true_poses
 from dpmjax.deeppointmap.training.curriculum import MIN_DISTANCE_M, SamplingConfig, TrainingConfig
-from dpmjax.geometry.pyramid_storage import pack_pyramid, record_type
+from dpmjax.geometry.pyramid_storage import record_type, store_pyramid
 from dpmjax.scans.augment import SPARSE_POINTS, AugmentConfig, augment_scan
 from dpmjax.scans.preprocess import MAX_CAPACITY, preprocess_scan_on_host
 from dpmjax.sequences import LidarSequence
@@ -77,18 +78,12 @@ def stored_bytes(config: TrainingConfig) -> int:
     return config.num_variants * _record_type(config).itemsize
 
 
-def prepare_drive(
-    drive: LidarSequence, config: TrainingConfig, *, folder: Path | None = None, seed: int = 0
-) -> PreparedDrive:
-    """Makes the pyramids of all variants of all scans, or finds the file that an earlier call has made.
-
-    A file belongs to the poses, the first, middle and last scan, the settings and the seed. It is written under another
-    name until it is whole. Where `config.num_variants` is 0, nothing is made.
+def prepare_drive(drive: LidarSequence, config: TrainingConfig, *, seed: int = 0) -> PreparedDrive:
+    """Makes the pyramids of all variants of all scans, in memory. Where `config.num_variants` is 0, nothing is made.
 
     Args:
         drive: drive with poses.
         config: settings of training.
-        folder: folder of the files; None keeps the pyramids in memory.
         seed: seed of the variants.
 
     Returns:
@@ -97,21 +92,15 @@ def prepare_drive(
     Raises:
         ValueError: if the drive has no poses.
     """
-    poses = drive.T_world_lidar
-    if poses is None:
-        raise ValueError("drives: expected a true pose for each scan, got a drive without poses")
+    poses = true_poses(drive)
     if config.num_variants == 0:
         return PreparedDrive(poses, drive, {})
-    scans = prepare_variants(drive, range(len(drive)), config, seed)
-    if folder is None:
-        pyramids = np.zeros((len(drive), config.num_variants), _record_type(config))
-        return PreparedDrive(poses, pyramids, _fill(pyramids, scans))
-    path = prepared_path(drive, config, folder, seed)
-    return find_prepared(path, poses) or store_scans(path, poses, scans, config)
+    pyramids = np.zeros((len(drive), config.num_variants), _record_type(config))
+    return PreparedDrive(poses, pyramids, _fill(pyramids, prepare_variants(drive, range(len(drive)), config, seed)))
 
 
 def prepared_path(drive: LidarSequence, config: TrainingConfig, folder: Path, seed: int) -> Path:
-    """Finds the name of the file of a drive, which depends on its scans and on the settings.
+    """Finds the name of the file of a drive: of its poses, its first, middle and last scan, the settings and the seed.
 
     Args:
         drive: drive with poses; up to three of its scans are read.
@@ -122,7 +111,22 @@ def prepared_path(drive: LidarSequence, config: TrainingConfig, folder: Path, se
     Returns:
         The path, whether the file is there or not.
     """
-    return folder / f"{_key(drive, config, seed)}.npy"
+    model = config.model
+    settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
+    settings[-1]["sparse_points"] = SPARSE_POINTS  # decides the points that are kept
+    # Motions are drawn in the step, so they do not change the file.
+    for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
+        del settings[-1][name]
+    order = [] if config.thins_as_in_use else ["shuffled"]
+    content = json.dumps([FORMAT, settings, model.scale_m, config.num_variants, seed, *order], sort_keys=True)
+    digest = hashlib.sha256(content.encode())
+    digest.update(np.ascontiguousarray(drive.T_world_lidar).tobytes())
+    for number in sorted({0, len(drive) // 2, len(drive) - 1}):
+        try:
+            digest.update(np.ascontiguousarray(drive.read_scan(number)).tobytes())
+        except ValueError as error:
+            digest.update(str(error).encode())
+    return folder / f"{digest.hexdigest()[:24]}.npy"
 
 
 def find_prepared(path: Path, T_world_lidar: Poses) -> PreparedDrive | None:
@@ -229,10 +233,11 @@ def scan_records(points: Float[np.ndarray, "n 3"], config: TrainingConfig, seeds
     Returns:
         A record of `record_type` for each variant.
     """
-    records = np.zeros(config.num_variants, _record_type(config))
-    for record, cloud in zip(records, _variants(points, config, seeds), strict=True):
-        pack_pyramid(pyramid_of_cloud(cloud, config.model, num_threads=1), record)
-    return records
+    stored = (
+        store_pyramid(pyramid_of_cloud(cloud, config.model, num_threads=1))
+        for cloud in _variants(points, config, seeds)
+    )
+    return np.array([tuple(jax.tree.leaves(one)) for one in stored], _record_type(config))
 
 
 def _record_type(config: TrainingConfig) -> np.dtype:
@@ -278,35 +283,13 @@ def variants_on_host(
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(VARIANT_STREAM), seeds[0]), seeds[1])
         host = PointCloud(np.asarray(cloud.points), np.asarray(cloud.mask))
         done = jax.device_get(_augmented(host, jax.random.split(key, num_variants), config=config))
-    variants = []
-    for points, mask in zip(done.points, done.mask, strict=True):
-        front = np.argsort(~mask, kind="stable")
-        variants.append(PointCloud(points[front], mask[front]))
-    return variants
+    fronts = np.argsort(~done.mask, axis=1, kind="stable")
+    return [PointCloud(*(leaf[row][front] for leaf in (done.points, done.mask))) for row, front in enumerate(fronts)]
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def _augmented(cloud: PointCloud, keys: Array, *, config: AugmentConfig) -> PointCloud:
     return jax.vmap(lambda key: augment_scan(jax.tree.map(jnp.asarray, cloud), config, key=key).cloud)(keys)
-
-
-def _key(drive: LidarSequence, config: TrainingConfig, seed: int) -> str:
-    model = config.model
-    settings = [dataclasses.asdict(part) for part in (model.preprocess, model.pyramid, config.augment)]
-    settings[-1]["sparse_points"] = SPARSE_POINTS  # decides the points that are kept
-    # Motions are drawn in the step, so they do not change the file.
-    for name in ("max_yaw_rad", "max_tilt_rad", "tilt_power", "translation_sigma_m"):
-        del settings[-1][name]
-    order = [] if config.thins_as_in_use else ["shuffled"]
-    content = json.dumps([FORMAT, settings, model.scale_m, config.num_variants, seed, *order], sort_keys=True)
-    digest = hashlib.sha256(content.encode())
-    digest.update(np.ascontiguousarray(drive.T_world_lidar).tobytes())
-    for number in sorted({0, len(drive) // 2, len(drive) - 1}):
-        try:
-            digest.update(np.ascontiguousarray(drive.read_scan(number)).tobytes())
-        except ValueError as error:
-            digest.update(str(error).encode())
-    return digest.hexdigest()[:24]
 
 
 def why_useless(drive: LidarSequence, sampling: SamplingConfig = PUBLISHED) -> str | None:

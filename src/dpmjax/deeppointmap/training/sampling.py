@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import flax.struct
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -23,7 +22,6 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.pyramid_storage import StoredPyramid
 from dpmjax.types import AnyArray, Poses
 
-TreeT = TypeVar("TreeT")
 NUM_ATTEMPTS = 100
 
 
@@ -245,18 +243,6 @@ def arrange_groups(groups: Sequence[Group], capacity: Layout, placed: PlacedScan
     for number, (source, target) in enumerate(numbered):
         T[number] = rigid.inverse(T_world_scan[target[0]]) @ T_world_scan[source[0]]
     return GroupBatch(sources, targets, T, np.arange(capacity.num_groups) < len(numbered))
-
-
-def stack(trees: Sequence[TreeT]) -> TreeT:
-    """Stacks pytrees of NumPy arrays along a new first axis.
-
-    Args:
-        trees: pyramids or samples of the same shapes.
-
-    Returns:
-        One tree of NumPy arrays.
-    """
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def _maps_of_scans(

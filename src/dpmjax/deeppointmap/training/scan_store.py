@@ -9,12 +9,13 @@ from __future__ import annotations
 import functools
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -35,7 +36,6 @@ from dpmjax.deeppointmap.training.sampling import (
     ScanTable,
     arrange_groups,
     draw_groups,
-    stack,
 )
 from dpmjax.geometry.pyramid_storage import sampled_positions, stored_pyramids
 from dpmjax.scans.augment import random_motions_on_host
@@ -105,15 +105,12 @@ class ScanStore:
         return pyramids[number, variant]
 
 
-def prepare_drives(
-    drives: Sequence[LidarSequence], config: TrainingConfig, *, folder: Path | None = None, seed: int = 0
-) -> ScanStore:
+def prepare_drives(drives: Sequence[LidarSequence], config: TrainingConfig, *, seed: int = 0) -> ScanStore:
     """Prepares the scans of all drives, in order.
 
     Args:
         drives: drives with poses.
         config: settings of training.
-        folder: folder of prepared scans for later calls; None keeps them in memory.
         seed: seed of the variants.
 
     Returns:
@@ -130,40 +127,27 @@ def prepare_drives(
     prepared = []
     for number, drive in enumerate(drives):
         LOGGER.info("prepares %s, %d scans, drive %d of %d", drive.name, len(drive), number + 1, len(drives))
-        prepared.append(prepare_drive(drive.take(drive.has_reference), config, folder=folder, seed=seed))
+        prepared.append(prepare_drive(drive.take(drive.has_reference), config, seed=seed))
     return ScanStore(prepared)
 
 
+@dataclass(frozen=True)
 class SampleMaker:
-    """Makes the batch of any step; a context manager that ends its thread."""
+    """Makes the batch of any step.
 
-    def __init__(
-        self,
-        store: ScanStore,
-        config: TrainingConfig,
-        *,
-        seed: int,
-        numbers: Sequence[int] | Int[np.ndarray, " d"] = (0,),
-        num_in_step: int = 1,
-    ) -> None:
-        """Starts the thread.
+    Attributes:
+        store: the scans.
+        config: settings of training.
+        seed: seed of the run.
+        numbers: which of the samples of a step this process makes, one for each of its devices.
+        num_in_step: number of samples of a step, one for each device of all processes.
+    """
 
-        Args:
-            store: the scans.
-            config: settings of training.
-            seed: seed of the run.
-            numbers: which of the samples of a step this process makes, one for each of its devices.
-            num_in_step: number of samples of a step, one for each device of all processes.
-        """
-        self._store, self._config, self._seed = store, config, seed
-        self._numbers, self._num_in_step = [int(number) for number in numbers], num_in_step
-        self._thread = ThreadPoolExecutor(1)
-
-    def __enter__(self) -> SampleMaker:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._thread.shutdown(wait=True, cancel_futures=True)
+    store: ScanStore
+    config: TrainingConfig
+    seed: int
+    numbers: Sequence[int] = (0,)
+    num_in_step: int = 1
 
     def __call__(self, step: int) -> RegistrationSample:
         """Makes the batch of a step, the same one every time.
@@ -174,9 +158,11 @@ class SampleMaker:
         Returns:
             Samples of NumPy arrays, stacked.
         """
-        return stack([self._sample(step, number) for number in self._numbers])
+        samples = [self._sample(step, number) for number in self.numbers]
+        batch: RegistrationSample = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
+        return batch
 
-    def batches(self, start: int, stop: int) -> Iterator[RegistrationSample]:
+    def batches(self, start: int, stop: int) -> Generator[RegistrationSample]:
         """Makes the batches of the steps from `start` to `stop - 1`, each some steps before it is needed.
 
         Args:
@@ -187,32 +173,36 @@ class SampleMaker:
             The batches in order.
         """
         ahead: deque[Future[RegistrationSample]] = deque()
-        for step in range(start, stop + STEPS_AHEAD):
-            if step < stop:
-                ahead.append(self._thread.submit(self, step))
-            if step >= start + STEPS_AHEAD:
-                yield ahead.popleft().result()
+        thread = ThreadPoolExecutor(1)
+        try:
+            for step in range(start, stop + STEPS_AHEAD):
+                if step < stop:
+                    ahead.append(thread.submit(self, step))
+                if step >= start + STEPS_AHEAD:
+                    yield ahead.popleft().result()
+        finally:
+            thread.shutdown(wait=True, cancel_futures=True)
 
     def _sample(self, step: int, number: int) -> RegistrationSample:
-        rng = np.random.default_rng([SAMPLE_STREAM, self._seed, step, number])
-        table, sampling = self._store.table, self._config.sampling
-        layout = self._config.layout_at(step, seed=self._seed)
+        rng = np.random.default_rng([SAMPLE_STREAM, self.seed, step, number])
+        table, sampling = self.store.table, self.config.sampling
+        layout = self.config.layout_at(step, seed=self.seed)
         capacity = layout_capacity(layout, sampling)
         groups = draw_groups(table, self._anchor(step, number), layout, sampling, rng)
         rows = np.concatenate([group.rows for group in groups])
         # The number of scans is always that of the capacity: another number would be compiled again.
         num_spare = capacity.num_scans - len(rows)
         padded = np.concatenate([rows, np.full(num_spare, rows[0])])
-        scans, placed = self._store.read(padded, self._config, rng)
+        scans, placed = self.store.read(padded, self.config, rng)
         placed = PlacedScans(*(values[: len(rows)] for values in placed))
-        if self._config.refines_labels:
+        if self.config.refines_labels:
             motions = np.asarray(scans.T_augmented_lidar)[: len(rows)]
-            points = moved_points(scans.pyramids, motions, self._config.model.scale_m)
-            placed = refine_labels(placed, points, groups, mapper=self._store.threads.map)
-        return RegistrationSample(scans, arrange_groups(groups, capacity, placed, thins=self._config.thins_maps))
+            points = moved_points(scans.pyramids, motions, self.config.model.scale_m)
+            placed = refine_labels(placed, points, groups, mapper=self.store.threads.map)
+        return RegistrationSample(scans, arrange_groups(groups, capacity, placed, thins=self.config.thins_maps))
 
     def _anchor(self, step: int, number: int) -> int:
         # Every scan is a first anchor once in an epoch, whatever the number of devices.
-        epoch, place = divmod(step * self._num_in_step + number, len(self._store.table))
-        order = np.random.default_rng([EPOCH_STREAM, self._seed, epoch]).permutation(len(self._store.table))
+        epoch, place = divmod(step * self.num_in_step + number, len(self.store.table))
+        order = np.random.default_rng([EPOCH_STREAM, self.seed, epoch]).permutation(len(self.store.table))
         return int(order[place])

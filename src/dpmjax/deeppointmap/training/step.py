@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -123,12 +122,8 @@ def finish(state: TrainingState, num_steps: int) -> TrainingState:
         The state with its new end.
     """
     require_count("num_steps", num_steps)
-    plan: dict[str, Any] = {
-        name: np.asarray(getattr(state, name)) for name in ("step", "end", "planned_at", "planned_progress")
-    }
-    progress = np.asarray(_progress(replace(state, **plan)))
-    end = np.asarray(plan["step"] + num_steps, np.int32)
-    return replace(state, end=end, planned_at=plan["step"], planned_progress=progress)
+    end = state.step + num_steps
+    return replace(state, end=end, planned_at=state.step, planned_progress=_progress(state))
 
 
 def make_step(config: TrainingConfig, mesh: Mesh | None = None) -> Step:

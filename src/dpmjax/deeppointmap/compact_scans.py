@@ -1,116 +1,21 @@
-"""A scan that is ready for registrations, and its compact form for maps: small integers from which it is restored."""
+"""The compact form of a scan for maps: small integers from which it is restored for registrations."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Int16, UInt8
 
-from dpmjax.deeppointmap.encoding import encode, pyramid_of_scan, valid_points
-from dpmjax.deeppointmap.model import Model, encode_pyramid
-from dpmjax.deeppointmap.verification import NUM_THREADS
-from dpmjax.reading import read_path
-from dpmjax.scans.lidar import Scan, measure_scan
+from dpmjax.scans.lidar import Scan
 from dpmjax.scans.surfaces import RangeImage, surface_of_elements
-from dpmjax.types import DescriptorCloud, RawScan, SurfaceElements
+from dpmjax.types import DescriptorCloud, SurfaceElements
 
 MAX_COORDINATE = np.iinfo(np.int16).max
 MAX_COMPONENT = np.iinfo(np.int8).max
 MAX_CODE = np.iinfo(np.uint8).max
 # Ranges of the codes, 2.3 % apart.
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 150.0
-
-
-# A raw scan, a prepared scan, or descriptors of a scan or of a map.
-ScanOrCloud = DescriptorCloud | Scan | RawScan
-
-
-def descriptors_of(scan: DescriptorCloud | Scan) -> DescriptorCloud:
-    """Returns the descriptors of a prepared scan, or the cloud itself; a `ValueError` refuses a scan without any."""
-    cloud = scan.descriptors if isinstance(scan, Scan) else scan
-    if cloud is None:
-        raise ValueError("scan: expected descriptors, got a scan that is not encoded; call prepare_scan")
-    return cloud
-
-
-def prepare_scan(model: Model, points: RawScan, *, scale: float = 1.0) -> Scan:
-    """Encodes a raw scan and prepares the verification by its points, so that `register` need not do it again.
-
-    Raises a `ValueError` if the points are no real numbers (n, 3), or if the scale is not positive.
-
-    Args:
-        model: encoder and configuration.
-        points: (n, 3), metres, in the frame of the lidar, or their file; points that are not finite are dropped.
-        scale: see `encode`.
-
-    Returns:
-        Descriptors, surface and free space.
-    """
-    return prepare_scans(model, [points], scale=scale)[0]
-
-
-def prepare_scans(model: Model, scans: Iterable[RawScan], *, scale: float = 1.0) -> list[Scan]:
-    """Prepares scans in their order; threads measure their surfaces while JAX encodes.
-
-    Raises a `ValueError` if the points of a scan are no real numbers (n, 3).
-
-    Args:
-        model: encoder and configuration.
-        scans: points in metres, each in the frame of its lidar.
-        scale: see `encode`.
-
-    Returns:
-        The prepared scans.
-    """
-    # Threads run NumPy only: compiled programs need threads of JAX, and several may wait for each other.
-    with ThreadPoolExecutor(NUM_THREADS) as pool:
-        clouds, measured = [], []
-        for scan in scans:
-            points = cast(RawScan, read_path(scan, "io.read_lidar_file"))
-            pyramid = pyramid_of_scan(points, model.config, scale=scale)
-            measured.append(pool.submit(measure_scan, valid_points(points), model.config.verification.surface))
-            clouds.append(encode_pyramid(model, pyramid))
-        return [
-            future.result()._replace(descriptors=cloud, scale=scale)
-            for cloud, future in zip(clouds, measured, strict=True)
-        ]
-
-
-def is_verified_pair(pair: tuple[ScanOrCloud, ScanOrCloud]) -> bool:
-    """Returns True where both sides are scans, so that their surfaces can verify a motion."""
-    return not any(isinstance(scan, DescriptorCloud) for scan in pair)
-
-
-def prepare_each(
-    model: Model, pairs: Sequence[tuple[ScanOrCloud, ScanOrCloud]], scale: float, *, num_elements: int | None
-) -> dict[tuple[int, bool], DescriptorCloud | Scan]:
-    """Prepares each scan object of pairs once for each use: surfaces are measured where both sides are scans.
-
-    Args:
-        model: encoder and configuration.
-        pairs: source and target of each.
-        scale: see `encode`.
-        num_elements: see `encode`, for a scan that is registered with a cloud.
-
-    Returns:
-        Prepared scans, or descriptors, by the id of each object and `is_verified_pair` of its pair.
-    """
-    raw: dict[tuple[int, bool], RawScan] = {}
-    ready: dict[tuple[int, bool], DescriptorCloud | Scan] = {}
-    for pair in pairs:
-        is_verified = is_verified_pair(pair)
-        for scan in pair:
-            use = id(scan), is_verified
-            if isinstance(scan, DescriptorCloud | Scan):
-                ready[use] = scan
-            elif is_verified:
-                raw[use] = scan
-            elif use not in ready:
-                ready[use] = encode(model, scan, scale=scale, num_elements=num_elements)
-    return {**ready, **dict(zip(raw, prepare_scans(model, list(raw.values()), scale=scale), strict=True))}
 
 
 class CompactElements(NamedTuple):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from dpmjax.deeppointmap import init_model, model_preset
+from dpmjax.deeppointmap.compact_scans import compact_scan, expand_scan, round_directions, round_features
 from dpmjax.deeppointmap.encoding import pyramid_of_scan
 from dpmjax.deeppointmap.model import model_fingerprint
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
-from dpmjax.deeppointmap.prepared_scans import compact_scan, expand_scan, round_directions, round_features
 from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.normals import pyramid_elements
