@@ -112,15 +112,22 @@ def as_user() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-@pytest.fixture
-def weights(tmp_path) -> Path:
-    """A file of a network that compiles in seconds."""
+@pytest.fixture(scope="session")
+def model():
+    """A network that compiles in seconds."""
     import dpmjax
     from tests.deeppointmap import toy
 
-    path = tmp_path / "model.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
-    return path
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+@pytest.fixture
+def weights(model, tmp_path) -> Path:
+    """The file of this network."""
+    import dpmjax
+
+    dpmjax.save_model(model, tmp_path / "model.safetensors", card="toy")
+    return tmp_path / "model.safetensors"
 
 
 @pytest.fixture

@@ -33,11 +33,6 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def model():
-    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
-
-
 def test_scans_of_the_network_may_be_files(folder, model) -> None:
     a, b = toy.drive(num_scans=2)
     files = str(folder / "a.npy"), folder / "b.npy"

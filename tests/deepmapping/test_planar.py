@@ -1,7 +1,5 @@
 """Laws of DeepMapping on planar scans."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -104,9 +102,8 @@ def test_an_epoch_has_every_scan_once_in_the_order_of_time(num_scans: int) -> No
     phase = replace(dm.preset("paper").cold_phases[0], scans_per_step=4)
     num_steps = -(-num_scans // 4)
     for epoch in range(2):
-        batches = [
-            blocks_of_step(phase, num_scans, jnp.int32(epoch * num_steps + k), key=KEY) for k in range(num_steps)
-        ]
+        steps = jnp.arange(epoch * num_steps, (epoch + 1) * num_steps, dtype=jnp.int32)
+        batches = [blocks_of_step(phase, num_scans, step, key=KEY) for step in steps]
         rows = np.concatenate([np.asarray(batch.rows[batch.is_scan]) for batch in batches])
         assert rows.tolist() == list(range(num_scans))
 
@@ -215,9 +212,8 @@ def test_scans_are_drawn_in_blocks_of_neighbours(num_scans: int, scans_per_step:
 def test_masked_beams_never_matter_and_those_that_are_zero_or_not_finite_are_masked(tiny_data) -> None:
     scans = tiny_data.scans
     mask = scans.mask & (jax.random.uniform(KEY, scans.mask.shape) < 0.8)
-    one, *others = (
-        as_scan_set(ScanSet(jnp.where(mask[..., None], scans.points, filling), mask)) for filling in (0.0, 1e6, np.nan)
-    )
+    filled = (jnp.where(mask[..., None], scans.points, filling) for filling in (0.0, 1e6, np.nan))
+    one, *others = (as_scan_set(ScanSet(points, mask)) for points in filled)
     points = np.where(mask[..., None], scans.points, 0.0)
     points[::2] = np.where(mask[::2, :, None], points[::2], np.nan)
     for other in (*others, as_scan_set(points)):

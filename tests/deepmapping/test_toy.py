@@ -1,21 +1,12 @@
 """Laws of the one-dimensional example (supplement D)."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dpmjax.deepmapping.engine import fit
-from dpmjax.deepmapping.toy import (
-    GLOBAL_MINIMUM,
-    ScalarNet,
-    ToyConfig,
-    network_value,
-    toy_loss,
-    toy_problem,
-)
+from dpmjax.deepmapping.toy import GLOBAL_MINIMUM, ScalarNet, ToyConfig, network_value, toy_loss, toy_problem
 from experiments.toy_1d import minimize
 from tests.tolerances import ACCUMULATED, ROUNDING
 

@@ -1,7 +1,5 @@
 """Laws of windows: cut and joined without a loss, and each with an L-Net of its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

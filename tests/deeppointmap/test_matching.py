@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import functools
 
 import jax
@@ -157,9 +155,8 @@ def test_merging_turns_elements_and_leaves_those_with_features_in_front() -> Non
     features = rng.normal(size=(2, 3, 4)).astype(np.float32)
     mask = np.array([[True] * 5, [True, False, True, True, False]])
     positions[~mask] = np.nan
-    clouds = DescriptorCloud(
-        positions, features, mask, normals=normals, planarity=rng.random((2, 5)).astype(np.float32)
-    )
+    planarity = rng.random((2, 5)).astype(np.float32)
+    clouds = DescriptorCloud(positions, features, mask, normals=normals, planarity=planarity)
     poses = np.stack([np.eye(4), np.asarray(T)])
     merged = merge_clouds(clouds, poses)
     described = [(cloud, row) for cloud in range(2) for row in range(3)]

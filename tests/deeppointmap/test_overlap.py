@@ -1,7 +1,5 @@
 """The evidence of overlap, and the probability that it gives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -52,9 +50,8 @@ def test_evidence_has_the_names_that_the_probability_is_fitted_on() -> None:
 @pytest.mark.slow
 def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     a, b = cloud(1), cloud(2)
-    features = [
-        np.asarray(decode(model, one.features, part="similarity_head"), float) for one in correlate(model, a, b)
-    ]
+    heads = [decode(model, one.features, part="similarity_head") for one in correlate(model, a, b)]
+    features = [np.asarray(head, float) for head in heads]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in features]
     similarity = unit[0] @ unit[1].T
     exponential = np.exp(similarity / TEMPERATURE)
@@ -95,10 +92,8 @@ def test_padded_equals_unpadded(model) -> None:
 def test_an_empty_or_broken_cloud_overlaps_nothing(fitted, side: int) -> None:
     some = cloud(1)
     empty = replace(some, mask=jnp.zeros(NUM, bool))
-    pairs = [
-        [other, some] if side == 0 else [some, other]
-        for other in (empty, replace(some, features=some.features.at[2].set(jnp.nan)))
-    ]
+    broken = replace(some, features=some.features.at[2].set(jnp.nan))
+    pairs = [[other, some][:: 1 - 2 * side] for other in (empty, broken)]
     assert np.isfinite(overlap_evidence(fitted, *pairs[0])).all()
     assert [float(overlap_probability(fitted, *pair)) for pair in pairs] == [0, 0]
 

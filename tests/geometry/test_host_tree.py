@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import pickle
 import subprocess
@@ -17,9 +15,7 @@ from dpmjax.geometry.neighbours import HostTree
 @pytest.mark.parametrize("num_threads", [1, 3])
 @pytest.mark.parametrize("k", [1, 7, 40])
 @pytest.mark.parametrize("case", ["random", "coinciding", "a line"])
-def test_distances_are_the_smallest_of_all(
-    case: str, k: int, num_threads: int, ordered_from: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_distances_are_the_smallest_of_all(case: str, k: int, num_threads: int, ordered_from: int, monkeypatch) -> None:
     monkeypatch.setattr(neighbours, "ORDERED_FROM", ordered_from)
     points = np.random.default_rng(0).normal(size=(40, 3))
     points *= {"random": 1, "coinciding": 0, "a line": np.array([1, 0, 0])}[case]

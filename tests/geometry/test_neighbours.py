@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +14,8 @@ KS = pytest.mark.parametrize("k", [1, 5])
 
 def clouds(seed: int, dim: int, num_queries: int = 30, num_points: int = 50) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return (
-        rng.normal(size=(num_queries, dim)).astype(np.float32),
-        rng.normal(size=(num_points, dim)).astype(np.float32),
-    )
+    queries, points = (rng.normal(size=(num, dim)).astype(np.float32) for num in (num_queries, num_points))
+    return queries, points
 
 
 @DIMS

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,18 +26,6 @@ def chamfer_in_scipy(a: np.ndarray, b: np.ndarray) -> float:
 def test_distance_is_its_definition(dim: int, seed: int) -> None:
     pair = clouds(seed, dim)
     np.testing.assert_allclose(chamfer_distance(*pair), chamfer_in_scipy(*pair), **ACCUMULATED)
-
-
-@DIMS
-def test_masked_points_take_no_part(dim: int) -> None:
-    a, b = clouds(3, dim)
-    rng = np.random.default_rng(4)
-    mask_a, mask_b = rng.random(30) < 0.6, rng.random(20) < 0.6
-    expected = chamfer_in_scipy(a[mask_a], b[mask_b])
-    np.testing.assert_allclose(chamfer_distance(a, b, mask_a, mask_b), expected, **ACCUMULATED)
-    for gradient, mask in zip(GRADIENTS(a, b, mask_a, mask_b), (mask_a, mask_b), strict=True):
-        assert np.isfinite(gradient).all()
-        np.testing.assert_array_equal(np.asarray(gradient)[~mask], 0)
 
 
 @DIMS

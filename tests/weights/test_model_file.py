@@ -11,11 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import Model, ModelConfig, init_model, model_preset
+from dpmjax.deeppointmap import Model, ModelConfig, model_preset
 from dpmjax.weights import load_model, read_card, save_model
 from dpmjax.weights.config_json import config_from_json
 from dpmjax.weights.torch_import import read_torch_file
-from tests.deeppointmap import toy
 from tests.optional import import_or_skip
 from tests.weights.published import published_tensors
 
@@ -23,11 +22,6 @@ from tests.weights.published import published_tensors
 @pytest.fixture
 def torch() -> Any:
     return import_or_skip("torch")
-
-
-@pytest.fixture(scope="module")
-def model() -> Model:
-    return init_model(jax.random.key(0), toy.MODEL)
 
 
 def assert_same(a: Model, b: Model, rtol: float = 0) -> None:

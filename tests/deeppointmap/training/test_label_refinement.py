@@ -1,7 +1,5 @@
 """Refinement of labels: poses that are off become right, and what cannot be aligned keeps its pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +10,7 @@ from dpmjax.deeppointmap.training.label_refinement import aligned_motion
 from dpmjax.geometry import rigid
 from dpmjax.sequences import LidarSequence
 from tests.deeppointmap import toy
+from tests.scans.surface_scenes import motion
 
 
 def room(rng: np.random.Generator, num: int = 3000) -> np.ndarray:
@@ -23,19 +22,12 @@ def room(rng: np.random.Generator, num: int = 3000) -> np.ndarray:
     return points
 
 
-def motion(shift: tuple[float, float, float], yaw: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = shift
-    return T
-
-
 @pytest.mark.parametrize("shift", [(0.3, -0.2, 0.1), (-0.4, 0.1, -0.1)])
 def test_a_motion_that_is_decimetres_off_becomes_right_to_centimetres(shift) -> None:
     rng = np.random.default_rng(0)
-    T_true = motion((3.0, 1.0, 0.0), 0.3)
+    T_true = motion(17.0, (3.0, 1.0, 0.0))
     target, source = room(rng), (room(rng) - T_true[:3, 3]) @ T_true[:3, :3]
-    refined = aligned_motion(target, source, T_true @ motion(shift, 0.02))
+    refined = aligned_motion(target, source, T_true @ motion(1.1, shift))
     assert np.linalg.norm((rigid.inverse(T_true) @ refined)[:3, 3]) < 0.03
     np.testing.assert_allclose(refined[:3, :3], T_true[:3, :3], atol=2e-3)
 
@@ -43,7 +35,7 @@ def test_a_motion_that_is_decimetres_off_becomes_right_to_centimetres(shift) -> 
 @pytest.mark.parametrize("num", [0, 1, 500])
 def test_scans_that_share_nothing_keep_the_given_motion(num: int) -> None:
     rng = np.random.default_rng(1)
-    given = motion((1.0, 0.0, 0.0), 0.1)
+    given = motion(6.0, (1.0, 0.0, 0.0))
     other = rng.uniform(100, 150, (num, 3))
     np.testing.assert_array_equal(aligned_motion(room(rng), other, given), given)
     np.testing.assert_array_equal(aligned_motion(other, room(rng), given), given)
@@ -56,9 +48,8 @@ def test_samples_of_a_drive_with_wrong_poses_have_better_labels() -> None:
     world = room(rng, 12_000)
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[:, 0, 3] = 1.5 * np.arange(8) - 6
-    true = LidarSequence(
-        "room", tuple("abcdefgh"), lambda index: (world - poses[index, :3, 3]).astype(np.float32), poses
-    )
+    scan = lambda index: (world - poses[index, :3, 3]).astype(np.float32)  # noqa: E731
+    true = LidarSequence("room", tuple("abcdefgh"), scan, poses)
     wrong = np.array(poses)
     wrong[:, :3, 3] += rng.normal(0, 0.15, (8, 3))
     config = replace(toy.TRAINING, model=replace(toy.MODEL, preprocess=replace(toy.MODEL.preprocess, capacity=8192)))

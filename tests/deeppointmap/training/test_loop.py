@@ -1,7 +1,5 @@
 """`dpmjax.train`: drives in, a model out; a continued training; input that cannot be trained on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

@@ -1,7 +1,5 @@
 """The second stage: pairs and labels by true distances, a frozen network, exact resumption, and a head that learns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

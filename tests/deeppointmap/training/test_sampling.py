@@ -1,7 +1,5 @@
 """Groups and pairs of scans: who may be in one, and how often."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
