@@ -130,14 +130,6 @@ def test_package_door_imports_only_the_lazy_loader() -> None:
     assert {name.split(".")[0] for name in imported_names(PACKAGE / "__init__.py")} == {"lazy_loader"}
 
 
-def test_relative_imports_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
-    module = tmp_path / "geometry" / "sample.py"
-    module.parent.mkdir()
-    module.write_text("from ..losses.chamfer import x\nfrom . import rigid\nimport dpmjax.nets\n")
-    assert imported_names(module) == {"dpmjax.losses.chamfer.x", "dpmjax.geometry.rigid", "dpmjax.nets"}
-
-
 def listed_names() -> set[str]:
     """Full names of everything that the door of the package or of a room lists."""
     found = set()

@@ -7,8 +7,9 @@ import pytest
 
 from dpmjax.cli import map2d
 from dpmjax.cli.run import EXIT_OK, load_json
-from tests.cli.test_slam import run, table
+from tests.cli.test_slam import run
 from tests.data_sets import write_pcd
+from tests.experiments.running import read_rows
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.slam.test_odometry import motion, planes, seen_from
 
@@ -42,7 +43,7 @@ def test_slam_maps_a_bag_as_it_maps_files(tmp_path: Path, without_networks, scan
     np.testing.assert_array_equal(of_files, of_bag)
     stamps = np.loadtxt(tmp_path / "b" / "trajectory_tum.txt")[:, 0]
     np.testing.assert_allclose(stamps, 1.6e9 + 0.1 * np.arange(NUM), atol=1e-5)
-    assert [row["status"] for row in table(tmp_path / "b" / "scans.csv")] == ["first", *["tracked"] * (NUM - 1)]
+    assert [row["status"] for row in read_rows(tmp_path / "b", "scans.csv")] == ["first", *["tracked"] * (NUM - 1)]
     assert load_json(tmp_path / "b" / "metrics.json")["status"] == "done"
     assert run("--resume", "-o", tmp_path / "b") == EXIT_OK
 

@@ -91,13 +91,6 @@ def test_bad_input_is_one_line_and_leaves_no_folder(toy, tmp_path):
     assert not (tmp_path / "results").exists()
 
 
-def test_a_folder_that_is_taken_is_refused_before_the_input_is_read(toy, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    code, output, errors = finish(toy("missing.pcd", "-o", "."))
-    assert (code, output) == (2, "")
-    assert errors == "dpmjax: error: . is not empty and holds no earlier run: name another folder with -o\n"
-
-
 def test_failure_on_the_way_exits_with_one_and_names_the_partial_results(toy, tmp_path):
     code, _, errors = finish(toy("-o", "out", "--fail"))
     assert code == 1

@@ -1,6 +1,5 @@
 """Whole runs of the main command on tiny scans, its help, and its answers to bad input."""
 
-import json
 import os
 import signal
 import subprocess
@@ -12,7 +11,7 @@ import pytest
 from evo.tools import file_interface
 
 from dpmjax.cli.map2d import Map2dOptions, fit_settings, main
-from dpmjax.cli.run import Run, run_command
+from dpmjax.cli.run import Run, load_json, run_command
 from dpmjax.io import ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
@@ -49,16 +48,12 @@ def test_unit_of_the_fit_is_that_of_the_worlds_of_the_paper(walk, preset, unit, 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
     """Runs the command in a process of its own; `interrupt` stops it after the first call of the step."""
     code = (
-        "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, run_command\n"
+        "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, load_json, run_command\n"
         "append = Run.append_row\n"
         "Run.append_row = lambda *a, **k: (append(*a, **k), os.kill(os.getpid(), signal.SIGINT))\n"
         "raise SystemExit(run_command(m.main, name='map2d', description=None))"
     )
     return run_python(*(("-c", code) if interrupt else ("-m", "dpmjax", "map2d")), *options)
-
-
-def metrics_of(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
 
 
 @pytest.mark.slow
@@ -67,14 +62,14 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
     np.save(tmp_path / "start.npy", walk.reference_poses + np.array([3.0, -2.0, 0.0]))
     done = run(folder, "-o", tmp_path / "out", "--steps", 20, "--init", tmp_path / "start.npy")
     assert done.returncode == 0, done.stderr
-    metrics = metrics_of(tmp_path / "out")
+    metrics = load_json(tmp_path / "out" / "metrics.json")
     assert not [name for name in METRICS if metrics.get(name) is None]
     assert (metrics["num_scans"], metrics["steps"], metrics["success"]) == (NUM_SCANS, 20, True)
     assert metrics["status"] == ("done" if metrics["assessment"]["is_trusted"] else "uncertain")
     # From a good start it never gets worse.
     assert metrics["ate_initial_px"] < 1e-3
     assert metrics["ate_px"] < 0.1
-    assert json.loads((tmp_path / "out" / "config.json").read_text())["steps"] == 20
+    assert load_json(tmp_path / "out" / "config.json")["steps"] == 20
     candidates = metrics["candidates"]
     assert list(candidates) == [
         "poses of start.npy", "DeepMapping", "poses of start.npy, refined", "DeepMapping, refined",
@@ -97,7 +92,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     options = (scans_npz, "--steps", 60, "--no-refine", "--init", "zero")
     broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
     assert broken.returncode == 130, broken.stderr
-    stopped = metrics_of(tmp_path / "broken")
+    stopped = load_json(tmp_path / "broken" / "metrics.json")
     assert stopped["status"] == "interrupted"
     assert 0 < stopped["steps"] < 60
     assert list(stopped["candidates"]) == ["zero poses", "DeepMapping"]
@@ -105,7 +100,10 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     assert resumed.returncode == 0, resumed.stderr
     unbroken = run(*options, "-o", tmp_path / "unbroken")
     assert unbroken.returncode == 0, unbroken.stderr
-    assert metrics_of(tmp_path / "broken")["steps"] == metrics_of(tmp_path / "unbroken")["steps"]
+    assert (
+        load_json(tmp_path / "broken" / "metrics.json")["steps"]
+        == load_json(tmp_path / "unbroken" / "metrics.json")["steps"]
+    )
     one, other = (np.load(tmp_path / name / "trajectory.npy") for name in ("broken", "unbroken"))
     np.testing.assert_array_equal(one, other)
     rows = [(tmp_path / name / "metrics.csv").read_text().splitlines() for name in ("broken", "unbroken")]
@@ -121,7 +119,7 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
     monkeypatch.setattr("dpmjax.registration2d.register_scans", interrupted)
     arguments = [str(scans_npz), "--init", "zero", "-o", str(tmp_path / "out")]
     assert run_command(main, name="map2d", description=None, args=arguments) == 130
-    found = metrics_of(tmp_path / "out")
+    found = load_json(tmp_path / "out" / "metrics.json")
     assert found["status"] == "interrupted"
     assert (found["steps"], found["kept"]) == (0, "zero poses")
     assert list(found["candidates"]) == ["zero poses"]
@@ -144,7 +142,7 @@ def test_a_global_start_finds_the_map_from_half_a_turn_of_view(tmp_path, is_orde
     options = [] if is_ordered else ["--no-ordered"]
     done = run(tmp_path / "half.npz", "-o", tmp_path / "out", "--init", "global", "--steps", 20, *options)
     assert done.returncode == 0, done.stderr
-    metrics = metrics_of(tmp_path / "out")
+    metrics = load_json(tmp_path / "out" / "metrics.json")
     candidates = metrics["candidates"]
     # The walk spans some metres: a tenth of a metre is right, and no wall is doubled.
     assert candidates["global registration"]["ate_m"] < 0.1

@@ -1,6 +1,5 @@
 """The command `dpmjax merge` on a network that compiles in seconds."""
 
-import csv
 from dataclasses import replace
 
 import jax
@@ -14,6 +13,7 @@ from dpmjax.slam import JoinedMaps, MergedMaps
 from dpmjax.slam.keyframe_map import MapEdge
 from dpmjax.slam.loops import Loop
 from tests.deeppointmap import toy
+from tests.experiments.running import read_rows
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> 
     counts = {"num_keyframes": len(both), "num_measured_parts": 1}
     assert metrics["parts"] == [{"file": "map.npz", "maps": [1, 2], **counts}]
     assert metrics["status"] == "done"
-    rows = list(csv.DictReader((out / "loops.csv").read_text().splitlines()))
+    rows = read_rows(out, "loops.csv")
     assert [row["map"] + row["other_map"] + row["status"] for row in rows] == ["21accepted", "21improbable"]
     # Scans are numbered as in the drive of each map.
     assert [row["scan"] for row in rows] == [str(keyframe.scan) for keyframe in b.keyframes[:2]]

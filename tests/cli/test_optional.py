@@ -10,7 +10,6 @@ from dpmjax.cli import program, slam
 from dpmjax.cli.info import EXTRAS, require_importable, why_not_importable
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, run_command
 from experiments import deepmapping_rgbd, deepmapping_suite, toy_1d
-from tests.optional import import_or_skip
 
 LIBUSB = "libusb-1.0.so.0: cannot open shared object file"
 PACKAGES = [name for names in EXTRAS.values() for name in names]
@@ -67,13 +66,6 @@ def test_info_names_what_is_broken_and_what_is_missing(packages: Path, monkeypat
     assert f"baselines: open3d is installed, but its import fails: {LIBUSB}" in lines
     assert "gtsam: gtsam is not installed (pip install 'dpmjax[gtsam]')" in lines
     assert "peers: installed" in lines
-
-
-def test_tests_of_a_broken_package_are_skipped_with_the_reason(packages: Path) -> None:
-    (packages / "broken.py").write_text(FAILURES["a missing library"])
-    with pytest.raises(pytest.skip.Exception, match="libusb"):
-        import_or_skip("broken")
-    assert import_or_skip("json").dumps([]) == "[]"
 
 
 @pytest.mark.parametrize(

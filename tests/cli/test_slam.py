@@ -3,7 +3,6 @@
 Matcher and geometry know the truth; a scan is one point, whose x is the number of its pose.
 """
 
-import csv
 import errno
 import os
 import shutil
@@ -19,6 +18,7 @@ from dpmjax.cli import slam, slam_run
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json, run_command
 from dpmjax.io import LidarSequence, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
+from tests.experiments.running import read_rows
 from tests.optional import import_or_skip
 from tests.processes import run_python, start_python
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
@@ -77,10 +77,6 @@ def assert_same_results(folder: Path, other: Path) -> None:
         assert (folder / name).read_bytes() == (other / name).read_bytes(), name
 
 
-def table(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(path.read_text().splitlines()))
-
-
 def test_what_is_known_to_be_bad_is_told_before_the_run(with_truth, tmp_path, refused) -> None:
     drive = tmp_path / "drive"
     drive.mkdir()
@@ -109,7 +105,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert metrics["t_rel_percent"] < 1.0
     assert metrics["seed"] == 0
     assert metrics["status"] == "done"
-    scans, loops = table(whole / "scans.csv"), table(whole / "loops.csv")
+    scans, loops = read_rows(whole, "scans.csv"), read_rows(whole, "loops.csv")
     assert [int(row["scan"]) for row in scans] == list(range(len(TRUTH)))
     assert {row["status"] for row in scans} == {"first", "tracked"}
     assert all(row["reason"] for row in scans)
@@ -187,15 +183,6 @@ def test_a_full_disk_is_one_line(drive, with_truth, tmp_path, monkeypatch, capsy
     assert "Traceback" in (tmp_path / "out" / "log.txt").read_text()
 
 
-@pytest.mark.slow
-def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:
-    drive = write_drive(tmp_path / "drive")
-    np.save(drive / "030.npy", np.zeros((5, 3), np.float32))
-    assert run(drive, "-o", tmp_path / "out") == EXIT_OK
-    assert table(tmp_path / "out" / "scans.csv")[30]["status"] == "empty"
-    assert len(np.load(tmp_path / "out" / "trajectory.npy")) == len(TRUTH)
-
-
 def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp_path, monkeypatch) -> None:
     out, read = tmp_path / "out", LidarSequence.read_points
 
@@ -258,12 +245,11 @@ sys.exit(run(*sys.argv[1:]))
 def test_a_killed_run_equals_an_unbroken_one(whole, drive, tmp_path) -> None:
     rng, out = np.random.default_rng(0), tmp_path / "out"
     for _ in range(5):
-        process = start_python("-c", PROCESS, *(["--resume"] if out.exists() else [drive]), "-o", out)
-        deadline = time.monotonic() + 120
-        while not (out / "run_state.npz").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        time.sleep(rng.uniform(0, 4))
-        process.kill()
-        process.wait()
+        with start_python("-c", PROCESS, *(["--resume"] if out.exists() else [drive]), "-o", out) as process:
+            deadline = time.monotonic() + 120
+            while not (out / "run_state.npz").exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+            time.sleep(rng.uniform(0, 4))
+            process.kill()
     assert run_python("-c", PROCESS, "--resume", "-o", out).returncode == EXIT_OK
     assert_same_results(out, whole)

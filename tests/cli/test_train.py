@@ -22,14 +22,12 @@ from dpmjax.deeppointmap import (
     StepRecord,
     TrainingHooks,
     TrainingReport,
-    begin_training,
     draw_evaluation_pairs,
     init_model,
-    init_training,
     prepare_drive,
     training_preset,
 )  # fmt: skip
-from dpmjax.deeppointmap.training.loop import Speed, after_evaluation
+from dpmjax.deeppointmap.training.loop import Speed
 from dpmjax.deeppointmap.training.objective import ObjectiveTerms
 from dpmjax.metrics.poses import registration_recall
 from dpmjax.weights import load_model
@@ -150,22 +148,6 @@ def test_a_cut_off_checkpoint_is_passed_over_for_the_one_before(tmp_path: Path, 
             file.write_bytes(file.read_bytes()[:50])
     assert_same_run(train(tmp_path), tmp_path, whole)
     assert "checkpoint 3 cannot be read" in caplog.text
-
-
-@pytest.mark.slow
-def test_the_best_of_equal_models_is_the_later() -> None:
-    state = init_training(jax.random.key(0), TRAINING)
-    first = after_evaluation(begin_training(TRAINING), 0.5)
-
-    def after(step: int, scale: float):
-        params = jax.tree.map(lambda leaf: scale * leaf, state.params)
-        return replace(state, params=params, step=jax.numpy.asarray(step, jax.numpy.int32))
-
-    last = TRAINING.num_steps
-    worse = after_evaluation(replace(first, state=after(2, 2.0)), 0.4)
-    equal = after_evaluation(replace(first, state=after(last, 3.0)), 0.5)
-    assert (int(worse.best_step), int(equal.best_step)) == (0, last)
-    assert worse.best_params is first.best_params
 
 
 @pytest.mark.slow

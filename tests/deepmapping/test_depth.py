@@ -165,14 +165,3 @@ def test_consistency_has_finite_slopes_where_nothing_overlaps(scans) -> None:
 
     assert jnp.isfinite(slope(1.5)).all()
     assert jnp.isfinite(slope(0.1)).all()
-
-
-def test_a_fit_that_is_not_finite_never_replaces_its_start(walk, scans, monkeypatch) -> None:
-    """Poses that contradict each other are worse than none, and still better than numbers that are none."""
-    start = np.array(walk.T_world_camera)
-    start[1, :3, 3] += 3.0
-    broken = dm.Fitted(np.full_like(start, np.nan), None, None, 1.0, dm.preset("fast", "depth"), 5)
-    monkeypatch.setattr("dpmjax.deepmapping.mapping.fit_deepmapping", lambda *_, **__: broken)
-    found = dm.register_depth(scans, key=jax.random.key(0), start=start)
-    assert found.kept == "start"
-    np.testing.assert_array_equal(found.T_world_scan, start)

@@ -41,12 +41,7 @@ TIMES = {"ouster": ("t", 1e9, 0.0), "velodyne": ("time", 1.0, 0.0), "hesai": ("t
 
 
 class BagWriter:
-    """Writes messages of the standard types.
-
-    Args:
-        path: without an ending.
-        kind: bag (ROS 1), mcap or db3 (folders of ROS 2).
-    """
+    """Writes messages of the standard types to a path without an ending: a bag of ROS 1, mcap or db3 of ROS 2."""
 
     def __init__(self, path: Path, kind: str) -> None:
         import_or_skip("rosbags.highlevel")
