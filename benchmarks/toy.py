@@ -11,6 +11,7 @@ import jax
 from benchmarks import Row, measure
 from dpmjax import cli
 from dpmjax.deepmapping import ToyConfig, solve, toy_problem
+from dpmjax.deepmapping.toy import ScalarNet
 from experiments.toy_1d import FORMS, share_at_minimum
 
 
@@ -41,7 +42,7 @@ def torch_seconds(toy: ToyConfig, seed: int) -> float:
 
     torch.manual_seed(seed)
     layers: list[torch.nn.Module] = []
-    for before, after in itertools.pairwise((1, *toy.net.features, 1)):
+    for before, after in itertools.pairwise((1, *ScalarNet(toy.initialization).features, 1)):
         layers += [torch.nn.Linear(before, after), torch.nn.ELU()]
     net = torch.nn.Sequential(*layers[:-1])
     z = torch.randn(1, requires_grad=True)

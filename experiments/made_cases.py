@@ -1,11 +1,11 @@
-"""Counts answers that are sure and wrong on made scans that tempt: reliefs, shells, other sizes, turns and tunnels.
+"""Counts answers that are sure and wrong on made scans: reliefs, shells, sizes, turns, tunnels, passages and silence.
 
     python -m experiments.made_cases --draws 20                       20 draws of each kind
     python -m experiments.made_cases --kinds relief scale --draws 200
     python -m experiments.made_cases --resume --draws 200             go on, with more draws
 
 The file rows.csv has a row for each kind and draw, table.md a summary. A drive along a relief of 3 to 20 cm is right
-below an ATE of 0.05 m, a pair within 2 m and 5 degrees.
+below an ATE of 0.05 m, a pair within 2 m and 5 degrees, a planar map where no scan is 0.5 m off.
 """
 
 from __future__ import annotations
@@ -15,13 +15,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, NamedTuple
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dpmjax import cli, deeppointmap, metrics, simulation, slam, weights
-from dpmjax.geometry import rigid
+from dpmjax import cli, deepmapping, deeppointmap, metrics, registration2d, sequences, simulation, slam, weights
+from dpmjax.geometry import rigid, se2
+from dpmjax.simulation.world2d import cast_rays
 
-NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M = 25, 0.12, 0.006, 0.9, 0.05
+NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M, RIGHT_PASSAGE_M = 25, 0.12, 0.006, 0.9, 0.05, 0.5
+PX_M = 0.05
+# The map is that of the alignment: a fit takes longer, and the trust is the same.
+FEW_STEPS = deepmapping.with_steps(deepmapping.preset("fast"), 2)
 COLUMNS = ("sure_and_wrong", "right_and_sure", "is_sure", "is_right", "error_m", "seconds")
 
 
@@ -31,7 +36,7 @@ class MadeOptions(cli.RunOptions, cli.ModelOptions):
 
     may_change: ClassVar[frozenset[str]] = frozenset({"draws", "kinds"})
 
-    kinds: tuple[str, ...] = ("relief", "shell", "scale", "turn", "tunnel")
+    kinds: tuple[str, ...] = ("relief", "shell", "scale", "turn", "tunnel", "passage", "wheels", "silence")
     """Kinds of cases."""
     draws: Annotated[int, cli.Bound(1)] = 5
     """Draws of each kind."""
@@ -108,6 +113,49 @@ def map_gallery(model: deeppointmap.Model, rng: np.random.Generator) -> Answer:
     return Answer(error_m, error_m < RIGHT_ATE_M, 10 * num_guessed <= NUM_SCANS)
 
 
+def map_passage(rng: np.random.Generator, *, odometry: str) -> Answer:
+    """Maps a planar drive from a room through a passage to another room; right within half a metre.
+
+    Args:
+        rng: source of all sizes: a passage 1 to 3 m wide and 12 to 30 m long, steps of 0.25 to 0.9 m.
+        odometry: "none", "wheels", or "silent" for wheels that repeat their pose for 5 to 40 scans.
+
+    Returns:
+        The answer, with the worst error of a position after the best rigid alignment.
+    """
+    width, length, rooms, step = rng.uniform(1, 3), rng.uniform(12, 30), rng.uniform(4, 8, 4), rng.uniform(0.25, 0.9)
+    grid, middle = np.ones((200, 1000), bool), 100
+    spans = ((1.0, rooms[0], rooms[2]), (1.0 + rooms[0], length, width), (1.0 + rooms[0] + length, rooms[1], rooms[3]))
+    for begin, long, wide in spans:
+        half = round(max(wide, width) / 2 / PX_M)
+        grid[middle - half : middle + half, round(begin / PX_M) : round((begin + long) / PX_M)] = False
+    for begin in (1.0 + rng.uniform(0, 0.3) * rooms[0], 1.0 + rooms[0] + length + rng.uniform(0.6, 0.8) * rooms[1]):
+        box = round(begin / PX_M), middle + round(width / 2 / PX_M) + 4
+        grid[box[1] : box[1] + 12, box[0] : box[0] + 16] = True
+    x = np.arange(1.0 + rooms[0] / 2, 1.0 + rooms[0] + length + rooms[1] / 2, step)
+    y = middle * PX_M + 0.1 * width * np.sin(x / rng.uniform(2, 5))
+    poses = np.column_stack([x, y, np.arctan2(np.gradient(y), np.gradient(x)) + rng.normal(0, 0.02, len(x))])
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    origins = np.repeat(poses[:, :2], len(angles), axis=0) / PX_M
+    ranges = PX_M * cast_rays(grid, origins, (poses[:, 2:] + angles).ravel()).reshape(len(poses), -1)
+    ranges += rng.normal(0, 0.01, ranges.shape)
+    steps = se2.relative(poses[:-1], poses[1:]) + rng.normal(size=(len(x) - 1, 3)) * [0.03 * step, 0.03 * step, 0.01]
+    if odometry == "silent":
+        count = int(rng.integers(5, min(40, len(steps) // 2)))
+        begin = int(rng.integers(1, len(steps) - count))
+        steps[begin : begin + count] = 0.0
+    points = (ranges[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).astype(np.float32)
+    found = registration2d.register_scans(
+        points,
+        registration2d.RegistrationConfig(fit=FEW_STEPS, min_distance=0.1),
+        key=jax.random.key(0),
+        odometry=None if odometry == "none" else se2.chain(steps),
+    )
+    drive = sequences.ScanSequence("passage", points, np.ones(points.shape[:2], bool), "m", reference_poses=poses)
+    worst_m = metrics.planar_errors(drive, found.poses)["worst_scan_m"]
+    return Answer(worst_m, worst_m < RIGHT_PASSAGE_M, found.assessment.is_trusted)
+
+
 class Pair(NamedTuple):
     """Two scans, and T_target_source; None where no motion is right."""
 
@@ -165,6 +213,9 @@ KINDS: dict[str, Callable[[deeppointmap.Model, np.random.Generator], Answer]] = 
     "scale": lambda model, rng: register_pair(model, with_scale(rng)),
     "turn": lambda model, rng: register_pair(model, draw_pair(rng, "corridor", 6)),
     "tunnel": lambda model, rng: register_pair(model, draw_pair(rng, "tunnel", 80)),
+    "passage": lambda _, rng: map_passage(rng, odometry="none"),
+    "wheels": lambda _, rng: map_passage(rng, odometry="wheels"),
+    "silence": lambda _, rng: map_passage(rng, odometry="silent"),
 }
 
 

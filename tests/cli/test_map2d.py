@@ -71,9 +71,8 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
     assert metrics["ate_px"] < 0.1
     assert load_json(tmp_path / "out" / "config.json")["steps"] == 20
     candidates = metrics["candidates"]
-    assert list(candidates) == [
-        "poses of start.npy", "DeepMapping", "poses of start.npy, refined", "DeepMapping, refined",
-    ]  # fmt: skip
+    # A fit that lies where the refined start lies is not refined again.
+    assert list(candidates)[:3] == ["poses of start.npy", "DeepMapping", "poses of start.npy, refined"]
     assert candidates[metrics["kept"]]["ate_px"] == metrics["ate_px"]
     assert candidates["poses of start.npy"]["ate_px"] == metrics["ate_initial_px"]
     assert min(numbers["misfit"] for numbers in candidates.values()) == candidates[metrics["kept"]]["misfit"]

@@ -301,8 +301,10 @@ class Records:
                     self._of_overlap.save(record.step, state)
                     self._saved_at = time.perf_counter()
 
-            hooks: dict[str, Any] = {"on_report": on_report, "stop": stop, "start": self.overlap_start}
-            model, state = dpm.train_overlap(store, trained.model, self._settings, seed=self.seed, **hooks)
+            hooks, start = dpm.OverlapHooks(on_report, stop), self.overlap_start
+            model, state = dpm.train_overlap(
+                store, trained.model, self._settings, seed=self.seed, start=start, hooks=hooks
+            )
         self._of_overlap.save(int(state.step), state)
         stopped_by = 0 if int(state.step) >= total else stop()
         return trained._replace(model=model, overlap=state, stopped_by=stopped_by)

@@ -88,6 +88,7 @@ from .training.loop import TrainingProgress as TrainingProgress
 from .training.loop import begin_training as begin_training
 from .training.loop import train as train
 from .training.objective import ObjectiveConfig as ObjectiveConfig
+from .training.overlap_stage import OverlapHooks as OverlapHooks
 from .training.overlap_stage import OverlapRecord as OverlapRecord
 from .training.overlap_stage import OverlapState as OverlapState
 from .training.overlap_stage import draw_overlap_pairs as draw_overlap_pairs

@@ -9,7 +9,14 @@ import pytest
 import dpmjax
 from dpmjax.deeppointmap import OverlapConfig, draw_overlap_pairs, train_overlap, why_no_overlap
 from dpmjax.deeppointmap.training import overlap_stage
-from dpmjax.deeppointmap.training.overlap_stage import PairFeatures, hard_pairs, head_logits, init_overlap, with_head
+from dpmjax.deeppointmap.training.overlap_stage import (
+    OverlapHooks,
+    PairFeatures,
+    hard_pairs,
+    head_logits,
+    init_overlap,
+    with_head,
+)
 from dpmjax.deeppointmap.training.sampling import ScanTable
 from tests.deeppointmap import toy
 
@@ -96,7 +103,7 @@ def test_a_head_learns_to_tell_pairs_apart(model) -> None:
 @pytest.mark.parametrize("config", [NEW, POOL], ids=["new pairs", "pool"])
 def test_only_the_head_changes_and_a_stopped_stage_goes_on_exactly(model, config) -> None:
     store, records = toy.store(), []
-    whole, last = train_overlap(store, model, config, on_report=lambda record, _: records.append(record))
+    whole, last = train_overlap(store, model, config, hooks=OverlapHooks(lambda record, _: records.append(record)))
     assert [record.step for record in records] == list(range(1, config.overlap.num_steps(24) + 1))
     assert records[0].learning_rate == pytest.approx(0.1 * config.learning_rate)
     assert whole.config.trained == ("registration", "overlap")
@@ -107,7 +114,7 @@ def test_only_the_head_changes_and_a_stopped_stage_goes_on_exactly(model, config
     moved = jax.tree.map(lambda a, b: np.any(a != b), last.head, init_overlap(model).head)
     assert any(jax.tree.leaves(moved))
     calls = iter([0, 0, 1])
-    first, state = train_overlap(store, model, config, stop=lambda: next(calls))
+    first, state = train_overlap(store, model, config, hooks=OverlapHooks(stop=lambda: next(calls)))
     assert (int(state.step), first.config.trained) == (2, ("registration",))
     toy.assert_trees_equal(train_overlap(store, model, config, start=state)[1], last)
 

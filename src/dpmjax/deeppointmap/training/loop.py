@@ -25,6 +25,7 @@ from dpmjax.checks import require_fields, runs_on_host
 from dpmjax.deeppointmap.model import Model
 from dpmjax.deeppointmap.training.curriculum import CurriculumStage, Layout, TrainingConfig, layout_capacity
 from dpmjax.deeppointmap.training.overlap_stage import (
+    OverlapHooks,
     OverlapState,
     init_overlap,
     train_overlap,
@@ -251,9 +252,8 @@ def _with_trained_head(
     if is_first():
         with progress_bar("train overlap", total=num_steps, unit="steps", is_shown=hooks is None) as bar:
             stop = int if hooks is None else hooks.stop
-            _, state = train_overlap(
-                store, first.model, config, seed=seed, on_report=lambda *_: bar.update(), stop=stop
-            )
+            calls = OverlapHooks(lambda *_: bar.update(), stop)
+            _, state = train_overlap(store, first.model, config, seed=seed, hooks=calls)
     state = from_first(state)
     is_whole = int(state.step) >= num_steps
     model = _local(with_head(first.model, state.head, is_trained=is_whole))

@@ -74,6 +74,18 @@ class OverlapRecord(NamedTuple):
     learning_rate: float
 
 
+class OverlapHooks(NamedTuple):
+    """Functions that the stage calls.
+
+    Attributes:
+        on_report: gets the record and the state after each step.
+        stop: called before each step; any number but 0 ends the stage.
+    """
+
+    on_report: Callable[[OverlapRecord, OverlapState], object] = lambda _record, _state: None
+    stop: Callable[[], int] = int
+
+
 class PairFeatures(NamedTuple):
     """Correlated features of pairs of scans.
 
@@ -95,8 +107,7 @@ def train_overlap(
     *,
     seed: int = 0,
     start: OverlapState | None = None,
-    on_report: Callable[[OverlapRecord, OverlapState], object] = lambda _record, _state: None,
-    stop: Callable[[], int] = int,
+    hooks: OverlapHooks | None = None,
 ) -> tuple[Model, OverlapState]:
     """Trains the overlap head of a model; all other parameters stay.
 
@@ -106,8 +117,7 @@ def train_overlap(
         config: settings of training.
         seed: seed of the pairs and of their augmentation.
         start: state to continue from; None begins with the head of the model.
-        on_report: gets the record and the state after each step.
-        stop: called before each step; any number but 0 ends the stage.
+        hooks: functions that are called: reports, and a request to stop.
 
     Returns:
         The model, `config.trained` with "overlap" if the stage came to its end; and the last state.
@@ -117,6 +127,7 @@ def train_overlap(
     """
     if (reason := why_no_overlap(store.table)) is not None:
         raise ValueError(f"store: {reason}")
+    hooks = hooks or OverlapHooks()
     settings, state = config.overlap, init_overlap(model) if start is None else start
     num_steps = settings.num_steps(len(store.table))
     schedule = optax.cosine_decay_schedule(
@@ -125,7 +136,7 @@ def train_overlap(
     frozen = Model(model.params, replace(model.config, calibration=None, overlap=None, trained=()))
     pool = _make_pool(store, frozen, config, seed) if settings.pool_pairs and int(state.step) < num_steps else None
     for step in range(int(state.step), num_steps):
-        if stop():
+        if hooks.stop():
             break
         pairs = (
             _new_pairs(store, frozen, config, (seed, step)) if pool is None else _pool_batch(pool, config, seed, step)
@@ -135,7 +146,7 @@ def train_overlap(
         batch = PairFeatures(pairs.features[:, sides], pairs.mask[:, sides], pairs.is_overlap)
         rate = settings.rate_share * float(schedule(step))
         state, loss, accuracy = _step(state, frozen, batch, rate, settings.rate_share * WEIGHT_DECAY)
-        on_report(OverlapRecord(step + 1, float(loss), float(accuracy), rate), state)
+        hooks.on_report(OverlapRecord(step + 1, float(loss), float(accuracy), rate), state)
     return with_head(model, state.head, is_trained=int(state.step) >= num_steps), state
 
 
