@@ -1,4 +1,4 @@
-"""Whole runs of the main command on tiny scans, its help, and its answers to bad input."""
+"""`dpmjax map2d`: whole runs on tiny scans and answers to bad input; the input of `dpmjax depth`."""
 
 import os
 import signal
@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from PIL import Image
 
-from dpmjax.cli.map2d import Map2dOptions, fit_settings, main
+from dpmjax.cli.depth import DepthOptions, read_images
+from dpmjax.cli.map2d import Map2dOptions, fit_settings, main, trust_verdict
 from dpmjax.cli.run import Run, load_json, run_command
-from dpmjax.io import ScanSequence
+from dpmjax.io import InputError, ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
 from tests.data_sets import write_deepmapping_folder
@@ -182,3 +184,26 @@ def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_
 )
 def test_a_start_that_is_not_there_is_named(as_user, scans_npz, refused, init, found) -> None:
     assert found in refused("map2d", scans_npz, "--init", init)
+
+
+@pytest.mark.parametrize(("rows", "spans"), [([4], "4"), ([3, 4, 5, 9], "3-5, 9"), ([0, 2, 3], "0, 2-3")])
+def test_the_verdict_names_the_uncertain_scans_and_the_fault(rows: list[int], spans: str) -> None:
+    assessment = {"is_trusted": False, "weakest_connection": 0.3, "contradiction": 0.01}
+    text = trust_verdict(assessment | {"uncertain_scans": rows, "fault": "the scans are mirrored"})
+    assert "DO NOT TRUST" in text
+    assert text.endswith(f" {spans}")
+    assert "the scans are mirrored" in text
+
+
+def test_a_blank_image_is_named(tmp_path) -> None:
+    np.savetxt(tmp_path / "intrinsics.txt", [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    for name, depth_mm in (("1", 2000), ("2", 0), ("3", 2000)):
+        Image.fromarray(np.full((48, 64), depth_mm, np.uint16)).save(tmp_path / f"{name}.depth.png")
+    with pytest.raises(InputError, match=r"2\.depth\.png: no pixel measures up to .* leave out such images, 1 of 3"):
+        read_images(DepthOptions(data=tmp_path))
+
+
+def test_a_folder_without_images_is_refused_and_a_selection_is_taken(tmp_path) -> None:
+    with pytest.raises(InputError, match="0 .depth.png files"):
+        read_images(DepthOptions(data=tmp_path))
+    assert len(read_images(DepthOptions(n_scans=2, jump=2))) == 2

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.config import REFINE
 from dpmjax.deepmapping.engine import fit, init
 from dpmjax.deepmapping.mapping import mapping_problem
 from dpmjax.deepmapping.objective import blocks_of_step
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.sensors import as_scan_set
+from dpmjax.deepmapping.toy import ToyConfig
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
@@ -239,13 +241,29 @@ def test_bad_input_is_named(as_user, scans, options, message) -> None:
         dm.fit_deepmapping(scans, **{"config": SMALL, "key": KEY, **options})
 
 
-def test_unknown_presets_and_too_few_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match="preset: expected one of fast, paper"):
-        dm.preset("quick")
-    with pytest.raises(ValueError, match="steps: expected at least one"):
-        dm.with_steps(dm.preset("fast"), 1)
-    with pytest.raises(ValueError, match="num_epochs"):
-        replace(dm.preset("paper").cold_phases[0], num_steps=5)
+PHASES = dm.preset("fast").cold_phases
+WINDOWS = PHASES[0], replace(PHASES[0], scans_per_window=None)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: dm.preset("quick"), "preset: expected one of fast, paper"),
+        (lambda: dm.with_steps(dm.preset("fast"), 1), "steps: expected at least one"),
+        (lambda: replace(dm.preset("paper").cold_phases[0], num_steps=5), "num_epochs"),
+        (lambda: replace(dm.preset("fast"), cold_phases=WINDOWS), "scans_per_window"),
+        (lambda: replace(PHASES[0], scans_per_window=1), "scans_per_window"),
+        (lambda: replace(REFINE, occupancy_weight=1.5), "occupancy_weight"),
+        (lambda: replace(REFINE, num_offsets=9), "num_offsets"),
+        (lambda: replace(REFINE, num_steps=0), "num_steps"),
+        (lambda: ToyConfig(learning_rate=0.0), "learning_rate"),
+        (lambda: ToyConfig(num_steps=0), "num_steps"),
+        (lambda: ToyConfig(initialization="zeros"), "initialization"),
+    ],
+)
+def test_senseless_settings_are_refused(as_user, make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 def test_scans_without_an_order_get_a_pointnet() -> None:

@@ -213,8 +213,6 @@ def test_copies_of_a_cloud_are_left_out(num_valid: int) -> None:
 
 
 def test_wrong_arguments_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^pair_ratio: expected"):
-        MatchConfig(pair_ratio=5.0)
     with pytest.raises(ValueError, match="^T_map_cloud: expected shape"):
         merge_clouds(DescriptorCloud(jnp.ones((2, 3, 3)), jnp.ones((2, 3, 5)), jnp.ones((2, 3), bool)), np.eye(4))
 

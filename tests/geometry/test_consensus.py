@@ -104,8 +104,3 @@ def test_pairs_of_one_point_tell_nothing() -> None:
     crowd = np.tile(source[:1], (40, 1)), np.tile(target[:1] + 15, (40, 1))
     found = find_consensus(np.concatenate([source, crowd[0]]), np.concatenate([target, crowd[1]]))
     assert errors(found.T_target_source[0], T)[0] < 0.5
-
-
-def test_wrong_shapes_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^target: expected shape"):
-        find_consensus(np.zeros((3, 3), np.float32), np.zeros((4, 3), np.float32))

@@ -113,21 +113,3 @@ def test_without_buckets_the_result_is_the_same(monkeypatch: pytest.MonkeyPatch)
     expected = build_pyramid_on_host(points, None, CONFIG)
     monkeypatch.setattr(pyramid_host, "_sample_by_buckets", lambda *_: None)
     jax.tree.map(np.testing.assert_array_equal, build_pyramid_on_host(points, None, CONFIG), expected)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: build_pyramid(np.ones((4, 2), np.float32), None, CONFIG), "points: expected shape"),
-        (lambda: build_pyramid(np.ones((0, 3), np.float32), None, CONFIG), "points: expected at least one"),
-        (lambda: build_pyramid_on_host(np.ones((4, 2), np.float32), None, CONFIG), "points: expected shape"),
-        (lambda: build_pyramid_on_host(np.ones((0, 3), np.float32), None, CONFIG), "points: expected shape"),
-        (lambda: build_pyramid_on_host(cloud(0), np.ones(3, bool), CONFIG), "mask: expected bool"),
-        (lambda: build_pyramid_on_host(cloud(0), None, CONFIG, num_threads=0), "num_threads: expected at least 1"),
-        (lambda: PyramidConfig(stages=CONFIG.stages[::-1]), "stages: expected no stage"),
-        (lambda: PyramidConfig(num_interpolations=5), "num_interpolations: expected"),
-    ],
-)
-def test_wrong_arguments_are_named(call, message: str, as_user) -> None:
-    with pytest.raises(ValueError, match=f"^{message}"):
-        call()

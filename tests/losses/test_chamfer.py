@@ -47,12 +47,3 @@ def test_gradient_is_finite_at_coincident_points(dim: int) -> None:
     a, _ = clouds(6, dim)
     for gradient in GRADIENTS(a, a):
         np.testing.assert_array_equal(gradient, 0)
-
-
-def test_wrong_arguments_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^b: expected 2 columns"):
-        chamfer_distance(jnp.ones((4, 2)), jnp.ones((4, 3)))
-    with pytest.raises(ValueError, match="^mask_b: expected bool of shape"):
-        chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), None, jnp.ones(4, bool))
-    with pytest.raises(ValueError, match="^max_distance: expected a number above 0"):
-        chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), max_distance=-1.0)

@@ -57,10 +57,3 @@ def test_perfect_prediction_and_no_prediction_have_loss_and_gradient_zero() -> N
         value, gradient = jax.value_and_grad(offset_loss)(*arguments)
         assert value == 0
         assert not np.any(gradient)
-
-
-def test_wrong_arguments_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^true: expected shape"):
-        offset_loss(np.ones((4, 3)), np.ones((5, 3)))
-    with pytest.raises(ValueError, match="^mask: expected"):
-        offset_loss(np.ones((4, 3)), np.ones((4, 3)), np.ones(3, bool))

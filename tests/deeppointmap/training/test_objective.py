@@ -99,8 +99,3 @@ def test_without_weight_offsets_reach_neither_loss_nor_gradient() -> None:
     assert of_bare.offset == 0 < terms.offset
     gradient = jax.grad(lambda x: matching_loss(a.replace(offsets=x), b, T_B_A, config=bare)[0])(lost.offsets)
     assert not np.any(gradient)
-
-
-def test_a_negative_weight_is_refused(as_user) -> None:
-    with pytest.raises(ValueError, match="^offset_weight: expected"):
-        ObjectiveConfig(offset_weight=-1)

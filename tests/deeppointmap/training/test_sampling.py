@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
+from dpmjax.deeppointmap import (
+    CurriculumStage,
+    MatchConfig,
+    ObjectiveConfig,
+    OverlapConfig,
+    SamplingConfig,
+    TrainingConfig,
+    VerificationConfig,
+    training_preset,
+)
 from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
@@ -154,6 +163,11 @@ def test_stages_follow_each_other() -> None:
         (lambda: TrainingConfig(num_epochs=0.0), "num_epochs"),
         (lambda: TrainingConfig(initialization="zero"), "initialization"),
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),
+        (lambda: ObjectiveConfig(offset_weight=-1), "offset_weight"),
+        (lambda: OverlapConfig(num_epochs=0), "num_epochs"),
+        (lambda: OverlapConfig(rate_share=0.0), "rate_share"),
+        (lambda: MatchConfig(pair_ratio=5.0), "pair_ratio"),
+        (lambda: VerificationConfig(num_samples=0), "num_samples"),
     ],
 )
 def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
