@@ -27,9 +27,7 @@ def test_evaluation_measures_every_pair_and_resumes(weights, tmp_path, monkeypat
     assert [row["band"] for row in rows] == [band for band in ("near", "middle", "far") for _ in range(2)]
     # Pairs far apart have no overlap, so other methods do not register them.
     assert [bool(row["search_right"] and row["clouds_32_right"]) for row in rows] == [True] * 4 + [False] * 2
-    assert 0 <= metrics["brier"] <= 1
     assert {row["band"] for row in metrics["table"]} == {"near", "middle"}
-    assert 0 <= float(read_rows(out, "overlap.csv")[0]["auc"]) <= 1
     for name in ("table.md", "pooled.md", "reliability.png"):
         assert (out / name).stat().st_size > 0
     monkeypatch.setattr(deeppointmap, "register_in_stages", None)

@@ -7,20 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax.simulation import LidarSensor
+from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.cast import cast_turn, near_world
 from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_ground, cross_spheroid, ground_height
-from dpmjax.simulation.town.primitives import (
-    GROUND,
-    NOTHING,
-    POLE,
-    SOFT,
-    SOLID,
-    Bodies,
-    Ground,
-    RoadUsers,
-    TownPrimitives,
-    pack_bodies,
-)
 from dpmjax.simulation.town.scan import make_rays
 from tests.tolerances import ACCUMULATED
 
@@ -79,7 +68,9 @@ def ground_oracle(heights, origin, cell, start, ray, max_range):
 def hull(centre, half_size, heading):
     shape = [np.atleast_2d(np.asarray(x, np.float32)) for x in (centre, half_size, heading)]
     zero = jnp.zeros(len(shape[0]))
-    return Bodies(*map(jnp.asarray, shape), zero, zero, jnp.full(len(zero), SOLID), jnp.ones(len(zero), bool))
+    return primitives.Bodies(
+        *map(jnp.asarray, shape), zero, zero, jnp.full(len(zero), primitives.SOLID), jnp.ones(len(zero), bool)
+    )
 
 
 def first_hit(crossing):
@@ -127,7 +118,7 @@ def land():
 
 
 def ground_of(heights, origin):
-    return Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
+    return primitives.Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
 
 
 def test_ground_is_met_where_a_ray_first_goes_below_it(land):
@@ -153,9 +144,13 @@ def small_town(land, rng):
     poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
     tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
     lanes = jnp.zeros((2, 64, 3)), jnp.ones(2), jnp.zeros(4, jnp.int32)
-    traffic = RoadUsers(*lanes, *[jnp.zeros(4)] * 3, half_sizes=jnp.ones((4, 3)), mask=jnp.zeros(4, bool))
-    bodies = pack_bodies(boxes, SOLID), pack_bodies(poles, POLE), pack_bodies(tufts, SOFT)
-    return TownPrimitives(*bodies, ground_of(heights, origin), traffic), boxes, poles, tufts
+    traffic = primitives.RoadUsers(*lanes, *[jnp.zeros(4)] * 3, half_sizes=jnp.ones((4, 3)), mask=jnp.zeros(4, bool))
+    bodies = (
+        primitives.pack_bodies(boxes, primitives.SOLID),
+        primitives.pack_bodies(poles, primitives.POLE),
+        primitives.pack_bodies(tufts, primitives.SOFT),
+    )
+    return primitives.TownPrimitives(*bodies, ground_of(heights, origin), traffic), boxes, poles, tufts
 
 
 def tilted_pose():
@@ -190,19 +185,19 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     wanted, kinds = [], []
     for ray in world:
         options = {
-            SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
-            POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[5]) for p in poles),
-            SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[5]) for s in tufts),
-            GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
+            primitives.SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
+            primitives.POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[5]) for p in poles),
+            primitives.SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[5]) for s in tufts),
+            primitives.GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
         }
         kind = min(options, key=options.get)
         wanted.append(min(options[kind], np.inf) if options[kind] <= SENSOR.max_range_m else np.inf)
-        kinds.append(kind if np.isfinite(wanted[-1]) else NOTHING)
+        kinds.append(kind if np.isfinite(wanted[-1]) else primitives.NOTHING)
     wanted, kinds = np.array(wanted), np.array(kinds)
     same = np.isclose(found, wanted, rtol=0, atol=0.03)
     assert same.mean() > 0.985
     assert (surfaces == kinds)[same].mean() > 0.98
-    assert {SOLID, POLE, SOFT, GROUND} <= set(surfaces.tolist())
+    assert {primitives.SOLID, primitives.POLE, primitives.SOFT, primitives.GROUND} <= set(surfaces.tolist())
 
 
 @pytest.mark.slow
@@ -226,7 +221,7 @@ def test_windows_lie_behind_their_wall(turn):
     depth = 0.3
     boxes = town.boxes._replace(window_depth=jnp.full_like(town.boxes.window_depth, depth))
     fronts = look(town._replace(boxes=boxes), pose)
-    is_wall = np.asarray(walls.surfaces) == SOLID
+    is_wall = np.asarray(walls.surfaces) == primitives.SOLID
     deeper = np.asarray(fronts.ranges)[is_wall] - np.asarray(walls.ranges)[is_wall]
     cosines = np.asarray(walls.cosines)[is_wall]
     assert (deeper >= 0).all()
