@@ -3,6 +3,7 @@
     python -m experiments.made_cases --draws 20                       20 draws of each kind
     python -m experiments.made_cases --kinds relief scale --draws 200
     python -m experiments.made_cases --resume --draws 200             go on, with more draws
+    python -m experiments.made_cases --kinds fused fused-cut --data DRIVE ...
 
 The file rows.csv has a row for each kind and draw, table.md a summary. A drive along a relief of 3 to 20 cm is right
 below an ATE of 0.05 m, a pair within 2 m and 5 degrees, a planar map where no scan is 0.5 m off.
@@ -11,20 +12,23 @@ below an ATE of 0.05 m, a pair within 2 m and 5 degrees, a planar map where no s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tyro.conf import arg
 
-from dpmjax import cli, deepmapping, deeppointmap, metrics, registration2d, sequences, simulation, slam, weights
+from dpmjax import cli, deepmapping, deeppointmap, io, metrics, registration2d, sequences, simulation, slam, weights
 from dpmjax.geometry import rigid, se2
 from dpmjax.simulation.world2d import cast_rays
 
 NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M, RIGHT_PASSAGE_M = 25, 0.12, 0.006, 0.9, 0.05, 0.5
-PX_M = 0.05
+FUSED = ("fused", "fused-cut")
+PX_M, CROP_M = 0.05, 35.0
 # The map is that of the alignment: a fit takes longer, and the trust is the same.
 FEW_STEPS = deepmapping.with_steps(deepmapping.preset("fast"), 2)
 COLUMNS = ("sure_and_wrong", "right_and_sure", "is_sure", "is_right", "error_m", "seconds")
@@ -40,11 +44,15 @@ class MadeOptions(cli.RunOptions, cli.ModelOptions):
     """Kinds of cases."""
     draws: Annotated[int, cli.Bound(1)] = 5
     """Draws of each kind."""
+    data: Annotated[tuple[Path, ...], arg(metavar="DRIVE ...")] = ()
+    """Drives with poses, for scans in crops of a fused map: --kinds fused fused-cut (a view of 70 degrees)."""
 
     def __post_init__(self) -> None:
         """Checks bounds and names."""
         super().__post_init__()
-        cli.check_names("--kinds", self.kinds, KINDS)
+        cli.check_names("--kinds", self.kinds, (*KINDS, *FUSED))
+        if not self.data and set(self.kinds) & set(FUSED):
+            raise ValueError("--kinds: fused and fused-cut need --data")
 
 
 def main(options: MadeOptions, run: cli.Run) -> cli.Row:
@@ -54,7 +62,10 @@ def main(options: MadeOptions, run: cli.Run) -> cli.Row:
 
     def work(kind: str, draw: int) -> cli.Row:
         begun, rng = time.process_time(), np.random.default_rng([options.seed, draw, *kind.encode()])
-        answer = KINDS[kind](model, rng)
+        if kind in FUSED:
+            answer = register_pair(model, draw_view(rng, options.data, is_cut=kind == FUSED[1]))
+        else:
+            answer = KINDS[kind](model, rng)
         sure = {"sure_and_wrong": answer.is_sure and not answer.is_right, "right_and_sure": all(answer[1:])}
         return {**answer._asdict(), **sure, "seconds": time.process_time() - begun}
 
@@ -205,6 +216,37 @@ def with_scale(rng: np.random.Generator) -> Pair:
     pair = draw_pair(rng, "suburb", 6)
     scale = 1 + rng.uniform(0.01, 0.1) * rng.choice([-1, 1])
     return pair._replace(source=(scale * pair.source).astype(np.float32), T_target_source=None)
+
+
+def draw_view(rng: np.random.Generator, drives: Sequence[Path], *, is_cut: bool) -> Pair:
+    """Draws a scan of a recorded drive, and a crop of a fused map of the drive without this scan and its neighbours.
+
+    Args:
+        rng: source of the choices.
+        drives: folders of drives with poses.
+        is_cut: True keeps a view of 70 degrees of the scan.
+
+    Returns:
+        The pair; the target is the crop of 35 m, thinned to 10 cm, in a frame turned about the vertical.
+    """
+    drive = io.open_lidar_sequence(drives[rng.integers(len(drives))])
+    if drive.T_world_lidar is None:
+        raise ValueError(f"{drive.name}: has no poses; the kinds fused and fused-cut need them")
+    T_world_lidar, row = drive.T_world_lidar, int(rng.integers(len(drive)))
+    T_world_crop = T_world_lidar[row].copy()
+    T_world_crop[:2, 3] += rng.uniform(-5, 5, 2)
+    T_world_crop[:3, :3] = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
+    order = np.argsort(np.linalg.norm(T_world_lidar[:, :3, 3] - T_world_crop[:3, 3], axis=1))[:40:2]
+    rows = [other for other in order.tolist() if abs(other - row) > 2][:15]
+    T_crop_lidar = rigid.inverse(T_world_crop) @ T_world_lidar
+    fused = np.concatenate([rigid.transform_points(T_crop_lidar[other], drive[other]) for other in rows])
+    fused = fused[np.linalg.norm(fused[:, :2], axis=1) < CROP_M]
+    fused = fused[np.unique(np.floor(fused / 0.1), axis=0, return_index=True)[1]].astype(np.float32)
+    scan = drive[row]
+    if is_cut:
+        off = np.arctan2(scan[:, 1], scan[:, 0]) - rng.uniform(-np.pi, np.pi)
+        scan = scan[np.cos(off) > np.cos(np.radians(35))]
+    return Pair(scan, fused, T_crop_lidar[row])
 
 
 KINDS: dict[str, Callable[[deeppointmap.Model, np.random.Generator], Answer]] = {

@@ -342,6 +342,22 @@ class LidarSequence:
         except EmptyScanError:
             return np.zeros((0, 3), np.float32)
 
+    def from_base(self, T_base_lidar: FloatArray) -> LidarSequence:
+        """Moves points and reference poses that are in the robot's frame, as those of Argoverse, to the lidar's frame.
+
+        Args:
+            T_base_lidar: (4, 4) pose of the lidar on the robot.
+
+        Returns:
+            The sequence; beams begin at the origin of its scans.
+        """
+        R, t, poses = T_base_lidar[:3, :3], T_base_lidar[:3, 3], self.T_world_lidar
+        return replace(
+            self,
+            read_scan=lambda index: ((self.read_scan(index) - t) @ R).astype(np.float32),
+            T_world_lidar=None if poses is None else poses @ T_base_lidar,
+        )
+
     def take(self, selection: Selection) -> LidarSequence:
         """Selects scans with their poses and times, in the same world; nothing is read."""
         numbers = [int(i) for i in np.arange(len(self))[selection]]

@@ -1,15 +1,19 @@
 """Laws of registration where another place fits as well: bare rooms, and rows of equal houses."""
 
+import dataclasses
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dpmjax
+from dpmjax.deeppointmap import registration
 from dpmjax.deeppointmap.confidence import MatchEvidence, calibrated_probability
 from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
 from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.scans.lidar import measure_scan
+from dpmjax.types import Registration
 from tests.scans.surface_scenes import motion, rectangle, seen_from, street
 
 CONFIG = VerificationConfig()
@@ -69,3 +73,27 @@ def test_two_places_of_one_score_share_the_probability() -> None:
     for gap, share in ((0.0, 0.5), (np.log(3), 0.75), (30.0, 1.0)):
         shared = calibrated_probability(calibration, MatchEvidence(scans[:4], scans, lookalike_gap=gap))
         assert shared == pytest.approx(share * alone, rel=1e-6)
+
+
+@pytest.mark.parametrize("is_right_at_home", [True, False])
+def test_scans_of_a_small_room_are_registered_at_twice_their_size_too(monkeypatch, is_right_at_home: bool) -> None:
+    points = [0.7 * seen_from(room(np.random.default_rng(seed), has_niche=True), T) for seed, T in enumerate(POSES)]
+    T_small = T_TRUE.copy()
+    T_small[:3, 3] *= 0.7
+    wrong, model = motion(120, (0.5, 1.0, 0.0)), dpmjax.load_model("dpm_small")
+
+    def answer(model, pairs, *, refine):
+        is_enlarged = np.abs(pairs[0][0]).max() > 1.5 * np.abs(points[0]).max()
+        T = T_small.copy() if is_right_at_home != is_enlarged else wrong.copy()
+        T[:3, 3] *= 2.0 if is_enlarged else 1.0
+        size = 0.95 if is_enlarged else 0.6
+        empty = np.zeros((0,), np.int32)
+        numbers = {name: np.zeros(()) for name in ("rmse", "num_inliers", "score")}
+        fields = {field.name: numbers.get(field.name, empty) for field in dataclasses.fields(Registration)}
+        fields |= {"T_target_source": jnp.asarray(T), "confidence": jnp.asarray(size), "weak_sigma_m": None}
+        return [Registration(**fields)]
+
+    monkeypatch.setattr(registration, "_register_either_way", answer)
+    found = dpmjax.register(model, *points)
+    np.testing.assert_allclose(found.T_target_source, T_small, atol=1e-5)
+    assert found.confidence <= 0.88

@@ -57,6 +57,8 @@ class SlamOptions(cli.DriveOptions):
     """Undo the motion of the lidar during its turn, by the times of the points (of .pcd .ply .npz) or their azimuth."""
     base_from_lidar: Annotated[tuple[float, ...], arg(metavar="X Y Z QX QY QZ QW")] = ()
     """Pose of the lidar in the robot's frame, metres and quaternion; the run writes the robot's trajectory, too."""
+    points_in_base: FlagCreatePairsOff[bool] = False
+    """Points and reference poses of DATA are in the robot's frame (Argoverse), not in that of the lidar."""
     cluster: Annotated[str | None, arg(metavar="local|HOST:PORT")] = None
     """Map several drives on workers of this Dask cluster, and merge their maps. local: processes here, one a drive."""
     visualize: Annotated[FlagCreatePairsOff[bool], arg(aliases=["-v"])] = False
@@ -79,6 +81,9 @@ class SlamOptions(cli.DriveOptions):
         if given and (len(given) != 7 or abs(norm - 1.0) > 0.01):
             raise ValueError(f"--base-from-lidar: expected 3 + 4 numbers, a unit quaternion, got {given}")
 
+        if self.points_in_base and not given:
+            raise ValueError("--points-in-base: give --base-from-lidar, too; beams begin at the lidar")
+
     @property
     def T_base_lidar(self) -> np.ndarray | None:
         """Pose of the lidar in the frame of the robot; None if it was not given."""
@@ -100,6 +105,8 @@ def main(options: SlamOptions, run: cli.Run) -> cli.Numbers:
     # A map of other weights is refused here, before the scans are opened.
     start = slam.init_slam(None if options.map is None else slam_run.open_map(options.map, methods))
     sequence = cli.open_drive(next(iter(options.data), None), options, options.sequence)
+    if options.points_in_base and options.T_base_lidar is not None:
+        sequence = sequence.from_base(options.T_base_lidar)
     odometry, notes = odometry_of(options, sequence)
     reader = cli.ScanReader(sequence, is_deskewed=options.deskew, jump=options.jump, odometry=odometry)
     beginning = slam_run.find_beginning(run.path if run.is_resumed else None, methods, start)

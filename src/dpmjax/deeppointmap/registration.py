@@ -44,12 +44,16 @@ from dpmjax.scans.align import LEVELS, align_on_host
 from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
 from dpmjax.scans.pair_registration import PairEvidence, ScanRegistration
 from dpmjax.scans.pairs import nearest_planes
-from dpmjax.scans.sizes import relative_size
+from dpmjax.scans.sizes import matched_share, relative_size
 from dpmjax.scans.weak_directions import WeakDirection, plane_information, weakest_direction
 from dpmjax.types import DescriptorCloud, Pose, Poses, RawScan, Registration, Verification
 
 # Probability from which one way is enough: of 517 such motions of real pairs two were wrong.
 SURE_PROBABILITY = 0.9
+
+# Scans with a smaller median range are registered enlarged, too: of fragments of rooms (2.5 m) the network places none
+# at their own size, those of a hall (7 m) all. Factor; and factor for the comparison, whose tolerances are a street's.
+ROOM_M, ROOM_SCALE, FINE_SCALE = 5.0, 2.0, 3.0
 
 # Number of surface elements of a scan that is registered with a cloud.
 NUM_ELEMENTS = 1024
@@ -85,7 +89,8 @@ def register(
 
     With a calibrated model, exchanged scans give the inverse motion with the same probability. The library chooses
     which scan is the source. If the probability is below 0.9, it exchanges the scans and registers them again, and
-    takes the more probable motion.
+    takes the more probable motion. Raw scans of small rooms are then registered at twice their size, too, and are
+    never sure.
 
     Args:
         model: encoder and decoder.
@@ -110,7 +115,37 @@ def register(
         ValueError: if the model is none, the points are no real numbers (n, 3), or features have another width than the
             model.
     """
-    return _register_either_way(model, [(source, target)], refine=refine)[0]
+    found = _register_either_way(model, [(source, target)], refine=refine)[0]
+    is_raw = not any(isinstance(scan, DescriptorCloud | Scan) for scan in (source, target))
+    if not is_raw or model.config.calibration is None or found.confidence >= SURE_PROBABILITY:
+        return found
+    return _register_as_room(model, source, target, found, refine=refine)
+
+
+def _register_as_room(
+    model: Model, source: ScanOrCloud, target: ScanOrCloud, found: Registration, *, refine: bool | None
+) -> Registration:
+    """Registers scans of small rooms enlarged, too, because the network has learned streets and halls.
+
+    The motion is kept under which the surfaces meet more closely. The enlarged scans are of no calibrated size.
+    """
+    points = [valid_points(cast(RawScan, read_path(scan, "io.read_lidar_file"))) for scan in (source, target)]
+    if not all(len(some) and np.median(np.linalg.norm(some, axis=1)) < ROOM_M for some in points):
+        return found
+    other = _register_either_way(model, [(ROOM_SCALE * points[0], ROOM_SCALE * points[1])], refine=refine)[0]
+    T_other = other.T_target_source.at[:3, 3].divide(ROOM_SCALE)
+    one, two = (measure_scan(FINE_SCALE * some).surface for some in points)
+
+    def agreement(T_target_source: Array) -> float:
+        T = np.array(T_target_source, np.float64)
+        T[:3, 3] *= FINE_SCALE
+        return min(matched_share(one, two, T), matched_share(two, one, rigid.inverse(T)))
+
+    if agreement(T_other) <= agreement(found.T_target_source):
+        return found
+    confidence, rmse = jnp.minimum(other.confidence, CORRIDOR_CONFIDENCE), other.rmse / ROOM_SCALE
+    sigma_m = None if other.weak_sigma_m is None else other.weak_sigma_m / ROOM_SCALE
+    return replace(other, T_target_source=T_other, rmse=rmse, weak_sigma_m=sigma_m, confidence=confidence)
 
 
 @runs_on_host("call correlate and weighted_svd there")

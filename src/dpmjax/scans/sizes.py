@@ -37,11 +37,11 @@ def relative_size(source: Surface, target: Surface, T_target_source: Pose) -> fl
     """
     if not len(source.samples) or not len(target.points):
         return 1.0
-    before = _matched_share(source, target, np.asarray(T_target_source, np.float64))
+    before = matched_share(source, target, np.asarray(T_target_source, np.float64))
     if before > ENOUGH:
         return 1.0
     found = [_align_with_scale(source, target, T_target_source, scale) for scale in START_SCALES]
-    share, scale = max(((_matched_share(source, target, _scaled(T, scale)), scale) for T, scale in found))
+    share, scale = max(((matched_share(source, target, _scaled(T, scale)), scale) for T, scale in found))
     return 1 / scale if abs(1 - scale) > MIN_DIFFERENCE and share > before + MIN_GAIN else 1.0
 
 
@@ -71,6 +71,15 @@ def _scaled(T_target_source: Pose, scale: float) -> Pose:
     return scaled
 
 
-def _matched_share(source: Surface, target: Surface, T_target_source: Pose) -> float:
-    """Returns the share of elements that meet planes under a similarity."""
+def matched_share(source: Surface, target: Surface, T_target_source: Pose) -> float:
+    """Computes the share of elements of a scan that meet planes of another.
+
+    Args:
+        source: surface of a scan.
+        target: surface of the second scan.
+        T_target_source: rigid motion or similarity.
+
+    Returns:
+        The share, 0 to 1.
+    """
     return float(nearest_planes(source, target, T_target_source[None], 1.0, NUM_ELEMENTS).meets.mean())

@@ -194,13 +194,13 @@ def test_uniform_parameters_are_those_of_pytorchs_linear_layers() -> None:
 
 EIGHT_DEVICES = """
 import jax, numpy as np
-from dpmjax.deeppointmap import dpm.SampleMaker, dpm.init_training
+from dpmjax.deeppointmap import SampleMaker, init_training
 from dpmjax.deeppointmap.training.processes import device_mesh, place
 from dpmjax.deeppointmap.training.step import batch_loss
 from tests.deeppointmap import toy
 assert jax.device_count() == 8
-maker = dpm.SampleMaker(toy.store(), toy.TRAINING, seed=0, numbers=range(8), num_in_step=8)
-batch, params = maker(0), dpm.init_training(jax.random.key(0), toy.TRAINING).params
+maker = SampleMaker(toy.store(), toy.TRAINING, seed=0, numbers=range(8), num_in_step=8)
+batch, params = maker(0), init_training(jax.random.key(0), toy.TRAINING).params
 gradient = jax.jit(jax.grad(lambda params, batch: batch_loss(params, batch, toy.TRAINING)[0]))
 alone = gradient(params, batch)
 mesh = device_mesh()
