@@ -1,7 +1,5 @@
 """Fixtures of all tests. Shapes and types are checked at run time, by jaxtyping and beartype."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import os
@@ -112,6 +110,24 @@ def as_user() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="session")
+def model():
+    """A network that compiles in seconds."""
+    import dpmjax
+    from tests.deeppointmap import toy
+
+    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
+
+
+@pytest.fixture
+def weights(model, tmp_path) -> Path:
+    """The file of this network."""
+    import dpmjax
+
+    dpmjax.save_model(model, tmp_path / "model.safetensors", card="toy")
+    return tmp_path / "model.safetensors"
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Writers of data sets in the layouts of their authors, for tests of the readers and of the commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +8,10 @@ from scipy.io import savemat
 from dpmjax.cli.options import RunOptions
 from dpmjax.cli.run import Run
 from dpmjax.geometry import rigid
-from dpmjax.io import InputError, LidarSequence, ScanSequence, write_kitti
+from dpmjax.io import InputError, LidarSequence, ScanSequence
 from dpmjax.io.clouds import parse_pcd, parse_ply
 from dpmjax.io.files import read_bytes
-
-# Axes of a camera that looks along x of the lidar: x right, y down, z forward. Written drives have it in the lidar.
-_T_CAM0_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+from tests.io.drives import write_kitti_odometry
 
 
 def write_pcd(path: Path, points: np.ndarray) -> Path:
@@ -54,30 +50,17 @@ def write_deepmapping_folder(folder: Path, sequence: ScanSequence) -> Path:
 
 
 def write_kitti_sequence(root: Path, name: str, sequence: LidarSequence) -> Path:
-    """Writes sequences/NAME/{velodyne,calib.txt,times.txt} and poses/NAME.txt of the good scans."""
-    folder = root / "sequences" / name
-    (folder / "velodyne").mkdir(parents=True)
-    kept = []
-    for index, points in readable_scans(sequence).items():
-        rows = np.zeros((len(points), 4), "<f4")
-        rows[:, :3] = points
-        (folder / "velodyne" / f"{len(kept):06d}.bin").write_bytes(rows.tobytes())
-        kept.append(index)
-    T_first_lidar = rigid.inverse(sequence.T_world_lidar[kept[0]]) @ sequence.T_world_lidar[kept]
-    write_kitti(root / "poses" / f"{name}.txt", _T_CAM0_LIDAR @ T_first_lidar @ rigid.inverse(_T_CAM0_LIDAR))
-    (folder / "calib.txt").write_text("Tr: " + " ".join(f"{value:.12e}" for value in _T_CAM0_LIDAR[:3].ravel()) + "\n")
-    times = np.arange(len(kept)) / 10.0 if sequence.times is None else sequence.times[kept]
-    (folder / "times.txt").write_text("".join(f"{time:.6f}\n" for time in times))
-    return folder
+    """Writes the good scans in the layout of KITTI's odometry."""
+    scans = readable_scans(sequence)
+    T_world_lidar = sequence.T_world_lidar[list(scans)]
+    return write_kitti_odometry(root, list(scans.values()), rigid.inverse(T_world_lidar[0]) @ T_world_lidar, name)
 
 
 def read_pcd(path: Path) -> np.ndarray:
-    """Reads the points of a PCD file, NaN too."""
     return parse_pcd(read_bytes(path), str(path)).points
 
 
 def read_ply(path: Path) -> np.ndarray:
-    """Reads the points of a PLY file, NaN too."""
     return parse_ply(read_bytes(path), str(path)).points
 
 

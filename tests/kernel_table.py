@@ -1,7 +1,5 @@
 """One table of all kernels: how each is called, on small arrays, and by which of them it has a derivative."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -48,13 +46,19 @@ def points(*names: str, dim: int = 3) -> Callable[[np.random.Generator], Arrays]
     return lambda rng: {name: rng.normal(size=(NUM, dim)).astype(np.float32) for name in names}
 
 
-def with_masks(*names: str, dim: int = 3, **masks: str) -> Callable[[np.random.Generator], Arrays]:
-    """Points, and masks that are True everywhere."""
-    return lambda rng: points(*names, dim=dim)(rng) | {mask: np.ones(NUM, bool) for mask in masks.values()}
-
-
 def masked(*names: str, **masks: str) -> Arrays:
     return dict.fromkeys(names, np.nan) | dict.fromkeys(masks.values(), False)
+
+
+def of_points(call, names: str, by="", *, padded="", masks="mask", dim=3, is_exact=True, has_places=True) -> Kernel:
+    """A kernel of named points and masks, of which all points are padded or those that `padded` names."""
+    rows, there = tuple((padded or names).split()), masks.split()
+
+    def make(rng: np.random.Generator) -> Arrays:
+        return points(*names.split(), dim=dim)(rng) | {mask: np.ones(NUM, bool) for mask in there}
+
+    padding = dict.fromkeys(rows, np.nan) | dict.fromkeys(there, False)
+    return Kernel(call, make, tuple(by.split()), padding, points=rows if has_places else (), is_exact=is_exact)
 
 
 def moved_clouds(dim: int) -> Callable[[np.random.Generator], Arrays]:
@@ -91,7 +95,6 @@ def distance_of_beams(points: Any, mask: Any, **T: Any) -> Any:
 
 
 def contrast(rng: np.random.Generator) -> Arrays:
-    """Descriptors, of which some queries and some keys do not count."""
     masks = {name: rng.uniform(size=NUM) < 0.8 for name in ("is_query", "is_key")}
     return points("queries", "keys")(rng) | {"positives": rng.permutation(NUM)} | masks
 
@@ -195,7 +198,8 @@ def edges_of(source: Any, target: Any, measured: Any, information: Any) -> pose_
 
 
 EDGES = {"source": 0, "target": 0} | masked("measured", "information", edge_mask="edge_mask")
-BOTH = {"source_mask": "source_mask", "target_mask": "target_mask"}
+SCAN = masked("points", mask="mask")
+PAIR = masked("source", "target", source_mask="source_mask", target_mask="target_mask")
 CLOUDS = masked("a", "b", "at_a", "at_b", is_a="is_a", is_b="is_b")
 KERNELS = {
     "weighted_svd": Kernel(
@@ -205,119 +209,62 @@ KERNELS = {
         masked("source", "target") | {"weights": 0.0},
         points=("source", "target"),
     ),
-    "align_rigid": Kernel(
-        dpmjax.align_rigid,
-        with_masks("estimated", "reference", mask="mask"),
-        ("estimated", "reference"),
-        masked("estimated", "reference", mask="mask"),
-    ),
-    "absolute_trajectory_error": Kernel(
-        dpmjax.absolute_trajectory_error,
-        with_masks("estimated", "reference", dim=2, mask="mask"),
-        ("estimated", "reference"),
-        masked("estimated", "reference", mask="mask"),
+    "align_rigid": of_points(dpmjax.align_rigid, "estimated reference", "estimated reference", has_places=False),
+    "absolute_trajectory_error": of_points(
+        dpmjax.absolute_trajectory_error, "estimated reference", "estimated reference", dim=2, has_places=False
     ),
     "relative_pose_error": Kernel(dpmjax.relative_pose_error, trajectories, ("estimated", "reference")),
-    "point_distance": Kernel(
-        distance_of_beams,
-        mapped_points,
-        ("points", "T_estimated"),
-        masked("points", mask="mask"),
-        points=("points",),
-    ),
-    "k_nearest": Kernel(
+    "point_distance": Kernel(distance_of_beams, mapped_points, ("points", "T_estimated"), SCAN, ("points",)),
+    "k_nearest": of_points(
         lambda queries, points, mask: dpmjax.k_nearest(queries, points, 3, mask),
-        with_masks("queries", "points", mask="mask"),
-        ("queries", "points"),
-        masked("points", mask="mask"),
-        points=("points",),
+        "queries points",
+        "queries points",
+        padded="points",
     ),
-    "radius_search": Kernel(
+    "radius_search": of_points(
         lambda queries, points, mask: dpmjax.radius_search(queries, points, 0.8, 3, mask),
-        with_masks("queries", "points", mask="mask"),
-        ("queries", "points"),
-        masked("points", mask="mask"),
-        points=("points",),
+        "queries points",
+        "queries points",
+        padded="points",
     ),
-    "farthest_point_sample": Kernel(
-        lambda points, mask: dpmjax.farthest_point_sample(points, 6, mask),
-        with_masks("points", mask="mask"),
-        padding=masked("points", mask="mask"),
-        points=("points",),
-    ),
-    "voxel_sample": Kernel(
-        lambda points, mask: dpmjax.voxel_sample(points, 0.7, mask),
-        with_masks("points", mask="mask"),
-        padding=masked("points", mask="mask"),
-        points=("points",),
-    ),
-    "estimate_normals": Kernel(
-        lambda points, mask: dpmjax.estimate_normals(points, 5, mask),
-        with_masks("points", mask="mask"),
-        padding=masked("points", mask="mask"),
-        points=("points",),
-    ),
+    "farthest_point_sample": of_points(lambda points, mask: dpmjax.farthest_point_sample(points, 6, mask), "points"),
+    "voxel_sample": of_points(lambda points, mask: dpmjax.voxel_sample(points, 0.7, mask), "points"),
+    "estimate_normals": of_points(lambda points, mask: dpmjax.estimate_normals(points, 5, mask), "points"),
     "sample_free_space": Kernel(dpmjax.sample_free_space, beams, ("origin", "points", "factors")),
     "geometry.build_pyramid": Kernel(
         lambda points, mask: geometry.build_pyramid(points, mask, toy.MODEL.pyramid).levels[1:],
         scan,
-        padding=masked("points", mask="mask"),
+        padding=SCAN,
         points=("points",),
     ),
-    "geometry.find_consensus": Kernel(
-        geometry.find_consensus,
-        with_masks("source", "target", mask="mask"),
-        padding=masked("source", "target", mask="mask"),
-        points=("source", "target"),
-    ),
+    "geometry.find_consensus": of_points(geometry.find_consensus, "source target"),
     "info_nce": Kernel(
         contrast_of,
         contrast,
         ("queries", "keys"),
         {"positives": 0} | masked("queries", "keys", query="is_query", key="is_key"),
     ),
-    "chamfer_distance": Kernel(
-        dpmjax.chamfer_distance,
-        with_masks("a", "b", mask_a="mask_a", mask_b="mask_b"),
-        ("a", "b"),
-        masked("a", "b", mask_a="mask_a", mask_b="mask_b"),
-        points=("a", "b"),
-    ),
+    "chamfer_distance": of_points(dpmjax.chamfer_distance, "a b", "a b", masks="mask_a mask_b"),
     "occupancy_loss": Kernel(
         dpmjax.occupancy_loss, samples, ("logits", "labels"), masked("logits", "labels") | {"weights": 0.0}
     ),
-    "losses.offset_loss": Kernel(
-        losses.offset_loss,
-        with_masks("predicted", "true", mask="mask"),
-        padding=masked("predicted", "true", mask="mask"),
-        by=("predicted",),
-        is_exact=False,  # the covariance is held constant
+    # The covariance is held constant.
+    "losses.offset_loss": of_points(
+        losses.offset_loss, "predicted true", "predicted", is_exact=False, has_places=False
     ),
+    # Compared with differences by a test of its own.
     "icp": Kernel(
-        partial(dpmjax.icp, metric="plane"),
-        moved_clouds(3),
-        ("source",),
-        masked("source", "target", **BOTH),
-        points=("source", "target"),
-        is_exact=False,  # a test of its own
+        partial(dpmjax.icp, metric="plane"), moved_clouds(3), ("source",), PAIR, ("source", "target"), is_exact=False
     ),
     "icp to points": Kernel(
         partial(dpmjax.icp, metric="point"),
         moved_clouds(2),
         ("source", "target"),
-        masked("source", "target", **BOTH),
-        points=("source", "target"),
+        PAIR,
+        ("source", "target"),
         is_exact=False,
     ),
-    "encode_pyramid": Kernel(
-        encode,
-        scan,
-        ("points",),
-        masked("points", mask="mask"),
-        points=("points",),
-        is_exact=False,
-        dtypes=("float32",),
-    ),
+    "encode_pyramid": Kernel(encode, scan, ("points",), SCAN, ("points",), is_exact=False, dtypes=("float32",)),
     "correlate": Kernel(correlate, descriptors, ("a", "b"), CLOUDS, is_exact=False, dtypes=("float32",)),
     "match_hypotheses": Kernel(match, descriptors, ("a", "b", "at_a", "at_b"), CLOUDS, dtypes=("float32",)),
     "pose_graph.residuals": Kernel(
@@ -355,7 +302,6 @@ def padded(kernel: Kernel, arrays: Arrays, point: float | None = None, hidden: f
 
 
 def total(kernel: Kernel, arrays: Arrays) -> Any:
-    """A weighted sum of all numbers that a kernel returns."""
     leaves = floats(kernel.call(**arrays))
     leaves = [jnp.where(jnp.isfinite(leaf), leaf, 0.0).ravel() for leaf in leaves]
     return sum(jnp.sum(jnp.cos(jnp.arange(leaf.size)) * leaf) for leaf in leaves)

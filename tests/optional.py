@@ -1,7 +1,5 @@
 """Tests that need a package of an extra are skipped with the reason, also if the package is broken."""
 
-from __future__ import annotations
-
 import importlib
 from types import ModuleType
 
@@ -11,10 +9,7 @@ from dpmjax.cli.info import why_not_importable
 
 
 def import_or_skip(module: str) -> ModuleType:
-    """Returns the module; skips the test where it cannot be imported.
-
-    Unlike `pytest.importorskip`, it also skips where the import raises anything else than an ImportError.
-    """
+    """Returns the module; skips the test where its import raises any error, not an ImportError alone."""
     if (reason := why_not_importable(module)) is not None:
         pytest.skip(reason)
     return importlib.import_module(module)

@@ -1,7 +1,5 @@
 """Compiled programs on disk: where they are kept, and that a later process takes them from there."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

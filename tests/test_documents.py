@@ -1,7 +1,5 @@
 """The pages agree with the tree: the plan of the rooms, files, links, settings, dependencies, lengths."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import tomllib

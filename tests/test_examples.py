@@ -1,19 +1,15 @@
 """Examples run, and the pages show their code: README and quick start as printed, guides as quoted and as a whole."""
 
-from __future__ import annotations
-
-import os
 import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.optional import import_or_skip
+from tests.processes import REPOSITORY as ROOT
+from tests.processes import run_python
 
-ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
 QUICK = ("06", "10")
@@ -61,8 +57,7 @@ def test_code_of_a_guide_defines_all_its_names(guide, tmp_path) -> None:
     """The blocks of a guide run in order, so no name may come from the example alone."""
     code = tmp_path / "guide.py"
     code.write_text("\n".join(_blocks(guide)))
-    ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "concise"]
-    done = subprocess.run([*ruff, str(code)], capture_output=True, text=True)
+    done = run_python("-m", "ruff", "check", "--isolated", "--select", "F821", "--output-format", "concise", code)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -75,11 +70,8 @@ def test_code_of_pages_and_examples_has_no_type_error_by_the_library(tmp_path) -
     # The functions of the pages are short and have no annotations, and optax ships none.
     own = ["no-untyped-def", "no-untyped-call", "import-untyped", "no-redef", "untyped-decorator"]
     options = ["--strict", "--follow-imports=silent", *(f"--disable-error-code={code}" for code in own)]
-    mypy = [sys.executable, "-m", "mypy", *options, "--cache-dir", str(ROOT / ".mypy_cache" / "pages")]
-    environment = os.environ | {"MYPYPATH": str(ROOT / "src")}
-    done = subprocess.run(
-        [*mypy, *map(str, sorted(tmp_path.iterdir()))], capture_output=True, text=True, env=environment
-    )
+    options += ["--cache-dir", ROOT / ".mypy_cache" / "pages", *sorted(tmp_path.iterdir())]
+    done = run_python("-m", "mypy", *options, variables={"MYPYPATH": str(ROOT / "src")})
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -3,8 +3,6 @@
 Each case prints its error, verdict, the right value, and whether it is right or not sure.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import NamedTuple

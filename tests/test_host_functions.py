@@ -1,7 +1,5 @@
 """Pipelines say in one sentence that they cannot be traced."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

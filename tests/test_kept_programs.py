@@ -1,7 +1,5 @@
 """Laws of traced programs on disk: traced once for all processes, and the same function as ever."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax

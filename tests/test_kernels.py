@@ -1,14 +1,8 @@
 """Laws of all kernels, for each row of `tests.kernel_table`."""
 
-from __future__ import annotations
-
 import operator
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,23 +15,13 @@ from jax.sharding import PartitionSpec as P
 import dpmjax
 from tests import kernel_table
 from tests.kernel_table import EXTRA, KERNELS, Arrays, Kernel, example, floats, moved_clouds, padded, total
+from tests.processes import REPOSITORY, run_python
 
 # Float32 sums and solutions of small systems; a loop that ends at a millionth of the cloud.
 CLOSE: Arrays = {"rtol": 1e-3, "atol": 2e-4}
-REPOSITORY = Path(__file__).parents[1]
 # These compile for seconds.
-SLOW = (
-    "correlate",
-    "deepmapping.solve",
-    "deepmapping.step",
-    "encode_pyramid",
-    "geometry.build_pyramid",
-    "geometry.find_consensus",
-    "icp",
-    "icp to points",
-    "match_hypotheses",
-    "pose_graph.solve_dense",
-)
+SLOW = {"correlate", "deepmapping.solve", "deepmapping.step", "encode_pyramid", "geometry.build_pyramid"}
+SLOW |= {"geometry.find_consensus", "icp", "icp to points", "match_hypotheses", "pose_graph.solve_dense"}
 WITH_MASKS = {name: kernel for name, kernel in KERNELS.items() if kernel.padding}
 WITH_GRADIENT = {name: kernel for name, kernel in KERNELS.items() if kernel.by}
 
@@ -50,7 +34,6 @@ def _made_outside_of_programs() -> None:
 
 
 def each(kernels: dict[str, Kernel]) -> pytest.MarkDecorator:
-    """Runs a test for each of some kernels."""
     marks = {name: (pytest.mark.slow,) if name in SLOW else () for name in kernels}
     rows = [pytest.param(kernel, id=name, marks=marks[name]) for name, kernel in kernels.items()]
     return pytest.mark.parametrize("kernel", rows)
@@ -203,11 +186,7 @@ for name, kernel in KERNELS.items():
 @pytest.mark.slow
 def test_eight_devices_and_64_bits_give_the_numbers_of_one_and_of_32() -> None:
     flags = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": "1"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
-    done = subprocess.run(
-        [sys.executable, "-c", ON_EIGHT_DEVICES], cwd=REPOSITORY, env=environment, capture_output=True, text=True
-    )
+    done = run_python("-c", ON_EIGHT_DEVICES, variables={"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"})
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [*KERNELS]
 
@@ -245,9 +224,7 @@ def test_a_prediction_that_is_not_finite_is_never_left_out(name: str) -> None:
 def test_the_guide_lists_every_public_kernel() -> None:
     text = (REPOSITORY / "docs" / "guides" / "pure_functions.md").read_text()
     rows = re.findall(r"^\* (Derivative|No derivative), (masks|weights|neither): (.+)\.$", text, re.MULTILINE)
-    found = {
-        name: (derivative, missing) for derivative, missing, names in rows for name in re.findall("`(.+?)`", names)
-    }
+    found = {name: row[:2] for row in rows for name in re.findall("`(.+?)`", row[2])}
     expected: dict[str, tuple[str, str]] = {}
     for name, kernel in KERNELS.items():
         if " " not in name and name != "match_hypotheses":

@@ -1,12 +1,8 @@
-from __future__ import annotations
-
 import importlib
 import importlib.metadata
 import inspect
 import pkgutil
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -16,6 +12,7 @@ import numpy as np
 import pytest
 
 import dpmjax
+from tests.processes import run_python
 from tests.test_kernels import KERNELS
 
 ROOMS = sorted({module.name for module in pkgutil.iter_modules(dpmjax.__path__)} - {"__main__"})
@@ -26,15 +23,14 @@ API = Path(__file__).parents[1] / "docs" / "api.md"
 
 def test_import_loads_neither_jax_nor_numpy() -> None:
     program = "import sys, dpmjax; assert not {'jax', 'numpy'} & sys.modules.keys(), 'import dpmjax imports too much'"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = run_python("-c", program)
     assert done.returncode == 0, done.stderr
 
 
 def test_every_room_is_reached_from_the_package_alone() -> None:
     # In a process of its own: an import of a room elsewhere would make it an attribute of the package.
     program = f"import dpmjax; print([getattr(dpmjax, room).__name__ for room in {ROOMS}])"
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == str([f"dpmjax.{room}" for room in ROOMS])
+    assert run_python("-c", program).stdout.strip() == str([f"dpmjax.{room}" for room in ROOMS])
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
@@ -55,10 +51,6 @@ def test_no_module_hides_a_public_name(package) -> None:
     listed = set(re.findall(r"^from \. import (\w+) as", stub, re.MULTILINE))
     assert modules == listed
     assert package is not dpmjax or listed == set(ROOMS)
-
-
-def test_version_is_the_one_of_the_distribution() -> None:
-    assert dpmjax.__version__ == importlib.metadata.version("dpmjax")
 
 
 def test_results_of_public_functions_are_public() -> None:

@@ -1,7 +1,5 @@
 """Bars of the pipelines: on a terminal, in no file, and not with `progress=False`."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
@@ -14,8 +12,6 @@ from tests.slam.truth import TruthGeometry, TruthMatcher, laps, scans_of
 
 
 class Terminal(io.StringIO):
-    """Text that a program takes for a terminal."""
-
     def isatty(self) -> bool:
         return True
 
@@ -24,9 +20,7 @@ class Terminal(io.StringIO):
     ("stream", "is_shown", "is_written"),
     [(Terminal(), True, True), (Terminal(), False, False), (io.StringIO(), True, False)],
 )
-def test_slam_counts_its_scans_on_a_terminal_alone(
-    stream: io.StringIO, is_shown: bool, is_written: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slam_counts_its_scans_on_a_terminal_alone(stream, is_shown: bool, is_written: bool, monkeypatch) -> None:
     monkeypatch.setattr(progress, "_SILENT_S", 0.0)
     monkeypatch.setattr("sys.stderr", stream)
     truth = laps(1, side_m=4.0, step_m=2.0)

@@ -1,7 +1,5 @@
 """A pipeline gives the same for a file or folder as for the arrays in it, and names a bad one in a line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax
@@ -25,7 +23,6 @@ def assert_equal(found, expected) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Drive, two scans for the network, and a map."""
     folder = tmp_path_factory.mktemp("files")
     (folder / "drive").mkdir()
     for number, scan in enumerate(DRIVE):
@@ -34,11 +31,6 @@ def folder(tmp_path_factory) -> Path:
         np.save(folder / f"{name}.npy", scan)
     dpmjax.save_map(folder / "map.npz", dpmjax.run_slam(METHODS, DRIVE).map)
     return folder
-
-
-@pytest.fixture(scope="module")
-def model():
-    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
 
 
 def test_scans_of_the_network_may_be_files(folder, model) -> None:

@@ -1,7 +1,5 @@
 """Laws of `register` and `register_scans`: one name for scans of any sensor."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The tolerances of all tests, each with its reason. float32 has a relative rounding of 6e-8."""
 
-from __future__ import annotations
-
 from typing import Any
 
 # A handful of float32 operations on numbers of order one: a hundred roundings.

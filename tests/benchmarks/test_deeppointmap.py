@@ -1,7 +1,5 @@
 """The DeepPointMap benchmark: each stage has a process of its own, and each number stands beside its rival."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -14,7 +12,6 @@ from tests.deeppointmap import toy
 
 @pytest.fixture
 def scans(monkeypatch):
-    """Two scans of a ring of posts, for a toy model."""
     monkeypatch.setattr(deeppointmap.dpmjax, "model_preset", lambda name: toy.MODEL)
     monkeypatch.setattr(deeppointmap.dpm, "training_preset", lambda name: toy.TRAINING)
     angles, heights = np.linspace(0, 2 * np.pi, 400), np.tile(np.linspace(0, 3, 8), 50)

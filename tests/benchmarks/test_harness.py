@@ -1,18 +1,12 @@
 """The benchmark harness: compile time apart, one table, memory of each benchmark its own."""
 
-from __future__ import annotations
-
 import json
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from benchmarks import measure
-
-REPOSITORY = Path(__file__).parents[2]
+from tests.processes import run_python
 
 
 def test_first_call_counts_as_compile_time():
@@ -32,8 +26,7 @@ def test_nothing_to_compile_is_never_negative():
 
 @pytest.mark.slow
 def test_command_prints_a_table_and_writes_json(tmp_path):
-    command = [sys.executable, "-m", "benchmarks", "--only", "core", "--quick", "-o", str(tmp_path / "rows.json")]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
+    done = run_python("-m", "benchmarks", "--only", "core", "--quick", "-o", tmp_path / "rows.json")
     assert done.returncode == 0, done.stderr
     assert "cores" in done.stdout.splitlines()[0]
     rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
@@ -47,8 +40,7 @@ def test_command_prints_a_table_and_writes_json(tmp_path):
 
 
 def test_unknown_benchmark_is_refused():
-    command = [sys.executable, "-m", "benchmarks", "--only", "cores"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
+    done = run_python("-m", "benchmarks", "--only", "cores")
     assert done.returncode == 2
     assert done.stderr.startswith("benchmarks: error: ")
     assert "invalid choice 'cores'" in done.stderr

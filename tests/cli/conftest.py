@@ -1,9 +1,6 @@
-"""A fixture that runs commands on bad input."""
-
-from __future__ import annotations
+"""Fixtures of the commands: runs without networks, and bad input."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +9,14 @@ from dpmjax.cli.run import EXIT_BAD_INPUT
 
 
 @pytest.fixture
-def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def without_networks(monkeypatch) -> None:
+    from tests.cli.test_slam_fuzz import leave_networks_out
+
+    leave_networks_out(monkeypatch)
+
+
+@pytest.fixture
+def refused(tmp_path, capsys) -> Callable[..., str]:
     """Runs a command that must refuse its input: one line, exit code 2, and no folder. Returns the line."""
 
     def run(*arguments: object) -> str:

@@ -1,26 +1,19 @@
 """Commands on bags of ROS: the same results as on files, topics, and notes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dpmjax.cli import localize, map2d, program
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
-from tests.cli.test_slam import run, table
-from tests.cli.test_slam_fuzz import leave_networks_out
+from dpmjax.cli import map2d
+from dpmjax.cli.run import EXIT_OK, load_json
+from tests.cli.test_slam import run
 from tests.data_sets import write_pcd
+from tests.experiments.running import read_rows
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.slam.test_odometry import motion, planes, seen_from
 
 NUM, STEP_NS = 5, 100_000_000
-
-
-@pytest.fixture
-def without_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    leave_networks_out(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +39,11 @@ def test_slam_maps_a_bag_as_it_maps_files(tmp_path: Path, without_networks, scan
     bag = write_bag(tmp_path / "drive", kind, scans)
     assert run(tmp_path / "files", "-o", tmp_path / "a") == EXIT_OK
     assert run(bag, "-o", tmp_path / "b") == EXIT_OK
-    np.testing.assert_array_equal(
-        np.load(tmp_path / "a" / "trajectory.npy"), np.load(tmp_path / "b" / "trajectory.npy")
-    )
+    of_files, of_bag = (np.load(tmp_path / name / "trajectory.npy") for name in "ab")
+    np.testing.assert_array_equal(of_files, of_bag)
     stamps = np.loadtxt(tmp_path / "b" / "trajectory_tum.txt")[:, 0]
     np.testing.assert_allclose(stamps, 1.6e9 + 0.1 * np.arange(NUM), atol=1e-5)
-    assert [row["status"] for row in table(tmp_path / "b" / "scans.csv")] == ["first", *["tracked"] * (NUM - 1)]
+    assert [row["status"] for row in read_rows(tmp_path / "b", "scans.csv")] == ["first", *["tracked"] * (NUM - 1)]
     assert load_json(tmp_path / "b" / "metrics.json")["status"] == "done"
     assert run("--resume", "-o", tmp_path / "b") == EXIT_OK
 
@@ -62,14 +54,10 @@ def test_scans_of_a_bag_are_deskewed_by_their_times(tmp_path: Path, without_netw
 
 
 @pytest.mark.parametrize("command", ["slam", "map2d"])
-def test_a_topic_that_is_not_there_is_one_line(
-    tmp_path: Path, scans, command: str, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_topic_that_is_not_there_is_one_line(tmp_path, scans, refused, command: str) -> None:
     bag = write_bag(tmp_path / "drive", "bag", scans)
-    assert program.main([command, str(bag), "--topic", "/none", "-o", str(tmp_path / "out")]) == EXIT_BAD_INPUT
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused(command, bag, "--topic", "/none")
     assert "no topic /none, it has /points (PointCloud2), /scan (LaserScan)" in line
-    assert not (tmp_path / "out").exists()
 
 
 def test_map2d_reads_the_planar_scans_of_the_same_bag(tmp_path: Path, scans) -> None:
@@ -77,4 +65,3 @@ def test_map2d_reads_the_planar_scans_of_the_same_bag(tmp_path: Path, scans) -> 
     sequence = map2d.read_scans(map2d.Map2dOptions(data=bag, jump=2))
     assert len(sequence) == 3
     np.testing.assert_allclose(np.linalg.norm(sequence.points, axis=2)[:, 0], [3.0, 3.2, 3.4], rtol=1e-6)
-    assert localize.LocalizeOptions(map=bag, scans=bag, topic="/points").topic == "/points"

@@ -1,19 +1,12 @@
 """The promises of every command to the shell: exit codes, one-line errors, results on Ctrl-C, resume."""
 
-from __future__ import annotations
-
-import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from dpmjax.cli.run import STOPPING
-
-REPOSITORY = Path(__file__).parents[2]
+from tests.processes import start_python
 
 TOY = '''
 """A toy.
@@ -67,20 +60,7 @@ if __name__ == "__main__":
 @pytest.fixture
 def toy(tmp_path):
     (tmp_path / "toy.py").write_text(TOY)
-    paths = [str(REPOSITORY), str(REPOSITORY / "src"), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-
-    def start(*arguments):
-        return subprocess.Popen(
-            [sys.executable, "toy.py", *arguments],
-            cwd=tmp_path,
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-
-    return start
+    return lambda *arguments: start_python("toy.py", *arguments, cwd=tmp_path)
 
 
 def finish(process):
@@ -109,13 +89,6 @@ def test_bad_input_is_one_line_and_leaves_no_folder(toy, tmp_path):
     assert errors == "dpmjax: error: missing.pcd: no such file name a file of scans\n"
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "results").exists()
-
-
-def test_a_folder_that_is_taken_is_refused_before_the_input_is_read(toy, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    code, output, errors = finish(toy("missing.pcd", "-o", "."))
-    assert (code, output) == (2, "")
-    assert errors == "dpmjax: error: . is not empty and holds no earlier run: name another folder with -o\n"
 
 
 def test_failure_on_the_way_exits_with_one_and_names_the_partial_results(toy, tmp_path):

@@ -1,12 +1,8 @@
 """`dpmjax evaluate` on a network that compiles in seconds."""
 
-from __future__ import annotations
-
-import jax
 import numpy as np
 import pytest
 
-import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli import drives
 from dpmjax.cli.program import main
@@ -19,13 +15,6 @@ from tests.experiments.running import read_rows
 
 def run(arguments: list[str]) -> int:
     return main(["evaluate", *arguments])
-
-
-@pytest.fixture
-def weights(tmp_path):
-    path = tmp_path / "model.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
-    return path
 
 
 @pytest.mark.slow
@@ -68,10 +57,3 @@ def test_a_drive_is_checked_with_the_distances_that_are_asked_for(tmp_path) -> N
     near = SamplingConfig(max_distance_m=3.0)
     with pytest.raises(ValueError, match=r"no two of them 0\.25 to 3\.0 m apart"):
         drives.find_sources([str(tmp_path / "kitti")], [], near)
-
-
-def test_a_drive_without_poses_is_refused(tmp_path, refused) -> None:
-    (tmp_path / "drive" / "velodyne").mkdir(parents=True)
-    for number in range(3):
-        np.ones((50, 4), "<f4").tofile(tmp_path / "drive" / "velodyne" / f"{number:06d}.bin")
-    assert "no poses" in refused("evaluate", tmp_path / "drive")

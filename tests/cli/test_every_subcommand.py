@@ -1,7 +1,5 @@
 """Every subcommand on simulated input, on a copy of the files that are installed, away from the checkout."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -36,7 +34,6 @@ the tests of `dpmjax train` run it."""
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """A folder with the files of the package that setuptools installs."""
     options = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
     patterns = ["*.py", *options["package-data"]["*"]]
 

@@ -1,7 +1,5 @@
 """Several drives on a cluster: the same poses as one by one, also where a worker is killed."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
@@ -24,7 +22,6 @@ NUM_SCANS = 24
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
-    """Two walks through one room, and a network that compiles in seconds."""
     folder, rng = tmp_path_factory.mktemp("fleet"), np.random.default_rng(0)
     for name, turn_deg in (("first", 3.0), ("second", -3.0)):
         (folder / name).mkdir()

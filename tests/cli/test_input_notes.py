@@ -1,7 +1,5 @@
 """A run reports decisions on its input, and a run without a result fails: log, metrics.json, last line, code."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +10,10 @@ from dpmjax.cli.slam_run import judge
 from dpmjax.geometry import rigid
 from dpmjax.io import write_tum
 from tests.cli.test_slam import run
-from tests.cli.test_slam_fuzz import leave_networks_out
 from tests.data_sets import write_pcd
 from tests.slam.test_odometry import motion, planes, seen_from
 
-
-@pytest.fixture(autouse=True)
-def without_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    leave_networks_out(monkeypatch)
+pytestmark = pytest.mark.usefixtures("without_networks")
 
 
 def ring(index: int) -> np.ndarray:
@@ -71,9 +65,7 @@ def test_the_status_follows_from_the_scans(statuses: dict[str, int], status: str
     assert judge({**numbers, "num_parts": 2})["status"] == ("uncertain" if status == "done" else status)
 
 
-def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_scans(tmp_path: Path) -> None:
     drive, out = tmp_path / "drive", tmp_path / "out"
     truth = write_room(drive, 6)
     times, fine = 100 + 0.1 * np.arange(6), 100 + 0.01 * np.arange(36)
@@ -90,23 +82,22 @@ def test_notes_are_in_the_log_and_the_numbers_and_errors_are_those_of_matched_sc
     assert len(truth) == metrics["num_scans"]
 
 
-def test_a_reference_in_millimetres_is_doubted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    drive, out = tmp_path / "drive", tmp_path / "out"
-    truth = write_room(drive, 6)
-    write_tum(drive / "poses_lidar.txt", truth)
-    assert run(drive, "-o", out) == EXIT_OK
-    assert load_json(out / "metrics.json")["reference_doubt"] is None
-    truth[:, :3, 3] *= 1000
-    write_tum(drive / "poses_lidar.txt", truth)
-    assert run(drive, "-o", tmp_path / "other") == EXIT_OK
-    assert "2e+03 m long, the trajectory 2 m: is the reference in metres?" in capsys.readouterr().out
-
-
-def test_inverted_reference_poses_are_doubted(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    drive = tmp_path / "drive"
-    write_tum(drive / "poses_lidar.txt", rigid.inverse(write_room(drive, 6)))
-    assert run(drive, "-o", tmp_path / "out") == EXIT_OK
-    assert "does the reference map the world to the lidar, not the lidar to the world?" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("spoil", "doubt"),
+    [
+        (lambda T: T, None),
+        (lambda T: T * np.array([1, 1, 1, 1000]), "2e+03 m long, the trajectory 2 m: is the reference in metres?"),
+        (rigid.inverse, "does the reference map the world to the lidar, not the lidar to the world?"),
+    ],
+    ids=["right", "in millimetres", "inverted"],
+)
+def test_a_wrong_reference_is_doubted(tmp_path: Path, capsys, spoil, doubt: str | None) -> None:
+    T = spoil(write_room(tmp_path / "drive", 6))
+    T[:, 3, 3] = 1.0
+    write_tum(tmp_path / "drive" / "poses_lidar.txt", T)
+    assert run(tmp_path / "drive", "-o", tmp_path / "out") == EXIT_OK
+    found = load_json(tmp_path / "out" / "metrics.json")["reference_doubt"]
+    assert found is None if doubt is None else doubt in capsys.readouterr().out
 
 
 def test_a_doubt_about_the_unit_is_in_the_log_and_the_numbers(tmp_path: Path) -> None:

@@ -1,27 +1,25 @@
-"""Whole runs of the main command on tiny scans, its help, and its answers to bad input."""
+"""`dpmjax map2d`: whole runs on tiny scans and answers to bad input; the input of `dpmjax depth`."""
 
-from __future__ import annotations
-
-import json
 import os
 import signal
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from PIL import Image
 
-from dpmjax.cli.map2d import Map2dOptions, fit_settings, main
-from dpmjax.cli.run import Run, run_command
-from dpmjax.io import ScanSequence
+from dpmjax.cli.depth import DepthOptions, read_images
+from dpmjax.cli.map2d import Map2dOptions, fit_settings, main, trust_verdict
+from dpmjax.cli.run import Run, load_json, run_command
+from dpmjax.io import InputError, ScanSequence
 from dpmjax.registration2d import register_scans
 from dpmjax.simulation import simulate_sequence
 from tests.data_sets import write_deepmapping_folder
+from tests.processes import run_python
 
-REPOSITORY = Path(__file__).parents[2]
 NUM_SCANS = 16
 SCALE_M = 0.05
 METRICS = (
@@ -51,26 +49,13 @@ def test_unit_of_the_fit_is_that_of_the_worlds_of_the_paper(walk, preset, unit, 
 
 def run(*options: object, interrupt: bool = False) -> subprocess.CompletedProcess[str]:
     """Runs the command in a process of its own; `interrupt` stops it after the first call of the step."""
-    command = ["-m", "dpmjax", "map2d"]
-    if interrupt:
-        code = (
-            "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, run_command\n"
-            "append = Run.append_row\n"
-            "Run.append_row = lambda *a, **k: (append(*a, **k), os.kill(os.getpid(), signal.SIGINT))\n"
-            "raise SystemExit(run_command(m.main, name='map2d', description=None))"
-        )
-        command = ["-c", code]
-    return subprocess.run(
-        [sys.executable, *command, *map(str, options)],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        timeout=300,
+    code = (
+        "import os, signal; from dpmjax.cli import map2d as m; from dpmjax.cli.run import Run, load_json, run_command\n"
+        "append = Run.append_row\n"
+        "Run.append_row = lambda *a, **k: (append(*a, **k), os.kill(os.getpid(), signal.SIGINT))\n"
+        "raise SystemExit(run_command(m.main, name='map2d', description=None))"
     )
-
-
-def metrics_of(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
+    return run_python(*(("-c", code) if interrupt else ("-m", "dpmjax", "map2d")), *options)
 
 
 @pytest.mark.slow
@@ -79,14 +64,14 @@ def test_a_run_on_the_authors_folder_writes_everything_it_promises(walk, tmp_pat
     np.save(tmp_path / "start.npy", walk.reference_poses + np.array([3.0, -2.0, 0.0]))
     done = run(folder, "-o", tmp_path / "out", "--steps", 20, "--init", tmp_path / "start.npy")
     assert done.returncode == 0, done.stderr
-    metrics = metrics_of(tmp_path / "out")
+    metrics = load_json(tmp_path / "out" / "metrics.json")
     assert not [name for name in METRICS if metrics.get(name) is None]
     assert (metrics["num_scans"], metrics["steps"], metrics["success"]) == (NUM_SCANS, 20, True)
     assert metrics["status"] == ("done" if metrics["assessment"]["is_trusted"] else "uncertain")
     # From a good start it never gets worse.
     assert metrics["ate_initial_px"] < 1e-3
     assert metrics["ate_px"] < 0.1
-    assert json.loads((tmp_path / "out" / "config.json").read_text())["steps"] == 20
+    assert load_json(tmp_path / "out" / "config.json")["steps"] == 20
     candidates = metrics["candidates"]
     # A fit that lies where the refined start lies is not refined again.
     assert list(candidates)[:3] == ["poses of start.npy", "DeepMapping", "poses of start.npy, refined"]
@@ -108,7 +93,7 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     options = (scans_npz, "--steps", 60, "--no-refine", "--init", "zero")
     broken = run(*options, "-o", tmp_path / "broken", interrupt=True)
     assert broken.returncode == 130, broken.stderr
-    stopped = metrics_of(tmp_path / "broken")
+    stopped = load_json(tmp_path / "broken" / "metrics.json")
     assert stopped["status"] == "interrupted"
     assert 0 < stopped["steps"] < 60
     assert list(stopped["candidates"]) == ["zero poses", "DeepMapping"]
@@ -116,13 +101,14 @@ def test_an_interrupted_run_is_resumed_to_the_same_numbers(scans_npz, tmp_path) 
     assert resumed.returncode == 0, resumed.stderr
     unbroken = run(*options, "-o", tmp_path / "unbroken")
     assert unbroken.returncode == 0, unbroken.stderr
-    assert metrics_of(tmp_path / "broken")["steps"] == metrics_of(tmp_path / "unbroken")["steps"]
+    assert (
+        load_json(tmp_path / "broken" / "metrics.json")["steps"]
+        == load_json(tmp_path / "unbroken" / "metrics.json")["steps"]
+    )
     one, other = (np.load(tmp_path / name / "trajectory.npy") for name in ("broken", "unbroken"))
     np.testing.assert_array_equal(one, other)
-    steps = [line.split(",")[0] for line in (tmp_path / "broken" / "metrics.csv").read_text().splitlines()[1:]]
-    assert steps == [
-        line.split(",")[0] for line in (tmp_path / "unbroken" / "metrics.csv").read_text().splitlines()[1:]
-    ]
+    rows = [(tmp_path / name / "metrics.csv").read_text().splitlines() for name in ("broken", "unbroken")]
+    assert [row.split(",")[0] for row in rows[0]] == [row.split(",")[0] for row in rows[1]]
 
 
 @pytest.mark.slow
@@ -134,7 +120,7 @@ def test_a_run_interrupted_before_the_fit_keeps_its_start(scans_npz, tmp_path, m
     monkeypatch.setattr("dpmjax.registration2d.register_scans", interrupted)
     arguments = [str(scans_npz), "--init", "zero", "-o", str(tmp_path / "out")]
     assert run_command(main, name="map2d", description=None, args=arguments) == 130
-    found = metrics_of(tmp_path / "out")
+    found = load_json(tmp_path / "out" / "metrics.json")
     assert found["status"] == "interrupted"
     assert (found["steps"], found["kept"]) == (0, "zero poses")
     assert list(found["candidates"]) == ["zero poses"]
@@ -157,7 +143,7 @@ def test_a_global_start_finds_the_map_from_half_a_turn_of_view(tmp_path, is_orde
     options = [] if is_ordered else ["--no-ordered"]
     done = run(tmp_path / "half.npz", "-o", tmp_path / "out", "--init", "global", "--steps", 20, *options)
     assert done.returncode == 0, done.stderr
-    metrics = metrics_of(tmp_path / "out")
+    metrics = load_json(tmp_path / "out" / "metrics.json")
     candidates = metrics["candidates"]
     # The walk spans some metres: a tenth of a metre is right, and no wall is doubled.
     assert candidates["global registration"]["ate_m"] < 0.1
@@ -181,17 +167,15 @@ def test_odometry_that_leads_astray_is_not_the_only_start(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize(
     ("spoil", "found"),
-    [("all_zero", "scans.npy"), ("all_nan", "scans.npy"), ("one_scan", "scan"), ("all_equal", "all scans are equal")],
+    [
+        (lambda points: 0 * points, "scans.npy"),
+        (lambda points: np.nan * points, "scans.npy"),
+        (lambda points: points[:1], "scan"),
+        (lambda points: np.tile(points[:1], (NUM_SCANS, 1, 1)), "all scans are equal"),
+    ],
 )
 def test_scans_without_a_valid_beam_or_all_equal_are_refused(as_user, walk, tmp_path, refused, spoil, found) -> None:
-    points = np.where(walk.mask[..., None], walk.points, 0.0)
-    if spoil == "one_scan":
-        points = points[:1]
-    elif spoil == "all_equal":
-        points[:] = points[:1]
-    else:
-        points[:] = np.nan if spoil == "all_nan" else 0.0
-    np.save(tmp_path / "scans.npy", points)
+    np.save(tmp_path / "scans.npy", spoil(np.where(walk.mask[..., None], walk.points, 0.0)))
     assert found in refused("map2d", tmp_path / "scans.npy")
 
 
@@ -202,5 +186,24 @@ def test_a_start_that_is_not_there_is_named(as_user, scans_npz, refused, init, f
     assert found in refused("map2d", scans_npz, "--init", init)
 
 
-def test_a_resumed_run_has_data_and_start_of_its_own() -> None:
-    assert Map2dOptions(resume=True, topic="/scan", ordered=False).resume
+@pytest.mark.parametrize(("rows", "spans"), [([4], "4"), ([3, 4, 5, 9], "3-5, 9"), ([0, 2, 3], "0, 2-3")])
+def test_the_verdict_names_the_uncertain_scans_and_the_fault(rows: list[int], spans: str) -> None:
+    assessment = {"is_trusted": False, "weakest_connection": 0.3, "contradiction": 0.01}
+    text = trust_verdict(assessment | {"uncertain_scans": rows, "fault": "the scans are mirrored"})
+    assert "DO NOT TRUST" in text
+    assert text.endswith(f" {spans}")
+    assert "the scans are mirrored" in text
+
+
+def test_a_blank_image_is_named(tmp_path) -> None:
+    np.savetxt(tmp_path / "intrinsics.txt", [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+    for name, depth_mm in (("1", 2000), ("2", 0), ("3", 2000)):
+        Image.fromarray(np.full((48, 64), depth_mm, np.uint16)).save(tmp_path / f"{name}.depth.png")
+    with pytest.raises(InputError, match=r"2\.depth\.png: no pixel measures up to .* leave out such images, 1 of 3"):
+        read_images(DepthOptions(data=tmp_path))
+
+
+def test_a_folder_without_images_is_refused_and_a_selection_is_taken(tmp_path) -> None:
+    with pytest.raises(InputError, match="0 .depth.png files"):
+        read_images(DepthOptions(data=tmp_path))
+    assert len(read_images(DepthOptions(n_scans=2, jump=2))) == 2

@@ -1,17 +1,10 @@
 """The program `dpmjax`: subcommands, help, exit codes."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
 import dpmjax
 from dpmjax.cli import program
-
-REPOSITORY = Path(__file__).parents[2]
+from tests.processes import run_python
 
 HELP = {
     "map2d": ("-o OUT", "-n N", "-j N", "--preset {fast,paper}", "--init", "--no-refine", "--seed", "--resume"),
@@ -20,16 +13,12 @@ HELP = {
 """Options that the help of a subcommand must name."""
 
 
-def start(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "dpmjax", *arguments], capture_output=True, text=True)
-
-
 def test_help_lists_every_subcommand_and_loads_nothing() -> None:
     code = (
         "import sys; from dpmjax.cli.program import main; code = main(['--help']);"
         "assert not {'jax', 'numpy', 'tyro'} & sys.modules.keys(); raise SystemExit(code)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     assert all(f"\n  {name} " in done.stdout for name in program.COMMANDS)
     assert "examples:" in done.stdout
@@ -41,7 +30,7 @@ def test_helps_of_subcommands_have_examples_and_load_nothing_slow() -> None:
         "for name in COMMANDS: print('HELP', name); assert main([name, '--help']) == 0\n"
         "assert not {'jax', 'scipy', 'matplotlib'} & sys.modules.keys()"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     helps = dict(text.split("\n", 1) for text in done.stdout.split("HELP ")[1:])
     assert helps.keys() == program.COMMANDS.keys()
@@ -53,9 +42,8 @@ def test_helps_of_subcommands_have_examples_and_load_nothing_slow() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("module", "name"), [("deepmapping_2d", "map2d"), ("dpm_train", "train")])
 def test_an_experiment_of_another_name_is_the_subcommand(module: str, name: str) -> None:
-    command = [sys.executable, "-m", f"experiments.{module}", "--help"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, start(name, "--help").stdout), done.stderr
+    done, same = run_python("-m", f"experiments.{module}", "--help"), run_python("-m", "dpmjax", name, "--help")
+    assert (done.returncode, done.stdout) == (0, same.stdout), done.stderr
 
 
 def test_a_stop_during_the_imports_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -85,7 +73,7 @@ try:
 except KeyboardInterrupt:
     program.end_process(program.EXIT_INTERRUPTED)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = run_python("-c", code)
     assert (done.returncode, done.stderr) == (program.EXIT_INTERRUPTED, "")
 
 
@@ -98,7 +86,7 @@ def test_wrong_usage_is_one_line(arguments: list[str], capsys: pytest.CaptureFix
 
 
 def test_version() -> None:
-    done = start("--version")
+    done = run_python("-m", "dpmjax", "--version")
     assert (done.returncode, done.stdout) == (0, f"dpmjax {dpmjax.__version__}\n")
 
 

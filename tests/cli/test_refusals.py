@@ -1,7 +1,5 @@
 """Wrong usage of every subcommand: one line, exit code 2, nothing written."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -1,7 +1,5 @@
 """The page of a run stands alone, agrees with the files, and opens in a browser without an error."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -27,7 +25,6 @@ TABLES = {
 
 
 def made(folder: Path, num_points: int) -> str:
-    """The page of a small run."""
     numbers = {"status": "done", "verdict": "10 scans & 1 loop", "ate_m": 0.123456789, "versions": {"jax": "0.10"}}
     (folder / "metrics.json").write_text(json.dumps(numbers))
     np.save(folder / "trajectory.npy", np.tile(np.eye(4), (10, 1, 1)))

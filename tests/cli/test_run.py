@@ -1,7 +1,5 @@
 """The folder of a run, its tables and numbers, and options of a command line."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass
@@ -45,7 +43,6 @@ def _in_empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def start():
-    """Opens a run, and closes it at the end of the test."""
     runs = []
 
     def open_run(**options) -> Run:

@@ -3,15 +3,10 @@
 Matcher and geometry know the truth; a scan is one point, whose x is the number of its pose.
 """
 
-from __future__ import annotations
-
-import csv
 import errno
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -23,10 +18,11 @@ from dpmjax.cli import slam, slam_run
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK, load_json, run_command
 from dpmjax.io import LidarSequence, write_tum
 from dpmjax.slam import SlamConfig, SlamMethods
+from tests.experiments.running import read_rows
 from tests.optional import import_or_skip
+from tests.processes import run_python, start_python
 from tests.slam.truth import TruthGeometry, TruthMatcher, laps, pose
 
-REPOSITORY = Path(__file__).parents[2]
 TRUTH = laps(2, side_m=40.0, step_m=2.0)
 SAME_FILES = (
     "trajectory.npy", "trajectory_tum.txt", "trajectory_kitti.txt", "odometry.npy", "keyframes.txt", "graph.g2o",
@@ -39,12 +35,7 @@ def truth_methods(config) -> SlamMethods:
 
 
 def run(*options) -> int:
-    return run_command(
-        slam.main,
-        name="slam",
-        description=slam.__doc__,
-        args=list(map(str, options)),
-    )
+    return run_command(slam.main, name="slam", description=slam.__doc__, args=list(map(str, options)))
 
 
 def write_drive(folder: Path, *, with_poses: bool = True) -> Path:
@@ -74,7 +65,6 @@ def with_truth(monkeypatch) -> None:
 
 @pytest.fixture(scope="module")
 def whole(drive, tmp_path_factory) -> Path:
-    """The folder of a run that nothing has stopped."""
     folder = tmp_path_factory.mktemp("output") / "whole"
     with pytest.MonkeyPatch.context() as patch:
         use_truth(patch)
@@ -85,10 +75,6 @@ def whole(drive, tmp_path_factory) -> Path:
 def assert_same_results(folder: Path, other: Path) -> None:
     for name in SAME_FILES:
         assert (folder / name).read_bytes() == (other / name).read_bytes(), name
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 def test_what_is_known_to_be_bad_is_told_before_the_run(with_truth, tmp_path, refused) -> None:
@@ -119,7 +105,7 @@ def test_results_say_what_was_done(whole, drive) -> None:
     assert metrics["t_rel_percent"] < 1.0
     assert metrics["seed"] == 0
     assert metrics["status"] == "done"
-    scans, loops = table(whole / "scans.csv"), table(whole / "loops.csv")
+    scans, loops = read_rows(whole, "scans.csv"), read_rows(whole, "loops.csv")
     assert [int(row["scan"]) for row in scans] == list(range(len(TRUTH)))
     assert {row["status"] for row in scans} == {"first", "tracked"}
     assert all(row["reason"] for row in scans)
@@ -197,15 +183,6 @@ def test_a_full_disk_is_one_line(drive, with_truth, tmp_path, monkeypatch, capsy
     assert "Traceback" in (tmp_path / "out" / "log.txt").read_text()
 
 
-@pytest.mark.slow
-def test_a_scan_without_points_is_passed_over(with_truth, tmp_path) -> None:
-    drive = write_drive(tmp_path / "drive")
-    np.save(drive / "030.npy", np.zeros((5, 3), np.float32))
-    assert run(drive, "-o", tmp_path / "out") == EXIT_OK
-    assert table(tmp_path / "out" / "scans.csv")[30]["status"] == "empty"
-    assert len(np.load(tmp_path / "out" / "trajectory.npy")) == len(TRUTH)
-
-
 def test_an_interrupted_run_writes_all_and_goes_on(whole, drive, with_truth, tmp_path, monkeypatch) -> None:
     out, read = tmp_path / "out", LidarSequence.read_points
 
@@ -264,24 +241,15 @@ sys.exit(run(*sys.argv[1:]))
 """
 
 
-def start(*options) -> subprocess.Popen:
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
-    return subprocess.Popen(
-        [sys.executable, "-c", PROCESS, *map(str, options)], cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL
-    )
-
-
 @pytest.mark.slow
 def test_a_killed_run_equals_an_unbroken_one(whole, drive, tmp_path) -> None:
     rng, out = np.random.default_rng(0), tmp_path / "out"
     for _ in range(5):
-        process = start(*(["--resume"] if out.exists() else [drive]), "-o", out)
-        deadline = time.monotonic() + 120
-        while not (out / "run_state.npz").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        time.sleep(rng.uniform(0, 4))
-        process.kill()
-        process.wait()
-    assert start("--resume", "-o", out).wait(timeout=300) == EXIT_OK
+        with start_python("-c", PROCESS, *(["--resume"] if out.exists() else [drive]), "-o", out) as process:
+            deadline = time.monotonic() + 120
+            while not (out / "run_state.npz").exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+            time.sleep(rng.uniform(0, 4))
+            process.kill()
+    assert run_python("-c", PROCESS, "--resume", "-o", out).returncode == EXIT_OK
     assert_same_results(out, whole)

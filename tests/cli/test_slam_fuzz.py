@@ -1,7 +1,5 @@
 """Broken drives: `dpmjax slam` ends with results, or with one line and an exit code, never with a traceback."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import dataclass
@@ -13,11 +11,11 @@ import pytest
 from dpmjax import model_preset
 from dpmjax.cli import slam, slam_run
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_FAILED, EXIT_OK
-from dpmjax.io import write_kitti, write_ply, write_tum
+from dpmjax.io import write_kitti, write_tum
 from dpmjax.slam import Match, Proposal, SlamConfig, SlamMethods, SurfaceGeometry
 from tests.cli.test_slam import run
-from tests.data_sets import write_pcd
 from tests.io.test_fuzz import spoil
+from tests.io.test_lidar_readers import FORMATS
 from tests.slam.test_odometry import compacted, motion, planes, seen_from
 
 NUM_FUZZED = int(os.environ.get("DPMJAX_NUM_FUZZED_DRIVES", "40"))
@@ -26,8 +24,6 @@ NUM_SCANS = 5
 
 @dataclass(frozen=True)
 class NoMatcher:
-    """Recognises nothing."""
-
     fingerprint: str = "none"
 
     def encode(self, scan):
@@ -47,41 +43,25 @@ class NoMatcher:
 
 
 def leave_networks_out(patch: pytest.MonkeyPatch) -> None:
-    """Alignment alone; no pictures."""
     methods = SlamMethods(NoMatcher(), SurfaceGeometry(model_preset("tiny")), SlamConfig())
     patch.setattr(slam, "slam_methods", lambda config: methods)
     patch.setattr(slam_run, "draw_pictures", lambda *_: None)
 
 
-@pytest.fixture
-def without_networks(monkeypatch) -> None:
-    leave_networks_out(monkeypatch)
-
-
 def write_scan(path: Path, points: np.ndarray) -> None:
-    points = points.astype(np.float32)
-    if path.suffix == ".bin":
-        path.write_bytes(np.column_stack([points, np.zeros(len(points), np.float32)]).astype("<f4").tobytes())
-    elif path.suffix == ".npy":
-        np.save(path, points)
-    elif path.suffix == ".npz":
-        np.savez(path, lidar_pcd=points)
-    else:
-        (write_ply if path.suffix == ".ply" else write_pcd)(path, points)
+    FORMATS[path.suffix](path, points.astype(np.float32))
 
 
 def write_drive(folder: Path, rng: np.random.Generator) -> None:
-    """A good drive of random kind."""
-    suffix = str(rng.choice([".bin", ".npy", ".npz", ".ply", ".pcd"]))
+    suffix = str(rng.choice(list(FORMATS)))
     scans = folder / "velodyne" if rng.random() < 0.5 else folder
     scans.mkdir(parents=True)
     world, truth = planes(rng, num=300), np.array([motion(0.4 * step, 0, 0) for step in range(NUM_SCANS)])
     for number, T in enumerate(truth):
         write_scan(scans / f"{number:06}{suffix}", seen_from(world, T))
     if rng.random() < 0.7:
-        write_tum(folder / "poses_lidar.txt", truth) if rng.random() < 0.5 else write_kitti(
-            folder / "poses_lidar.txt", truth
-        )
+        write = write_tum if rng.random() < 0.5 else write_kitti
+        write(folder / "poses_lidar.txt", truth)
     if rng.random() < 0.7:
         (folder / "times.txt").write_text("".join(f"{0.1 * number:.6f}\n" for number in range(NUM_SCANS)))
 
@@ -92,7 +72,7 @@ def bad_numbers(path: Path, rng: np.random.Generator) -> None:
     share = rng.choice([0.01, 0.5, 1.0])
     spoilt = rng.random(points.shape) < share
     points[spoilt] = rng.choice(values, int(spoilt.sum()))
-    if path.suffix in (".bin", ".npy", ".npz", ".ply", ".pcd"):
+    if path.suffix in FORMATS:
         write_scan(path, points)
     else:
         np.savetxt(path, points)
@@ -100,7 +80,7 @@ def bad_numbers(path: Path, rng: np.random.Generator) -> None:
 
 def few_points(path: Path, rng: np.random.Generator) -> None:
     points = rng.normal(size=(int(rng.integers(0, 4)), 3)) * rng.choice([0.0, 1.0, 20.0])
-    if path.suffix in (".bin", ".npy", ".npz", ".ply", ".pcd"):
+    if path.suffix in FORMATS:
         write_scan(path, points)
     else:
         path.write_text("")
@@ -110,7 +90,6 @@ DAMAGES = (bad_numbers, few_points, spoil, spoil, spoil)
 
 
 def damage(folder: Path, rng: np.random.Generator) -> list[str]:
-    """Damages one to three files; returns the list of damages."""
     done = []
     for _ in range(int(rng.integers(1, 4))):
         files = sorted(path for path in folder.rglob("*") if path.is_file())

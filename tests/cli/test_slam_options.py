@@ -1,7 +1,5 @@
 """Options of `dpmjax slam`: saved maps are extended, scans deskewed, and the viewer records."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

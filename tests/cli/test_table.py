@@ -1,7 +1,5 @@
 """The table of an experiment: rows are computed once, and the counts of their summary are right."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import dataclass

@@ -1,12 +1,6 @@
 """Two processes that train as one: the numbers of one process, one writer, and one Ctrl-C for both."""
 
-from __future__ import annotations
-
-import os
 import socket
-import subprocess
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -16,19 +10,11 @@ from optax.tree_utils import tree_get
 
 from dpmjax.checkpoints import Checkpoints
 from dpmjax.cli.run import CHECKPOINTS, HISTORY
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    SampleMaker,
-    begin_training,
-    init_training,
-    join_processes,
-    make_step,
-)
+from dpmjax.deeppointmap import SampleMaker, begin_training, init_training, join_processes, make_step
+from tests.cli.test_train import TRAINING
 from tests.data_sets import run_in
 from tests.deeppointmap import toy
-
-REPOSITORY = Path(__file__).parents[2]
-TRAINING = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 4),))
+from tests.processes import start_python
 
 # The first process gets a signal before its third step of four.
 PROCESS = """
@@ -66,20 +52,8 @@ def free_port() -> int:
 
 @pytest.mark.slow
 def test_two_processes_train_as_one_and_stop_as_one(tmp_path: Path) -> None:
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
-    arguments = [sys.executable, "-c", PROCESS, f"localhost:{free_port()}"]
-    both = [
-        subprocess.Popen(
-            [*arguments, str(number), str(tmp_path)],
-            cwd=REPOSITORY,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for number in range(2)
-    ]
+    coordinator = f"localhost:{free_port()}"
+    both = [start_python("-c", PROCESS, coordinator, number, tmp_path) for number in range(2)]
     try:
         told = [process.communicate(timeout=300) for process in both]
     finally:

@@ -1,7 +1,5 @@
 """Laws of the registration of depth images by one call."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,22 +9,11 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
-from dpmjax import io, simulation
 from dpmjax.geometry import typical_range
-from dpmjax.registration_rgbd import DepthScans, PlacedImages, as_depth_scans, initialize_depth, projective_consistency
+from dpmjax.registration_rgbd import DepthScans, PlacedImages, initialize_depth, projective_consistency
 
 KEY = jax.random.key(3)
 CONFIG = replace(dm.preset("fast", "depth"), steps_per_call=1)
-
-
-@pytest.fixture(scope="module")
-def walk() -> io.DepthSequence:
-    return simulation.simulate_depth_sequence(0, 4, seed=1, config=simulation.DepthWalkConfig(height=12, width=16))
-
-
-@pytest.fixture(scope="module")
-def scans(walk) -> DepthScans:
-    return as_depth_scans(walk.points, walk.mask)
 
 
 def returning(T: np.ndarray, scans: DepthScans) -> Callable[..., dm.Fit]:

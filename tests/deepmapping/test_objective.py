@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -170,16 +168,3 @@ def test_map_decay_is_the_mean_square_of_the_nodes() -> None:
     # 5 x 5 nodes of 2 each, over the beams of the step, with the weight 0.001.
     expected = 0.4 * terms.occupancy + 0.6 * 0.25 + 1e-3 * 25 * 4.0 / (NUM_SCANS * NUM_POINTS)
     np.testing.assert_allclose(loss, expected, **ROUNDING)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"occupancy_weight": 1.5}, "occupancy_weight"),
-        ({"num_offsets": 9}, "num_offsets"),
-        ({"num_steps": 0}, "num_steps"),
-    ],
-)
-def test_phase_settings_are_checked(change, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        replace(REFINE, **change)

@@ -1,7 +1,5 @@
 """Laws of DeepMapping on planar scans."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -10,11 +8,13 @@ import numpy as np
 import pytest
 
 from dpmjax import deepmapping as dm
+from dpmjax.deepmapping.config import REFINE
 from dpmjax.deepmapping.engine import fit, init
 from dpmjax.deepmapping.mapping import mapping_problem
 from dpmjax.deepmapping.objective import blocks_of_step
 from dpmjax.deepmapping.problem import MappingData
 from dpmjax.deepmapping.sensors import as_scan_set
+from dpmjax.deepmapping.toy import ToyConfig
 from dpmjax.geometry import se2
 from dpmjax.metrics import absolute_trajectory_error
 from dpmjax.nets.mapping import LocalizationNetConfig, OccupancyConfig
@@ -104,9 +104,8 @@ def test_an_epoch_has_every_scan_once_in_the_order_of_time(num_scans: int) -> No
     phase = replace(dm.preset("paper").cold_phases[0], scans_per_step=4)
     num_steps = -(-num_scans // 4)
     for epoch in range(2):
-        batches = [
-            blocks_of_step(phase, num_scans, jnp.int32(epoch * num_steps + k), key=KEY) for k in range(num_steps)
-        ]
+        steps = jnp.arange(epoch * num_steps, (epoch + 1) * num_steps, dtype=jnp.int32)
+        batches = [blocks_of_step(phase, num_scans, step, key=KEY) for step in steps]
         rows = np.concatenate([np.asarray(batch.rows[batch.is_scan]) for batch in batches])
         assert rows.tolist() == list(range(num_scans))
 
@@ -215,9 +214,8 @@ def test_scans_are_drawn_in_blocks_of_neighbours(num_scans: int, scans_per_step:
 def test_masked_beams_never_matter_and_those_that_are_zero_or_not_finite_are_masked(tiny_data) -> None:
     scans = tiny_data.scans
     mask = scans.mask & (jax.random.uniform(KEY, scans.mask.shape) < 0.8)
-    one, *others = (
-        as_scan_set(ScanSet(jnp.where(mask[..., None], scans.points, filling), mask)) for filling in (0.0, 1e6, np.nan)
-    )
+    filled = (jnp.where(mask[..., None], scans.points, filling) for filling in (0.0, 1e6, np.nan))
+    one, *others = (as_scan_set(ScanSet(points, mask)) for points in filled)
     points = np.where(mask[..., None], scans.points, 0.0)
     points[::2] = np.where(mask[::2, :, None], points[::2], np.nan)
     for other in (*others, as_scan_set(points)):
@@ -243,13 +241,29 @@ def test_bad_input_is_named(as_user, scans, options, message) -> None:
         dm.fit_deepmapping(scans, **{"config": SMALL, "key": KEY, **options})
 
 
-def test_unknown_presets_and_too_few_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match="preset: expected one of fast, paper"):
-        dm.preset("quick")
-    with pytest.raises(ValueError, match="steps: expected at least one"):
-        dm.with_steps(dm.preset("fast"), 1)
-    with pytest.raises(ValueError, match="num_epochs"):
-        replace(dm.preset("paper").cold_phases[0], num_steps=5)
+PHASES = dm.preset("fast").cold_phases
+WINDOWS = PHASES[0], replace(PHASES[0], scans_per_window=None)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: dm.preset("quick"), "preset: expected one of fast, paper"),
+        (lambda: dm.with_steps(dm.preset("fast"), 1), "steps: expected at least one"),
+        (lambda: replace(dm.preset("paper").cold_phases[0], num_steps=5), "num_epochs"),
+        (lambda: replace(dm.preset("fast"), cold_phases=WINDOWS), "scans_per_window"),
+        (lambda: replace(PHASES[0], scans_per_window=1), "scans_per_window"),
+        (lambda: replace(REFINE, occupancy_weight=1.5), "occupancy_weight"),
+        (lambda: replace(REFINE, num_offsets=9), "num_offsets"),
+        (lambda: replace(REFINE, num_steps=0), "num_steps"),
+        (lambda: ToyConfig(learning_rate=0.0), "learning_rate"),
+        (lambda: ToyConfig(num_steps=0), "num_steps"),
+        (lambda: ToyConfig(initialization="zeros"), "initialization"),
+    ],
+)
+def test_senseless_settings_are_refused(as_user, make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 def test_scans_without_an_order_get_a_pointnet() -> None:

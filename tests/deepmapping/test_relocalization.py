@@ -1,7 +1,5 @@
 """Laws of re-localisation: L-Net's proposals, rendered scans, and the search in the map."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

@@ -1,21 +1,12 @@
 """Laws of the one-dimensional example (supplement D)."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dpmjax.deepmapping.engine import fit
-from dpmjax.deepmapping.toy import (
-    GLOBAL_MINIMUM,
-    ScalarNet,
-    ToyConfig,
-    network_value,
-    toy_loss,
-    toy_problem,
-)
+from dpmjax.deepmapping.toy import GLOBAL_MINIMUM, ScalarNet, ToyConfig, network_value, toy_loss, toy_problem
 from experiments.toy_1d import minimize
 from tests.tolerances import ACCUMULATED, ROUNDING
 
@@ -84,16 +75,3 @@ def test_solvers_end_at_the_minimum_of_their_valley(method: str) -> None:
     x_best, _ = GLOBAL_MINIMUM
     x = minimize(jnp.float32(x_best + 0.05), solver=method, max_iterations=50)
     assert float(x) == pytest.approx(x_best, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: ToyConfig(learning_rate=0.0), "learning_rate"),
-        (lambda: ToyConfig(num_steps=0), "num_steps"),
-        (lambda: ToyConfig(initialization="zeros"), "initialization"),
-    ],
-)
-def test_bad_settings_are_named(call, message, as_user) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()

@@ -1,7 +1,5 @@
 """Laws of windows: cut and joined without a loss, and each with an L-Net of its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -92,14 +90,6 @@ def test_poses_of_windows_start_in_the_world_of_the_given_start(tiny_walk, poses
     problem = mapping_problem(config, data)
     found = np.asarray(problem.poses(config, phase, init(problem, data, key=KEY).params, data)) * [unit, unit, 1.0]
     np.testing.assert_allclose(se2.to_matrix(found), se2.to_matrix(tiny_walk.reference_poses), atol=2e-2)
-
-
-def test_phases_with_networks_of_other_windows_are_refused() -> None:
-    first = SMALL.cold_phases[0]
-    with pytest.raises(ValueError, match="scans_per_window"):
-        replace(SMALL, cold_phases=(first, replace(first, scans_per_window=None)))
-    with pytest.raises(ValueError, match="scans_per_window"):
-        replace(first, scans_per_window=1)
 
 
 def test_networks_of_windows_do_not_relocalize(tiny_walk) -> None:

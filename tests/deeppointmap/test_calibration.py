@@ -1,12 +1,8 @@
 """Calibration on the drives of a user: fitted on the training part, measured on held-out places."""
 
-from __future__ import annotations
-
-import jax
 import numpy as np
 import pytest
 
-import dpmjax
 from dpmjax.deeppointmap import OVERLAP_FEATURES
 from dpmjax.deeppointmap.calibration import KINDS, MeasuredDrives, calibrate, column_of, fit_confidence, measure_overlap
 from tests.deeppointmap import toy
@@ -35,11 +31,6 @@ def matches(num: int, seed: int) -> list[dict]:
         {**dict(zip(OVERLAP_FEATURES, row, strict=True)), "is_overlap": label, "head": probability}
         for row, label, probability in zip(evidence, is_overlap, head, strict=True)
     ]
-
-
-@pytest.fixture(scope="module")
-def model() -> dpmjax.Model:
-    return dpmjax.init_model(jax.random.key(0), toy.MODEL)
 
 
 def test_fits_are_measured_on_held_out_places(model) -> None:

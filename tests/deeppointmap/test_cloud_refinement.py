@@ -1,7 +1,5 @@
 """Registration of two descriptor clouds without their scans, by the shipped network."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -48,9 +46,8 @@ def test_elements_make_the_registration_of_clouds_exact(model, clouds) -> None:
 def test_a_scan_is_refined_against_a_cloud(model, clouds) -> None:
     points = seen_from(street(0, 30000), T_WORLD_A)
     match = dpmjax.register(model, points, clouds[1], refine=True)
-    np.testing.assert_allclose(
-        match.T_target_source, dpmjax.register(model, *clouds, refine=True).T_target_source, atol=1e-5
-    )
+    of_clouds = dpmjax.register(model, *clouds, refine=True)
+    np.testing.assert_allclose(match.T_target_source, of_clouds.T_target_source, atol=1e-5)
 
 
 @pytest.mark.slow

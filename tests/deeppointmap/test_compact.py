@@ -1,15 +1,115 @@
-"""Laws of compact scans: small integers from which elements and free space are made again, within stated errors."""
-
-from __future__ import annotations
+"""Laws of compact scans: verification by rounded elements finds the same motion, descriptors change by a rounding."""
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap.compact_scans import compact_elements, compact_image, expand_elements, expand_image
-from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, scan_surface
-from dpmjax.types import SurfaceElements
+from dpmjax.deeppointmap import init_model, model_preset
+from dpmjax.deeppointmap.compact_scans import (
+    compact_elements,
+    compact_image,
+    compact_scan,
+    expand_elements,
+    expand_image,
+    expand_scan,
+    round_directions,
+    round_features,
+)
+from dpmjax.deeppointmap.encoding import pyramid_of_scan
+from dpmjax.deeppointmap.model import model_fingerprint
+from dpmjax.deeppointmap.motion_choice import choose_motion, refine_motion
+from dpmjax.deeppointmap.verification import VerificationConfig
+from dpmjax.geometry import rigid
+from dpmjax.geometry.normals import pyramid_elements
+from dpmjax.scans.lidar import measure_scan
+from dpmjax.scans.surfaces import Surface, SurfaceConfig, range_image, scan_surface, surface_of_elements
+from dpmjax.types import DescriptorCloud, SurfaceElements
+from tests.scans.surface_scenes import motion, seen_from, street
+
+CONFIG = VerificationConfig(plane_radius_m=2.0)
+"""Elements are metres apart."""
+
+T_WORLD_A, T_WORLD_B = motion(5, (1, -2, 0), 1), motion(130, (-4, 3, 0))
+T_TRUE = rigid.inverse(T_WORLD_B) @ T_WORLD_A
+NUM_ELEMENTS, NUM_DESCRIPTORS = 1536, 16
+
+
+def cloud_of(points: np.ndarray, seed: int = 0) -> DescriptorCloud:
+    """Elements of a scan, of which the first have random descriptors."""
+    config, rng = model_preset("small"), np.random.default_rng(seed)
+    elements = jax.device_get(pyramid_elements(pyramid_of_scan(points, config), NUM_ELEMENTS))
+    angles = rng.uniform(-np.pi, np.pi, NUM_DESCRIPTORS)
+    return DescriptorCloud(
+        elements.positions * config.scale_m,
+        (rng.normal(size=(NUM_DESCRIPTORS, 8)) * rng.uniform(0.01, 100, (NUM_DESCRIPTORS, 1))).astype(np.float32),
+        elements.mask,
+        np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),
+        elements.normals,
+        elements.planarity,
+    )
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[np.ndarray]:
+    return [seen_from(street(seed, 24_000), T) for seed, T in enumerate((T_WORLD_A, T_WORLD_B))]
+
+
+@pytest.mark.slow
+def test_compact_scans_find_the_same_motion(scans) -> None:
+    images = [measure_scan(scan).image for scan in scans]
+    compact = [compact_scan(cloud_of(scan), image) for scan, image in zip(scans, images, strict=True)]
+    found = [expand_scan(one) for one in compact]
+    hypotheses = np.stack([motion(200, (3, 0, 0)), T_TRUE @ motion(3, (1.0, -0.8, 0.1))])
+    chosen = choose_motion(*found, hypotheses, CONFIG)
+    T = refine_motion(*found, chosen, CONFIG).T_target_source
+    assert chosen.row == 1
+    assert np.linalg.norm((rigid.inverse(T_TRUE) @ T)[:3, 3]) < 0.03
+    assert chosen.verification.gap > 0.2
+
+
+def test_a_compact_scan_is_the_cloud_within_rounding(scans) -> None:
+    cloud, image = cloud_of(scans[0]), measure_scan(scans[0]).image
+    compact = compact_scan(cloud, image)
+    found = compact.cloud
+    np.testing.assert_array_equal(found.mask, cloud.mask)
+    # Each descriptor has a step of its own: large ones take nothing from small ones.
+    largest = np.abs(cloud.features).max(axis=1, keepdims=True)
+    assert np.abs((found.features - cloud.features) / largest).max() <= 0.501 / 127
+    cosines = np.sum(found.directions * cloud.directions, axis=1)
+    assert cosines.min() > np.cos(np.radians(0.5 * 180 / 127 + 0.01))
+    # The scan that registration reads is made of the same elements.
+    surface, expected = expand_scan(compact).surface, surface_of_elements(found.elements)
+    for name in ("points", "normals", "flatness", "samples"):
+        np.testing.assert_array_equal(getattr(surface, name), getattr(expected, name))
+
+
+def test_features_that_are_zero_stay_so_and_rounding_twice_changes_nothing() -> None:
+    features = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
+    features[2] = 0
+    codes, steps = round_features(features)
+    assert not codes[2].any()
+    assert (steps > 0).all()
+    assert (np.abs(codes).max(axis=1)[[0, 1, 3, 4]] == 127).all()
+    again, _ = round_features(codes * steps[:, None])
+    np.testing.assert_array_equal(again, codes)
+    assert round_features(np.zeros((0, 4), np.float32))[0].shape == (0, 4)
+
+
+def test_directions_turn_round_without_a_break() -> None:
+    angles = np.linspace(-np.pi, np.pi, 1001)
+    codes = round_directions(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+    turned = (codes * (np.pi / 127) - angles + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(turned).max() < 0.51 * np.pi / 127
+
+
+@pytest.mark.slow
+def test_the_fingerprint_is_that_of_the_parameters_without_the_overlap_head() -> None:
+    first, other = (init_model(jax.random.key(seed), model_preset("tiny")) for seed in (0, 1))
+    assert model_fingerprint(first) == model_fingerprint(jax.device_get(first)) != model_fingerprint(other)
+    decoder = {**first.params["decoder"], "overlap_head": other.params["decoder"]["overlap_head"]}
+    assert model_fingerprint(first.replace(params={**first.params, "decoder": decoder})) == model_fingerprint(first)
 
 
 def room(num: int = 20000, seed: int = 0) -> np.ndarray:

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import json
 
@@ -7,14 +5,7 @@ import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax.deeppointmap.confidence import (
-    CLOUD_FEATURES,
-    SCAN_FEATURES,
-    Calibration,
-    LogisticModel,
-    fit_weights,
-    logistic_probability,
-)
+from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, LogisticModel, fit_weights, logistic_probability
 from tests.deeppointmap import toy
 
 
@@ -51,10 +42,7 @@ def test_features_of_another_version_are_refused() -> None:
 
 @pytest.fixture(scope="module")
 def calibrated(model) -> dpmjax.Model:
-    calibration = Calibration(
-        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, -1.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 2.0)
-    )
-    return model.replace(config=dataclasses.replace(model.config, calibration=calibration))
+    return model.replace(config=dataclasses.replace(model.config, calibration=toy.calibration(-1.0, 2.0)))
 
 
 def test_calibration_decides_the_confidence(calibrated) -> None:

@@ -1,7 +1,5 @@
 """Laws of registration where walls hold one direction only."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import permutations
 
@@ -10,20 +8,7 @@ import pytest
 from scipy.special import logit
 
 import dpmjax
-from dpmjax.deeppointmap.confidence import (
-    CLOUD_FEATURES,
-    CORRIDOR_CONFIDENCE,
-    ELEMENT_FEATURES,
-    SCAN_FEATURES,
-    WEAK_FEATURES,
-    Calibration,
-    LogisticModel,
-    MatchEvidence,
-    calibrated_probability,
-    gather_evidence,
-    logistic_probability,
-    weak_features,
-)
+from dpmjax.deeppointmap import confidence as conf
 from dpmjax.deeppointmap.motion_choice import VerifiedMotion, choose_motion, refine_motion, verify_elements
 from dpmjax.deeppointmap.verification import VerificationConfig
 from dpmjax.scans.lidar import Scan, measure_scan, measured_elements
@@ -57,7 +42,7 @@ def bare() -> list[Scan]:
 def confidence(found: VerifiedMotion) -> float:
     """Returns the confidence by the shipped model."""
     model = dpmjax.load_model("dpm_small").config.calibration.of_weak_scans
-    return float(logistic_probability(model, weak_features(found.verification)))
+    return float(conf.logistic_probability(model, conf.weak_features(found.verification)))
 
 
 def along_the_corridor(distance_m: float, turn_deg: float = 0.0) -> np.ndarray:
@@ -97,31 +82,31 @@ def test_elements_tell_the_motion_from_shifts_but_are_never_sure(with_pillars) -
     assert right.num_slid == shifted.num_slid > 0
     assert right.facing_gap > 0 > shifted.facing_gap
     found = evidence_of(right)
-    assert found.lookalike_gap == pytest.approx(logit(CORRIDOR_CONFIDENCE))
+    assert found.lookalike_gap == pytest.approx(logit(conf.CORRIDOR_CONFIDENCE))
     assert found.of_elements is not None
-    sure = LogisticModel(ELEMENT_FEATURES, (0.0,) * 8, 20.0)
-    calibration = Calibration(
-        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, 0.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 0.0), of_elements=sure
+    sure = conf.LogisticModel(conf.ELEMENT_FEATURES, (0.0,) * 8, 20.0)
+    calibration = conf.Calibration(
+        conf.LogisticModel(conf.CLOUD_FEATURES, (0.0,) * 4, 0.0),
+        conf.LogisticModel(conf.SCAN_FEATURES, (0.0,) * 9, 0.0),
+        of_elements=sure,
     )
-    assert calibrated_probability(calibration, found) == pytest.approx(CORRIDOR_CONFIDENCE)
+    assert conf.calibrated_probability(calibration, found) == pytest.approx(conf.CORRIDOR_CONFIDENCE)
     few = evidence_of(right, num_elements=256)
     assert few.of_elements is None
-    assert calibrated_probability(calibration, few) == pytest.approx(CORRIDOR_CONFIDENCE / 2)
+    assert conf.calibrated_probability(calibration, few) == pytest.approx(conf.CORRIDOR_CONFIDENCE / 2)
 
 
 def test_a_lead_that_other_niches_have_too_is_not_sure() -> None:
-    sure = LogisticModel(WEAK_FEATURES, (0.0, 0.0), 20.0)
-    calibration = Calibration(
-        LogisticModel(CLOUD_FEATURES, (0.0,) * 4, 0.0), LogisticModel(SCAN_FEATURES, (0.0,) * 9, 0.0), sure
+    sure = conf.LogisticModel(conf.WEAK_FEATURES, (0.0, 0.0), 20.0)
+    calibration = conf.Calibration(
+        conf.LogisticModel(conf.CLOUD_FEATURES, (0.0,) * 4, 0.0),
+        conf.LogisticModel(conf.SCAN_FEATURES, (0.0,) * 9, 0.0),
+        sure,
     )
-    for lead, expected in ((39.0, CORRIDOR_CONFIDENCE), (41.0, 1.0)):
+    for lead, expected in ((39.0, conf.CORRIDOR_CONFIDENCE), (41.0, 1.0)):
         scans = Verification(0.9, 0.6, 0.0, 5.0, num_slid=146, facing_gap=lead)
-        one = np.ones(1)
-        hypotheses = Registration(
-            np.eye(4)[None], one, one, one, one, one, *(np.zeros((1, 0), dtype) for dtype in (int, int, float, bool))
-        )
-        found = gather_evidence(hypotheses, 0, scans)
-        assert calibrated_probability(calibration, found) == pytest.approx(expected)
+        found = evidence_of(None, scans=scans, num_pairs=1)
+        assert conf.calibrated_probability(calibration, found) == pytest.approx(expected)
 
 
 def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None:
@@ -135,13 +120,11 @@ def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None
     assert evidence_of(right).lookalike_gap == np.inf
 
 
-def evidence_of(elements: Verification, num_elements: int = 1024) -> MatchEvidence:
-    """Evidence of one hypothesis with 100 pairs."""
-    one = np.ones(1)
-    hypotheses = Registration(
-        np.eye(4)[None], one, one, one, 100 * one, one, *(np.zeros((1, 0), dtype) for dtype in (int, int, float, bool))
-    )
-    return gather_evidence(hypotheses, 0, None, elements, num_elements)
+def evidence_of(elements: Verification | None, num_elements: int = 1024, *, scans=None, num_pairs=100):
+    """Evidence of one hypothesis."""
+    one, nothing = np.ones(1), (np.zeros((1, 0), dtype) for dtype in (int, int, float, bool))
+    hypotheses = Registration(np.eye(4)[None], one, one, one, num_pairs * one, one, *nothing)
+    return conf.gather_evidence(hypotheses, 0, scans, elements, num_elements)
 
 
 @pytest.mark.slow
@@ -169,10 +152,8 @@ def test_elements_that_face_the_axis_make_the_shift_known(with_pillars) -> None:
 def test_walls_of_all_directions_leave_the_choice_as_it_was() -> None:
     rng = np.random.default_rng(3)
     ground = np.column_stack([rng.uniform(-20, 20, (4000, 2)), np.full(4000, -1.2)])
-    walls = [
-        seen_from(corridor(seed, length_m=8.0)[::3], motion(angle, (0, 12, 0)))
-        for seed, angle in enumerate(range(0, 360, 50))
-    ]
+    sides = [motion(angle, (0, 12, 0)) for angle in range(0, 360, 50)]
+    walls = [seen_from(corridor(seed, length_m=8.0)[::3], T) for seed, T in enumerate(sides)]
     points = np.concatenate([ground, *walls])
     scans = [measure_scan(seen_from(points, T)) for T in POSES]
     hypotheses = np.stack([along_the_corridor(9.0), along_the_corridor(0.5)])

@@ -1,7 +1,5 @@
 """Features and offsets are relative to the frame of each descriptor, in scans and in maps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

@@ -1,7 +1,5 @@
 """The public functions of inference: encode, register, overlap."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

@@ -1,7 +1,5 @@
 """Laws of registration where another place fits as well: bare rooms, and rows of equal houses."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import replace
 

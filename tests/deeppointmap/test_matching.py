@@ -1,19 +1,16 @@
-from __future__ import annotations
-
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap import MatchConfig, merge_clouds
 from dpmjax.deeppointmap.matching import best_pairs, thin_merged
 from dpmjax.geometry import ConsensusConfig, rigid
 from dpmjax.types import DescriptorCloud
 from tests.deeppointmap import toy
-from tests.tolerances import ACCUMULATED, ALIGNMENT
+from tests.tolerances import ACCUMULATED
 
 T = np.asarray(rigid.exp(np.array([5.0, -3.0, 0.5, 0.02, -0.05, 1.2], np.float32)))
 CONFIG = MatchConfig()
@@ -55,20 +52,6 @@ def test_best_pairs_have_the_highest_dual_softmax(shape: tuple[int, int]) -> Non
     assert len(best.scores) == count
     np.testing.assert_allclose(best.scores, np.sort(scores.ravel())[::-1][:count], **ACCUMULATED)
     np.testing.assert_allclose(best.scores, scores[best.source_indices, best.target_indices], **ACCUMULATED)
-
-
-def test_motion_is_the_best_one_of_its_inliers() -> None:
-    """Ten of eighty pairs are tens of metres off. The motion is the least-squares motion of the inliers, by SciPy."""
-    match = jax.device_get(match_clouds(*clouds(1, num_outliers=10), config=MatchConfig(pair_ratio=1.0)))
-    source, target, _ = clouds(1, num_outliers=10)
-    p, q = source[match.source_indices][match.is_inlier], target[match.target_indices][match.is_inlier]
-    weights = match.scores[match.is_inlier].astype(np.float64)
-    centres = [np.average(points, axis=0, weights=weights) for points in (p, q)]
-    rotation = Rotation.align_vectors(q - centres[1], p - centres[0], weights=weights)[0].as_matrix()
-    np.testing.assert_allclose(match.T_target_source[:3, :3], rotation, **ALIGNMENT)
-    np.testing.assert_allclose(match.T_target_source[:3, 3], centres[1] - rotation @ centres[0], atol=1e-3)
-    residuals = p @ rotation.T + centres[1] - rotation @ centres[0] - q
-    np.testing.assert_allclose(match.rmse, np.sqrt(np.mean(np.sum(residuals**2, axis=1))), rtol=1e-3)
 
 
 def test_one_far_outlier_is_dropped_in_rounds() -> None:
@@ -157,9 +140,8 @@ def test_merging_turns_elements_and_leaves_those_with_features_in_front() -> Non
     features = rng.normal(size=(2, 3, 4)).astype(np.float32)
     mask = np.array([[True] * 5, [True, False, True, True, False]])
     positions[~mask] = np.nan
-    clouds = DescriptorCloud(
-        positions, features, mask, normals=normals, planarity=rng.random((2, 5)).astype(np.float32)
-    )
+    planarity = rng.random((2, 5)).astype(np.float32)
+    clouds = DescriptorCloud(positions, features, mask, normals=normals, planarity=planarity)
     poses = np.stack([np.eye(4), np.asarray(T)])
     merged = merge_clouds(clouds, poses)
     described = [(cloud, row) for cloud in range(2) for row in range(3)]
@@ -216,8 +198,6 @@ def test_copies_of_a_cloud_are_left_out(num_valid: int) -> None:
 
 
 def test_wrong_arguments_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^pair_ratio: expected"):
-        MatchConfig(pair_ratio=5.0)
     with pytest.raises(ValueError, match="^T_map_cloud: expected shape"):
         merge_clouds(DescriptorCloud(jnp.ones((2, 3, 3)), jnp.ones((2, 3, 5)), jnp.ones((2, 3), bool)), np.eye(4))
 

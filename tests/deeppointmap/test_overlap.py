@@ -1,7 +1,5 @@
 """The evidence of overlap, and the probability that it gives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -11,16 +9,10 @@ import pytest
 
 import dpmjax
 from dpmjax.deeppointmap import correlate
+from dpmjax.deeppointmap import overlap_prediction as prediction
 from dpmjax.deeppointmap.confidence import OVERLAP_FEATURES, LogisticModel, logistic_probability
 from dpmjax.deeppointmap.matching import TEMPERATURE
 from dpmjax.deeppointmap.model import decode
-from dpmjax.deeppointmap.overlap_prediction import (
-    HIGH,
-    OverlapEvidence,
-    head_probability,
-    overlap_evidence,
-    overlap_probability,
-)
 from dpmjax.slam import KeyframeMap
 from dpmjax.types import DescriptorCloud
 from tests.tolerances import ACCUMULATED
@@ -46,15 +38,14 @@ def cloud(seed: int, num_padded: int = 0) -> DescriptorCloud:
 
 
 def test_evidence_has_the_names_that_the_probability_is_fitted_on() -> None:
-    assert OverlapEvidence._fields == OVERLAP_FEATURES
+    assert prediction.OverlapEvidence._fields == OVERLAP_FEATURES
 
 
 @pytest.mark.slow
 def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     a, b = cloud(1), cloud(2)
-    features = [
-        np.asarray(decode(model, one.features, part="similarity_head"), float) for one in correlate(model, a, b)
-    ]
+    heads = [decode(model, one.features, part="similarity_head") for one in correlate(model, a, b)]
+    features = [np.asarray(head, float) for head in heads]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in features]
     similarity = unit[0] @ unit[1].T
     exponential = np.exp(similarity / TEMPERATURE)
@@ -71,14 +62,14 @@ def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
     expected = {
         "scan_similarity": means[0] @ means[1] / np.linalg.norm(means[0]) / np.linalg.norm(means[1]),
         "similarity_median": quantile(similarity, 0.5),
-        "similarity_high": quantile(similarity, HIGH),
+        "similarity_high": quantile(similarity, prediction.HIGH),
         "score_median": quantile(scores, 0.5),
-        "score_high": quantile(scores, HIGH),
+        "score_high": quantile(scores, prediction.HIGH),
         "mutual_share": mutual / NUM,
         "log_radius": np.log(min(radii)),
         "log_radius_ratio": abs(np.log(radii[0] / radii[1])),
     }
-    found = overlap_evidence(model, a, b)
+    found = prediction.overlap_evidence(model, a, b)
     for name, value in expected.items():
         np.testing.assert_allclose(getattr(found, name), value, err_msg=name, **ACCUMULATED)
     assert 0 <= found.support_second <= found.support <= 1
@@ -87,7 +78,10 @@ def test_evidence_of_the_descriptors_is_that_of_numpy(model) -> None:
 
 @pytest.mark.slow
 def test_padded_equals_unpadded(model) -> None:
-    found, expected = overlap_evidence(model, cloud(1, 3), cloud(2, 5)), overlap_evidence(model, cloud(1), cloud(2))
+    found, expected = (
+        prediction.overlap_evidence(model, cloud(1, 3), cloud(2, 5)),
+        prediction.overlap_evidence(model, cloud(1), cloud(2)),
+    )
     np.testing.assert_allclose(found, expected, **ACCUMULATED)
 
 
@@ -95,27 +89,25 @@ def test_padded_equals_unpadded(model) -> None:
 def test_an_empty_or_broken_cloud_overlaps_nothing(fitted, side: int) -> None:
     some = cloud(1)
     empty = replace(some, mask=jnp.zeros(NUM, bool))
-    pairs = [
-        [other, some] if side == 0 else [some, other]
-        for other in (empty, replace(some, features=some.features.at[2].set(jnp.nan)))
-    ]
-    assert np.isfinite(overlap_evidence(fitted, *pairs[0])).all()
-    assert [float(overlap_probability(fitted, *pair)) for pair in pairs] == [0, 0]
+    broken = replace(some, features=some.features.at[2].set(jnp.nan))
+    pairs = [[other, some][:: 1 - 2 * side] for other in (empty, broken)]
+    assert np.isfinite(prediction.overlap_evidence(fitted, *pairs[0])).all()
+    assert [float(prediction.overlap_probability(fitted, *pair)) for pair in pairs] == [0, 0]
 
 
 def test_the_probability_is_the_logistic_function_of_the_evidence(fitted, assert_compiles_nothing) -> None:
     a, b = cloud(1), cloud(2)
-    expected = logistic_probability(fitted.config.overlap, np.asarray(overlap_evidence(fitted, a, b), float))
-    np.testing.assert_allclose(overlap_probability(fitted, a, b), expected, **ACCUMULATED)
+    expected = logistic_probability(fitted.config.overlap, np.asarray(prediction.overlap_evidence(fitted, a, b), float))
+    np.testing.assert_allclose(prediction.overlap_probability(fitted, a, b), expected, **ACCUMULATED)
     with assert_compiles_nothing():
-        overlap_probability(fitted, b, cloud(3))
+        prediction.overlap_probability(fitted, b, cloud(3))
 
 
 def test_a_model_without_a_fit_answers_with_its_trained_head(model, fitted) -> None:
     a, b = cloud(1), cloud(2)
     expected = jax.nn.sigmoid(decode(model, *correlate(model, a, b), part="overlap_logit"))
-    np.testing.assert_allclose(overlap_probability(model, a, b), expected, **ACCUMULATED)
-    np.testing.assert_array_equal(head_probability(fitted, a, b), head_probability(model, a, b))
+    np.testing.assert_allclose(prediction.overlap_probability(model, a, b), expected, **ACCUMULATED)
+    np.testing.assert_array_equal(prediction.head_probability(fitted, a, b), prediction.head_probability(model, a, b))
 
 
 @pytest.mark.parametrize(
@@ -123,8 +115,8 @@ def test_a_model_without_a_fit_answers_with_its_trained_head(model, fitted) -> N
     [
         lambda model: dpmjax.overlap(model, cloud(1), cloud(2)),
         lambda model: dpmjax.overlap_pairs(model, [cloud(1)], [cloud(2)]),
-        lambda model: overlap_probability(model, cloud(1), cloud(2)),
-        lambda model: head_probability(model, cloud(1), cloud(2)),
+        lambda model: prediction.overlap_probability(model, cloud(1), cloud(2)),
+        lambda model: prediction.head_probability(model, cloud(1), cloud(2)),
         lambda model: dpmjax.run_slam(model, []),
         lambda model: dpmjax.run_agents(model, [[], []]),
         lambda model: dpmjax.merge_maps(model, *[KeyframeMap()] * 2),

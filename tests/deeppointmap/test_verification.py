@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import numpy as np
@@ -126,8 +124,3 @@ def test_empty_scans_leave_the_hypothesis(scans) -> None:
         assert np.isfinite(found.verification._replace(lookalike_gap=0.0)).all()
         assert found.verification.lookalike_gap == np.inf
         assert isinstance(refine_motion(*pair, found, CONFIG), VerifiedMotion)
-
-
-def test_settings_out_of_range_are_named() -> None:
-    with pytest.raises(ValueError, match="num_samples"):
-        VerificationConfig(num_samples=0)

@@ -1,25 +1,13 @@
 """A network that compiles in seconds, and scans for it: boxes about a street."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    MatchConfig,
-    ModelConfig,
-    ObjectiveConfig,
-    OverlapConfig,
-    SamplingConfig,
-    ScanStore,
-    TrainingConfig,
-    match_hypotheses,
-    prepare_drive,
-)
+from dpmjax import deeppointmap as dpm
+from dpmjax.deeppointmap.confidence import CLOUD_FEATURES, SCAN_FEATURES, Calibration, LogisticModel
 from dpmjax.geometry.pyramid import PyramidConfig, PyramidStage
 from dpmjax.io import LidarSequence
 from dpmjax.nets.decoder import DecoderConfig
@@ -27,7 +15,7 @@ from dpmjax.nets.point_encoder import EncoderConfig
 from dpmjax.scans import PreprocessConfig
 from dpmjax.types import DescriptorCloud, Registration
 
-MODEL = ModelConfig(
+MODEL = dpm.ModelConfig(
     pyramid=PyramidConfig(stages=(PyramidStage(32, (0.2,), 8), PyramidStage(8, (0.4,), 4)), num_interpolations=1),
     encoder=EncoderConfig(stem_channels=4, expansion=2, output_channels=8),
     decoder=DecoderConfig(input_channels=8, model_channels=12, num_layers=1, num_heads=2),
@@ -43,17 +31,17 @@ SLAM_MODEL = replace(
 )
 """Enough surface elements for odometry."""
 
-TRAINING = TrainingConfig(
+TRAINING = dpm.TrainingConfig(
     model=MODEL,
-    curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)),
-    sampling=SamplingConfig(num_scans=6, max_side=2),
+    curriculum=(dpm.CurriculumStage(2, 3), dpm.CurriculumStage(4, 2)),
+    sampling=dpm.SamplingConfig(num_scans=6, max_side=2),
     num_variants=4,
     thins_as_in_use=True,
     thins_maps=True,
     initialization="normal",
-    objective=ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
+    objective=dpm.ObjectiveConfig(max_close=4, positive_radius_m=3.0, offset_radius_m=5.0),
     stages=("registration",),
-    overlap=OverlapConfig(num_epochs=2, batch_pairs=4),
+    overlap=dpm.OverlapConfig(num_epochs=2, batch_pairs=4),
 )
 
 
@@ -77,9 +65,9 @@ def drive(seed: int = 0, num_scans: int = 24, step_m: float = 4.0) -> LidarSeque
     return LidarSequence(f"toy {seed}", tuple(map(str, range(num_scans))), read_scan, poses)
 
 
-def store(*drives: LidarSequence) -> ScanStore:
+def store(*drives: LidarSequence) -> dpm.ScanStore:
     """Prepared drives, in memory."""
-    return ScanStore([prepare_drive(one, TRAINING) for one in drives or (drive(),)])
+    return dpm.ScanStore([dpm.prepare_drive(one, TRAINING) for one in drives or (drive(),)])
 
 
 def assert_trees_equal(found: object, expected: object) -> None:
@@ -88,7 +76,13 @@ def assert_trees_equal(found: object, expected: object) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def best_match(source, target, similarity, predict_offsets, *, config: MatchConfig) -> Registration:
+def best_match(source, target, similarity, predict_offsets, *, config: dpm.MatchConfig) -> Registration:
     """The best of the motions between two clouds."""
-    hypotheses = match_hypotheses(source, target, similarity, predict_offsets, config=config)
+    hypotheses = dpm.match_hypotheses(source, target, similarity, predict_offsets, config=config)
     return jax.tree.map(lambda leaf: leaf[0], hypotheses)
+
+
+def calibration(of_clouds: float = 0.0, of_scans: float = 0.0, **more: LogisticModel) -> Calibration:
+    """Constant log odds of clouds and of scans."""
+    clouds = LogisticModel(CLOUD_FEATURES, (0.0,) * len(CLOUD_FEATURES), of_clouds)
+    return Calibration(clouds, LogisticModel(SCAN_FEATURES, (0.0,) * len(SCAN_FEATURES), of_scans), **more)

@@ -1,37 +1,18 @@
 """Calibration on simulated places, its check, and the weights of the evidence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
 import dpmjax
-from dpmjax import deeppointmap, simulation
+from dpmjax import deeppointmap as dpm
+from dpmjax import simulation
 from dpmjax.cli.run import EXIT_OK, load_json
-from dpmjax.deeppointmap import (
-    CLOUD_FEATURES,
-    ELEMENT_FEATURES,
-    SCAN_FEATURES,
-    WEAK_FEATURES,
-    Calibration,
-    LogisticModel,
-    MatchEvidence,
-    calibration,
-)
 from dpmjax.deeppointmap.evaluation import StagedRegistration
 from experiments import dpm_calibrate
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
-
-
-@pytest.fixture
-def weights(tmp_path):
-    path = tmp_path / "model.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
-    return path
 
 
 @pytest.fixture
@@ -47,19 +28,19 @@ def kinds(monkeypatch) -> list[str | None]:
         is_right = rng.uniform() < 0.5
         T = pair.T_target_source if is_right else np.eye(4)
         of_clouds = rng.normal(size=4) + is_right
-        evidence = MatchEvidence(
+        evidence = dpm.MatchEvidence(
             np.full(4, 1e6 * is_right),  # of the motion that the scans chose: no feature of clouds
-            np.concatenate([of_clouds, rng.normal(size=len(SCAN_FEATURES) - 4) + 2 * is_right]),
-            rng.normal(size=len(WEAK_FEATURES)) + 2 * is_right if rng.uniform() < 0.5 else None,
+            np.concatenate([of_clouds, rng.normal(size=len(dpm.SCAN_FEATURES) - 4) + 2 * is_right]),
+            rng.normal(size=len(dpm.WEAK_FEATURES)) + 2 * is_right if rng.uniform() < 0.5 else None,
         )
-        of_elements = np.concatenate([of_clouds, rng.normal(size=len(ELEMENT_FEATURES) - 4) + is_right])
-        motions.append((T, MatchEvidence(of_clouds, None, of_elements=of_elements)))
+        of_elements = np.concatenate([of_clouds, rng.normal(size=len(dpm.ELEMENT_FEATURES) - 4) + is_right])
+        motions.append((T, dpm.MatchEvidence(of_clouds, None, of_elements=of_elements)))
         return StagedRegistration(T, T, T, evidence, 0.5, 0.0)
 
     monkeypatch.setattr(simulation, "simulate_drive", simulate_drive)
-    monkeypatch.setattr(calibration, "encode", lambda model, points, num_elements: points)
-    monkeypatch.setattr(calibration, "register_in_stages", staged)
-    monkeypatch.setattr(calibration, "register_clouds", lambda *_: motions[-1])
+    monkeypatch.setattr(dpm.calibration, "encode", lambda model, points, num_elements: points)
+    monkeypatch.setattr(dpm.calibration, "register_in_stages", staged)
+    monkeypatch.setattr(dpm.calibration, "register_clouds", lambda *_: motions[-1])
     return kinds
 
 
@@ -91,25 +72,25 @@ def test_calibration_is_stored_in_a_copy_of_the_model_and_resumes(weights, kinds
 
 def test_a_calibration_is_rated_by_what_it_is_sure_of() -> None:
     """Three sure registrations, of which one is wrong; clouds rest on features of their own."""
-    of_scans = LogisticModel(SCAN_FEATURES, (0.0,) * 7 + (10.0, 0.0), 0.0)
-    calibration = Calibration(LogisticModel(CLOUD_FEATURES, (0.0,) * 4, -5.0), of_scans)
+    of_scans = dpm.LogisticModel(dpm.SCAN_FEATURES, (0.0,) * 7 + (10.0, 0.0), 0.0)
+    calibration = dpm.Calibration(dpm.LogisticModel(dpm.CLOUD_FEATURES, (0.0,) * 4, -5.0), of_scans)
     rows = []
     for score, right, distance_m in ((1.0, True, 2.0), (1.0, True, 8.0), (1.0, False, 3.0), (-1.0, False, 4.0)):
         row = {"kind": "hall", "is_right": right, "is_right_of_clouds": False, "distance_m": distance_m}
-        values = dict.fromkeys(SCAN_FEATURES, 0.0) | {"score": score}
+        values = dict.fromkeys(dpm.SCAN_FEATURES, 0.0) | {"score": score}
         row |= {f"of_scans {name}": value for name, value in values.items()}
-        row |= {f"of_clouds {name}": 0.0 for name in CLOUD_FEATURES}
-        row |= {f"of_weak_scans {name}": None for name in WEAK_FEATURES}
+        row |= {f"of_clouds {name}": 0.0 for name in dpm.CLOUD_FEATURES}
+        row |= {f"of_weak_scans {name}": None for name in dpm.WEAK_FEATURES}
         has_elements = distance_m != 4.0
-        row |= {f"of_elements {name}": 0.0 if has_elements else None for name in ELEMENT_FEATURES}
+        row |= {f"of_elements {name}": 0.0 if has_elements else None for name in dpm.ELEMENT_FEATURES}
         rows.append(row)
 
-    def sure(calibration: Calibration, *, of_clouds: bool) -> list[bool]:
-        return [deeppointmap.rate_pair(calibration, row, of_clouds=of_clouds) >= 0.9 for row in rows]
+    def sure(calibration: dpm.Calibration, *, of_clouds: bool) -> list[bool]:
+        return [dpm.rate_pair(calibration, row, of_clouds=of_clouds) >= 0.9 for row in rows]
 
     assert sure(calibration, of_clouds=False) == [True, True, True, False]
     assert not any(sure(calibration, of_clouds=True))
-    by_elements = replace(calibration, of_elements=LogisticModel(ELEMENT_FEATURES, (0.0,) * 8, 5.0))
+    by_elements = replace(calibration, of_elements=dpm.LogisticModel(dpm.ELEMENT_FEATURES, (0.0,) * 8, 5.0))
     assert sure(by_elements, of_clouds=True) == [True, True, True, False]
     rows[0]["lookalike_gap_of_scans"] = 0.0  # another place fits as well
     assert sure(calibration, of_clouds=False) == [False, True, True, False]

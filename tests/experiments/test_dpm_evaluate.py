@@ -1,29 +1,18 @@
 """The tables of registered pairs, on a network that compiles in seconds."""
 
-from __future__ import annotations
-
-import jax
 import numpy as np
 import pytest
 from scipy import stats
 
-import dpmjax
 from dpmjax import deeppointmap, simulation
 from dpmjax.cli.evaluate import summarize_pairs
-from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
+from dpmjax.cli.run import EXIT_OK, load_json
 from experiments import dpm_evaluate
 from experiments.dpm_evaluate import MONITORED, compare_methods, pool_drives
 from tests.deeppointmap import toy
 from tests.experiments.running import read_rows, run
 
 NUM_PAIRS, NUM_NETWORK, NUM_SEARCH = 30, 20, 25
-
-
-@pytest.fixture
-def weights(tmp_path):
-    path = tmp_path / "model.safetensors"
-    dpmjax.save_model(dpmjax.init_model(jax.random.key(0), toy.MODEL), path, card="toy")
-    return path
 
 
 @pytest.mark.slow
@@ -38,32 +27,13 @@ def test_evaluation_measures_every_pair_and_resumes(weights, tmp_path, monkeypat
     assert [row["band"] for row in rows] == [band for band in ("near", "middle", "far") for _ in range(2)]
     # Pairs far apart have no overlap, so other methods do not register them.
     assert [bool(row["search_right"] and row["clouds_32_right"]) for row in rows] == [True] * 4 + [False] * 2
-    assert 0 <= metrics["brier"] <= 1
     assert {row["band"] for row in metrics["table"]} == {"near", "middle"}
-    assert 0 <= float(read_rows(out, "overlap.csv")[0]["auc"]) <= 1
     for name in ("table.md", "pooled.md", "reliability.png"):
         assert (out / name).stat().st_size > 0
     monkeypatch.setattr(deeppointmap, "register_in_stages", None)
     monkeypatch.setattr(deeppointmap, "evaluate_overlap", None)
     assert run(dpm_evaluate, "--resume", "-o", out) == EXIT_OK
     assert read_rows(out) == rows
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere", "--weights", "WEIGHTS"], "nowhere"),
-        (["town", "--weights", "no_such_model"], "no_such_model"),
-        (["town", "--weights", "WEIGHTS", "--clouds", "1"], "--clouds"),
-    ],
-)
-def test_bad_input_is_one_line(weights, tmp_path, capsys, arguments, message: str) -> None:
-    given = [weights if argument == "WEIGHTS" else argument for argument in arguments]
-    assert run(dpm_evaluate, *given, "-o", tmp_path / "out") == EXIT_BAD_INPUT
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    assert message in lines[0]
-    assert not (tmp_path / "out").exists()
 
 
 def rows_of(drive: str) -> list[dict]:

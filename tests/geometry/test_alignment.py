@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -142,31 +140,15 @@ def test_gradient_is_right_at_equal_singular_values(scale: tuple[float, ...]) ->
     def loss(x: np.ndarray) -> float:
         return float(np.sum(align_in_numpy(source, x, weights) * probe))
 
-    np.testing.assert_allclose(
-        gradients(source, target, weights, probe)[1], finite_differences(loss, target), **GRADIENT
-    )
+    found = gradients(source, target, weights, probe)[1]
+    np.testing.assert_allclose(found, finite_differences(loss, target), **GRADIENT)
 
 
 @DIMS
 def test_gradient_is_finite_where_the_rotation_is_open(dim: int) -> None:
     # A perfect mirror image with equal spread: every rotation of a family fits equally well.
     source = np.concatenate([np.eye(dim), -np.eye(dim)]).astype(np.float32)
-    T = weighted_svd(source, -source if dim == 3 else source * np.array([1, -1], np.float32), np.ones(2 * dim))
-    np.testing.assert_allclose(np.linalg.det(T[:dim, :dim]), 1, **ROUNDING)
     target = -source if dim == 3 else source * np.array([1, -1], np.float32)
+    T = weighted_svd(source, target, np.ones(2 * dim))
+    np.testing.assert_allclose(np.linalg.det(T[:dim, :dim]), 1, **ROUNDING)
     assert all(np.abs(g).max() < 1e3 for g in gradients(source, target, np.ones(2 * dim, np.float32)))
-
-
-@pytest.mark.parametrize(
-    ("shapes", "named"),
-    [
-        (((5, 4), (5, 4), (5,)), "source"),
-        (((5,), (5,), (5,)), "source"),
-        (((5, 3), (6, 3), (5,)), "target"),
-        (((5, 3), (5, 2), (5,)), "target"),
-        (((5, 3), (5, 3), (6,)), "weights"),
-    ],
-)
-def test_wrong_shapes_are_named(shapes, named: str, as_user) -> None:
-    with pytest.raises(ValueError, match=f"^{named}: expected shape"):
-        weighted_svd(*map(jnp.ones, shapes))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest
@@ -20,12 +18,7 @@ def pairs_with_outliers(seed: int, num_right: int, num_wrong: int, noise_m: floa
     target = source @ T[:3, :3].T + T[:3, 3] + noise_m * rng.normal(size=source.shape)
     target[num_right:] = rng.uniform(-extent, extent, (num_wrong, 3))
     order = rng.permutation(len(source))
-    return (
-        source[order].astype(np.float32),
-        target[order].astype(np.float32),
-        T,
-        np.arange(num_right + num_wrong)[order] < num_right,
-    )
+    return source[order].astype(np.float32), target[order].astype(np.float32), T, order < num_right
 
 
 def errors(T: jax.Array, T_true: np.ndarray) -> tuple[float, float]:
@@ -59,9 +52,8 @@ def test_moving_both_frames_moves_the_motion() -> None:
         T[:3, :3] = Rotation.from_euler("xyz", [3, -2, angle], degrees=True).as_matrix()
         T[:3, 3] = (4, -7, 1)
     plain = np.asarray(find_consensus(source, target).T_target_source[0])
-    moved = find_consensus(
-        rigid.transform_points(motions[0], source), rigid.transform_points(motions[1], target)
-    ).T_target_source[0]
+    sides = (rigid.transform_points(T, side) for T, side in zip(motions, (source, target), strict=True))
+    moved = find_consensus(*sides).T_target_source[0]
     np.testing.assert_allclose(moved, motions[1] @ plain @ np.linalg.inv(motions[0]), atol=2e-3)
 
 
@@ -93,9 +85,7 @@ def test_missing_motions_repeat_the_first_without_support() -> None:
     found = find_consensus(source, target)
     assert found.support[0] > 15
     np.testing.assert_array_equal(found.support[1:], 0)
-    np.testing.assert_array_equal(
-        found.T_target_source[1:], found.T_target_source[:1].repeat(len(found.support) - 1, axis=0)
-    )
+    assert (found.T_target_source[1:] == found.T_target_source[0]).all()
     assert not found.is_inlier[1:].any()
 
 
@@ -114,8 +104,3 @@ def test_pairs_of_one_point_tell_nothing() -> None:
     crowd = np.tile(source[:1], (40, 1)), np.tile(target[:1] + 15, (40, 1))
     found = find_consensus(np.concatenate([source, crowd[0]]), np.concatenate([target, crowd[1]]))
     assert errors(found.T_target_source[0], T)[0] < 0.5
-
-
-def test_wrong_shapes_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^target: expected shape"):
-        find_consensus(np.zeros((3, 3), np.float32), np.zeros((4, 3), np.float32))

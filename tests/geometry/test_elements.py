@@ -1,7 +1,5 @@
 """Laws of surface elements: normals of planes, the order of farthest points, masks, both builders."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

@@ -1,13 +1,18 @@
-from __future__ import annotations
+import os
+import pickle
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from dpmjax import k_nearest, radius_search
 from dpmjax.geometry import neighbours
+from dpmjax.geometry.neighbours import HostTree
 from tests.tolerances import ROUNDING
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
@@ -16,10 +21,8 @@ KS = pytest.mark.parametrize("k", [1, 5])
 
 def clouds(seed: int, dim: int, num_queries: int = 30, num_points: int = 50) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return (
-        rng.normal(size=(num_queries, dim)).astype(np.float32),
-        rng.normal(size=(num_points, dim)).astype(np.float32),
-    )
+    queries, points = (rng.normal(size=(num, dim)).astype(np.float32) for num in (num_queries, num_points))
+    return queries, points
 
 
 @DIMS
@@ -102,28 +105,49 @@ def test_radius_search_finds_those_within(k: int, radius: float) -> None:
     assert np.isinf(near.squared_distances[~near.mask]).all()
 
 
-ONES = np.ones((4, 3), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: k_nearest(ONES[0], ONES, 1), "queries: expected shape"),
-        (lambda: k_nearest(ONES.astype(object), ONES, 1), "queries: expected real numbers, got dtype"),
-        (lambda: k_nearest(ONES.astype(complex), ONES, 1), "queries: expected real numbers, got dtype"),
-        (lambda: k_nearest(ONES, ONES[:, :2], 1), "points: expected 3 columns"),
-        (lambda: k_nearest(ONES, ONES, 1, jnp.ones(3, bool)), "mask: expected bool of shape"),
-        (lambda: k_nearest(ONES, ONES, 1, jnp.ones(4)), "mask: expected bool"),
-        (lambda: k_nearest(ONES, ONES, 0), "k: expected at least 1"),
-        (lambda: radius_search(ONES, ONES, 0.0, 1), "radius: expected a number above 0"),
-    ],
-)
-def test_wrong_arguments_are_named(call, message: str, as_user) -> None:
-    with pytest.raises(ValueError, match=f"^{message}"):
-        call()
-
-
 def test_arrays_of_another_byte_order_are_the_same_numbers() -> None:
     queries, points = clouds(0, 3)
     swapped = (array.astype(array.dtype.newbyteorder()) for array in (queries, points))
     np.testing.assert_array_equal(k_nearest(*swapped, 3).indices, k_nearest(queries, points, 3).indices)
+
+
+@pytest.mark.parametrize("ordered_from", [1, 1000])
+@pytest.mark.parametrize("num_threads", [1, 3])
+@pytest.mark.parametrize("k", [1, 7, 40])
+@pytest.mark.parametrize("case", ["random", "coinciding", "a line"])
+def test_distances_are_the_smallest_of_all(case: str, k: int, num_threads: int, ordered_from: int, monkeypatch) -> None:
+    monkeypatch.setattr(neighbours, "ORDERED_FROM", ordered_from)
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    points *= {"random": 1, "coinciding": 0, "a line": np.array([1, 0, 0])}[case]
+    queries = np.random.default_rng(1).normal(size=(25, 3)).astype(np.float32)
+    rows, distances = HostTree(points, num_threads=num_threads).nearest(queries, k)
+    exact = cdist(queries, points)
+    np.testing.assert_allclose(distances, np.sort(exact, axis=1)[:, :k], atol=1e-12)
+    np.testing.assert_allclose(np.take_along_axis(exact, rows, axis=1), distances, atol=1e-12)
+    assert all(len(set(row)) == k for row in rows)
+
+
+@pytest.mark.parametrize(("num_points", "num_queries", "k"), [(0, 4, 0), (5, 0, 3), (5, 4, 0)])
+def test_without_points_queries_or_neighbours_nothing_is_found(num_points: int, num_queries: int, k: int) -> None:
+    rows, distances = HostTree(np.ones((num_points, 3)), num_threads=2).nearest(np.ones((num_queries, 3)), k)
+    assert rows.shape == distances.shape == (num_queries, k)
+
+
+@pytest.mark.parametrize("num_points", [0, 40])
+def test_a_pickled_tree_finds_the_same(num_points: int) -> None:
+    points = np.random.default_rng(0).normal(size=(num_points, 3))
+    tree = HostTree(points, num_threads=1)
+    again = pickle.loads(pickle.dumps(tree))
+    assert again.num_threads == 1
+    k = min(num_points, 3)
+    np.testing.assert_array_equal(again.nearest(points, k), tree.nearest(points, k))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", [None, "ACTIVE"])
+def test_other_libraries_keep_their_policy_of_waiting(policy: str | None) -> None:
+    variables = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    variables |= {} if policy is None else {"OMP_WAIT_POLICY": policy}
+    program = "import os, dpmjax.geometry.neighbours; print(os.environ.get('OMP_WAIT_POLICY'))"
+    printed = subprocess.run([sys.executable, "-c", program], env=variables, capture_output=True, check=True, text=True)
+    assert printed.stdout.strip() == str(policy)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,9 +93,8 @@ def test_adjoint_moves_a_tangent_through_a_pose() -> None:
         return np.array([[0.0, -v[2], v[0]], [v[2], 0.0, v[1]], [0.0, 0.0, 0.0]])
 
     T = matrix_of(pose)
-    np.testing.assert_allclose(
-        expm(hat(se2.adjoint(pose) @ tangent)), T @ expm(hat(tangent)) @ np.linalg.inv(T), **DOUBLE
-    )
+    moved = expm(hat(se2.adjoint(pose) @ tangent))
+    np.testing.assert_allclose(moved, T @ expm(hat(tangent)) @ np.linalg.inv(T), **DOUBLE)
 
 
 def test_wrap_angle_keeps_the_direction_and_small_angles(kind: str) -> None:

@@ -1,7 +1,5 @@
 """Laws of shells: points at the largest range are no echoes, walls and rooms are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

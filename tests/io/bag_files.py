@@ -1,7 +1,5 @@
 """Bags of ROS 1 and 2, written by rosbags: clouds by the conventions of several drivers, planar scans, odometry."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -43,12 +41,7 @@ TIMES = {"ouster": ("t", 1e9, 0.0), "velodyne": ("time", 1.0, 0.0), "hesai": ("t
 
 
 class BagWriter:
-    """Writes messages of the standard types.
-
-    Args:
-        path: without an ending.
-        kind: bag (ROS 1), mcap or db3 (folders of ROS 2).
-    """
+    """Writes messages of the standard types to a path without an ending: a bag of ROS 1, mcap or db3 of ROS 2."""
 
     def __init__(self, path: Path, kind: str) -> None:
         import_or_skip("rosbags.highlevel")
@@ -69,7 +62,7 @@ class BagWriter:
         self._writer: Any = Writer1(self.path) if self.is_ros1 else Writer2(self.path, version=9, storage_plugin=plugin)
         self._connections: dict[str, Any] = {}
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self):
         self._writer.open()
         return self
 
@@ -93,14 +86,13 @@ class BagWriter:
         self,
         points: np.ndarray,
         stamp_ns: int,
-        *,
-        layout: str = "ouster",
-        times_s: np.ndarray | None = None,
-        topic: str = "/points",
-        delay_ns: int = 20_000_000,
-        row_tail: int = 0,
-        is_bigendian: bool = False,
-        num_rows: int = 1,
+        layout="ouster",
+        times_s=None,
+        topic="/points",
+        delay_ns=20_000_000,
+        row_tail=0,
+        is_bigendian=False,
+        num_rows=1,
     ) -> None:
         """Writes a cloud by the conventions of a driver; it is recorded a while after its stamp."""
         fields, step = LAYOUTS[layout]
@@ -135,22 +127,12 @@ class BagWriter:
         values = (stamp_ns, len(points), 1, np.zeros(3, np.uint8), entries)
         self.write("/livox/lidar", kind, stamp_ns, self.make(kind, self.header(stamp_ns), *values))
 
-    def write_scan(
-        self,
-        ranges: np.ndarray,
-        stamp_ns: int,
-        *,
-        topic: str = "/scan",
-        range_max: float = 30.0,
-        frame: str = "laser",
-        delay_ns: int = 0,
-    ) -> None:
-        """Writes a planar scan of the whole turn."""
+    def write_scan(self, ranges: np.ndarray, stamp_ns: int, *, delay_ns: int = 0) -> None:
         step = 2 * np.pi / len(ranges)
-        limits = (-np.pi, np.pi - step, step, 0.0, 0.1, 0.1, range_max)
+        limits = (-np.pi, np.pi - step, step, 0.0, 0.1, 0.1, 30.0)
         values = (ranges.astype(np.float32), np.zeros(0, np.float32))
-        message = self.make("sensor_msgs/msg/LaserScan", self.header(stamp_ns, frame), *limits, *values)
-        self.write(topic, "sensor_msgs/msg/LaserScan", stamp_ns + delay_ns, message)
+        message = self.make("sensor_msgs/msg/LaserScan", self.header(stamp_ns, "laser"), *limits, *values)
+        self.write("/scan", "sensor_msgs/msg/LaserScan", stamp_ns + delay_ns, message)
 
     def _vector(self, values: Sequence[float]) -> Any:
         return self.make("geometry_msgs/msg/Vector3", *map(float, values))
@@ -160,8 +142,7 @@ class BagWriter:
         numbers = (np.cos(half), np.sin(half), 0.0, 0.0) if is_upside_down else (0.0, 0.0, np.sin(half), np.cos(half))
         return self.make("geometry_msgs/msg/Quaternion", *map(float, numbers))
 
-    def write_odometry(self, pose: np.ndarray, stamp_ns: int, *, topic: str = "/odom", delay_ns: int = 0) -> None:
-        """Writes x, y, heading as an Odometry."""
+    def write_odometry(self, pose: np.ndarray, stamp_ns: int, *, delay_ns: int = 0) -> None:
         point = self.make("geometry_msgs/msg/Point", float(pose[0]), float(pose[1]), 0.0)
         zeros = np.zeros(36)
         covered = self.make("geometry_msgs/msg/Pose", point, self._turn(pose[2]))
@@ -173,16 +154,10 @@ class BagWriter:
             self.make("geometry_msgs/msg/PoseWithCovariance", covered, zeros),
             self.make("geometry_msgs/msg/TwistWithCovariance", twist, zeros),
         )
-        self.write(topic, "nav_msgs/msg/Odometry", stamp_ns + delay_ns, message)
+        self.write("/odom", "nav_msgs/msg/Odometry", stamp_ns + delay_ns, message)
 
     def write_transform(
-        self,
-        frames: tuple[str, str],
-        pose: np.ndarray,
-        stamp_ns: int,
-        *,
-        topic: str = "/tf",
-        is_upside_down: bool = False,
+        self, frames: tuple[str, str], pose: np.ndarray, stamp_ns: int, *, topic="/tf", is_upside_down=False
     ) -> None:
         """Writes x, y, heading of a child frame in its parent."""
         parent, child = frames

@@ -1,7 +1,5 @@
 """Depth images in the layouts of the data sets."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

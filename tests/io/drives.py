@@ -1,7 +1,5 @@
 """Tiny drives in the layouts of the data sets: each function writes clouds and the poses of the lidar."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

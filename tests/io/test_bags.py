@@ -1,7 +1,5 @@
 """Bags of ROS: clouds of all drivers, planar scans with odometry, topics, and refusals."""
 
-from __future__ import annotations
-
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -51,16 +49,8 @@ def test_clouds_are_read_in_the_order_and_at_the_times_of_their_headers(tmp_path
 @pytest.mark.parametrize("is_bigendian", [False, True])
 def test_clouds_of_all_drivers_are_read(tmp_path: Path, layout: str, is_bigendian: bool, clouds) -> None:
     times = np.linspace(0, 0.1, len(clouds[0])) if layout in TIMES else None
-    path = write_clouds(
-        tmp_path / "a",
-        "bag",
-        clouds[:1],
-        layout=layout,
-        times_s=times,
-        is_bigendian=is_bigendian,
-        num_rows=4,
-        row_tail=7,
-    )
+    options = {"layout": layout, "times_s": times, "is_bigendian": is_bigendian, "num_rows": 4, "row_tail": 7}
+    path = write_clouds(tmp_path / "a", "bag", clouds[:1], **options)
     drive = open_lidar_sequence(path)
     np.testing.assert_allclose(drive.read_scan(0), clouds[0], rtol=1e-6)
     found = drive.read_times(0)
@@ -195,26 +185,21 @@ POSES = np.column_stack([0.2 * np.arange(NUM), 0.1 * np.arange(NUM), 0.05 * np.a
 T_BASE_LASER = np.array([0.3, 0.1, 0.4])
 
 
-def points_in_world(scans, poses: np.ndarray) -> np.ndarray:
-    return np.concatenate(
-        [
-            np.asarray(se2.transform_points(pose, points[mask].astype(float)))
-            for pose, points, mask in zip(poses, scans.points, scans.mask, strict=True)
-        ]
-    )
+def assert_on_walls(scans) -> None:
+    for pose, points, mask in zip(scans.odometry_poses, scans.points, scans.mask, strict=True):
+        x, y = np.abs(se2.transform_points(pose, points[mask].astype(float))).T
+        assert np.minimum(np.abs(x - 6), np.abs(y - 4)).max() < 1e-3
 
 
-def assert_on_walls(points: np.ndarray) -> None:
-    off = np.minimum(np.abs(np.abs(points[:, 0]) - 6), np.abs(np.abs(points[:, 1]) - 4))
-    assert off.max() < 1e-3
+def moments(poses: np.ndarray = POSES):
+    return [(EPOCH_NS + index * STEP_NS, pose) for index, pose in enumerate(poses)]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_planar_scans_come_with_the_odometry_of_the_laser(tmp_path: Path, kind: str) -> None:
     with BagWriter(tmp_path / "a", kind) as bag:
         bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS, topic="/tf_static")
-        for index, pose in enumerate(POSES):
-            stamp = EPOCH_NS + index * STEP_NS
+        for stamp, pose in moments():
             bag.write_transform(("odom", "base_link"), pose, stamp)
             bag.write_transform(("map", "odom"), np.array([9.0, 9, 1]), stamp)
             bag.write_scan(room(se2.compose(pose, T_BASE_LASER)), stamp)
@@ -222,19 +207,16 @@ def test_planar_scans_come_with_the_odometry_of_the_laser(tmp_path: Path, kind: 
     np.testing.assert_allclose(scans.odometry_poses, se2.compose(POSES, T_BASE_LASER), atol=1e-6)
     np.testing.assert_allclose(scans.times, 1.6e9 + 0.1 * np.arange(NUM), atol=1e-6)
     assert scans.is_organised
-    assert_on_walls(points_in_world(scans, scans.odometry_poses))
+    assert_on_walls(scans)
 
 
 @pytest.mark.parametrize(("topic", "num"), [("/tf_static", 2), ("/tf", NUM)])
 @pytest.mark.parametrize("has_odometry_topic", [False, True])
-def test_a_mounting_that_is_published_again_stays_one(
-    tmp_path: Path, topic: str, num: int, has_odometry_topic: bool
-) -> None:
+def test_a_mounting_that_is_published_again_stays_one(tmp_path, topic: str, num: int, has_odometry_topic: bool) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
-        for index in range(num):
-            bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS + index * STEP_NS, topic=topic)
-        for index, pose in enumerate(POSES):
-            stamp = EPOCH_NS + index * STEP_NS
+        for stamp, _ in moments()[:num]:
+            bag.write_transform(("base_link", "laser"), T_BASE_LASER, stamp, topic=topic)
+        for stamp, pose in moments():
             if has_odometry_topic:
                 bag.write_odometry(pose, stamp)
             else:
@@ -246,10 +228,9 @@ def test_a_mounting_that_is_published_again_stays_one(
 
 def test_a_laser_that_moves_on_a_moving_robot_has_no_odometry(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
-        for index, pose in enumerate(POSES):
-            stamp = EPOCH_NS + index * STEP_NS
+        for stamp, pose in moments():
             bag.write_transform(("odom", "base_link"), pose, stamp)
-            bag.write_transform(("base_link", "laser"), np.array([0, 0, 0.1 * index]), stamp)
+            bag.write_transform(("base_link", "laser"), np.array([0, 0, pose[0]]), stamp)
             bag.write_scan(room(pose), stamp)
     scans = read_sequence(bag.path)
     assert scans.odometry_poses is None
@@ -259,21 +240,20 @@ def test_a_laser_that_moves_on_a_moving_robot_has_no_odometry(tmp_path: Path) ->
 def test_a_laser_upside_down_is_turned(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a", "bag") as bag:
         bag.write_transform(("base_link", "laser"), T_BASE_LASER, EPOCH_NS, topic="/tf_static", is_upside_down=True)
-        for index, pose in enumerate(POSES):
-            stamp = EPOCH_NS + index * STEP_NS
+        for stamp, pose in moments():
             bag.write_transform(("odom", "base_link"), pose, stamp)
             # Seen from below, the beams run in the opposite direction.
             ranges = room(se2.compose(pose, T_BASE_LASER))
             bag.write_scan(np.roll(ranges[::-1], 1), stamp)
     scans = read_sequence(bag.path)
-    assert_on_walls(points_in_world(scans, scans.odometry_poses))
+    assert_on_walls(scans)
 
 
 def test_odometry_is_interpolated_at_the_scans(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a", "mcap") as bag:
-        for index, pose in enumerate(POSES):
-            bag.write_odometry(pose, EPOCH_NS + index * STEP_NS)
-            bag.write_scan(room(pose), EPOCH_NS + index * STEP_NS + STEP_NS // 2)
+        for stamp, pose in moments():
+            bag.write_odometry(pose, stamp)
+            bag.write_scan(room(pose), stamp + STEP_NS // 2)
     scans = read_sequence(bag.path)
     np.testing.assert_allclose(scans.odometry_poses[:-1], (POSES[1:] + POSES[:-1]) / 2, atol=1e-6)
 

@@ -1,7 +1,5 @@
 """The number of columns of raw files: inferred from the values, by the ending, or said."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 
@@ -16,7 +14,6 @@ NUM = 1200
 
 @pytest.fixture
 def table() -> np.ndarray:
-    """Points in a street, intensity, ring and time."""
     rng = np.random.default_rng(0)
     azimuth, ring = rng.uniform(-np.pi, np.pi, NUM), rng.integers(0, 32, NUM)
     ranges = rng.uniform(3, 40, NUM)
@@ -43,13 +40,10 @@ def test_columns_are_judged_by_the_values(tmp_path: Path, table: np.ndarray, col
 
 
 def test_a_cut_file_is_not_taken_for_one_of_other_columns(tmp_path: Path, table: np.ndarray) -> None:
-    path = tmp_path / "0.bin"
-    path.write_bytes(table[:, :4].tobytes()[:-4])  # 4799 numbers
-    with pytest.raises(InputError, match="no whole number of points of 4 float32"):
-        read_lidar_file(path)
-    path.write_bytes(table[:, :4].tobytes()[:-12])  # 4797 numbers, 3 x 1599
-    with pytest.raises(InputError, match="no whole number of points of 4 float32"):
-        read_lidar_file(path)
+    for num_bytes in (4, 12):  # 4799 numbers, and 4797, which are 3 x 1599
+        (tmp_path / "0.bin").write_bytes(table[:, :4].tobytes()[:-num_bytes])
+        with pytest.raises(InputError, match="no whole number of points of 4 float32"):
+            read_lidar_file(tmp_path / "0.bin")
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5])

@@ -1,7 +1,5 @@
 """Made-up inputs: every reader ends in a good result or in an `InputError` of one line, and so does the command."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import re
@@ -21,6 +19,7 @@ from tests.data_sets import readable_scans, write_deepmapping_folder, write_pcd
 from tests.io import drives
 from tests.io.bag_files import EPOCH_NS, KINDS, BagWriter
 from tests.io.depth_files import write_pose_folder, write_scene
+from tests.io.test_g2o import EDGES, PLANAR, spatial_text
 from tests.io.test_las import write_las
 from tests.io.test_pcd import compressed
 from tests.io.test_pcd import header as pcd_header
@@ -41,37 +40,29 @@ def cloud(rng):
     return rng.normal(size=(40, 3)).astype(np.float32) * [10, 10, 1]
 
 
-def write_npy_2d(folder, rng):
-    np.save(folder / "a.npy", points_2d(rng))
-    return folder / "a.npy"
+def arrays_2d(rng):
+    return {"points": points_2d(rng), "poses": rng.normal(size=(4, 3)), "times": np.arange(4.0), "unit": "m"}
 
 
-def write_npz_2d(folder, rng, *, is_packed=False):
-    save = np.savez_compressed if is_packed else np.savez
-    save(folder / "a.npz", points=points_2d(rng), poses=rng.normal(size=(4, 3)), times=np.arange(4.0), unit="m")
-    return folder / "a.npz"
-
-
-def write_ranges(folder, rng):
-    np.savez(folder / "a.npz", ranges=rng.uniform(1, 9, (4, 24)), angles=np.linspace(0, 6, 24))
-    return folder / "a.npz"
-
-
-def write_log(folder, rng, *, is_packed=False):
+def log_bytes(rng):
     lines = [
         f"FLASER 20 {' '.join(f'{r:.2f}' for r in rng.uniform(1, 9, 20))} {i} 0 0 {i} 1 0 {i} h {i}" for i in range(4)
     ]
-    text = ("# log\n" + "\n".join(lines) + "\n").encode()
-    path = folder / ("a.log.gz" if is_packed else "a.log")
-    path.write_bytes(gzip.compress(text) if is_packed else text)
-    return path
+    return ("# log\n" + "\n".join(lines) + "\n").encode()
+
+
+def at(name: str, write: Callable[[Path, np.random.Generator], object]) -> Write:
+    def write_file(folder: Path, rng: np.random.Generator) -> Path:
+        write(folder / name, rng)
+        return folder / name
+
+    return write_file
 
 
 def write_pcd_folder(folder, rng):
     mask = np.ones((4, 24), bool)
-    scans = ScanSequence(
-        "s", 30 * points_2d(rng).astype(np.float32), mask, "px", reference_poses=rng.normal(size=(4, 3))
-    )
+    points = 30 * points_2d(rng).astype(np.float32)
+    scans = ScanSequence("s", points, mask, "px", reference_poses=rng.normal(size=(4, 3)))
     return write_deepmapping_folder(folder / "scans", scans)
 
 
@@ -82,36 +73,16 @@ def write_pcd_tar(folder, rng):
     return folder / "a.tar"
 
 
-def write_ascii_pcd(folder, rng):
-    header = "VERSION 0.7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 40\nHEIGHT 1\nPOINTS 40\n"
-    rows = "".join(f"{x} {y} {z} 7\n" for x, y, z in cloud(rng))
-    (folder / "0.pcd").write_text(header + "DATA ascii\n" + rows)
-    return folder / "0.pcd"
+def ascii_rows(rng, more: str = "") -> str:
+    return "".join(f"{x} {y} {z}{more}\n" for x, y, z in cloud(rng))
 
 
-def write_ascii_ply(folder, rng):
-    properties = "".join(f"property float {name}\n" for name in "xyz")
-    rows = "".join(f"{x} {y} {z}\n" for x, y, z in cloud(rng))
-    (folder / "0.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 40\n{properties}end_header\n{rows}")
-    return folder / "0.ply"
-
-
-def write_npy_3d(folder, rng):
-    np.save(folder / "0.npy", cloud(rng))
-    return folder / "0.npy"
+ASCII_PCD = pcd_header("x y z i", "4 4 4 4", "F F F U", "1 1 1 1", "ascii", 40).decode()
+ASCII_PLY = "ply\nformat ascii 1.0\nelement vertex 40\n" + "".join(f"property float {name}\n" for name in "xyz")
 
 
 def trajectory(rng):
     return np.column_stack([rng.uniform(-9, 9, (5, 2)), rng.uniform(-3, 3, 5)])
-
-
-def write_trajectory(folder, rng, *, name, write):
-    return write(folder / name, trajectory(rng))
-
-
-def write_columns(folder, rng):
-    np.savetxt(folder / "a.txt", trajectory(rng), header="x_m y_m theta_rad")
-    return folder / "a.txt"
 
 
 def write_drive(folder, rng, *, kind):
@@ -122,22 +93,12 @@ def write_drive(folder, rng, *, kind):
 
 
 def pcd_bytes(rng, *, kind):
-    """Files of the Point Cloud Library: compressed, or padded."""
     points = np.round(cloud(rng), 1).astype("<f4")
     if kind == "compressed":
         return pcd_header("x y z", "4 4 4", "F F F", "1 1 1", "binary_compressed", 40) + compressed(list(points.T))
     records = np.zeros(40, [("p", "<f4", 3), ("a", "u1", 4), ("t", "<f8"), ("b", "u1", 8)])
     records["p"] = points
     return pcd_header("x y z _ t _", "4 4 4 1 8 1", "F F F U F U", "1 1 1 4 1 8", "binary", 40) + records.tobytes()
-
-
-def write_pcd_bytes(folder, rng, *, kind):
-    (folder / "0.pcd").write_bytes(pcd_bytes(rng, kind=kind))
-    return folder / "0.pcd"
-
-
-def write_las_file(folder, rng, *, suffix):
-    return write_las(folder / f"0{suffix}", cloud(rng).astype(np.float64), times=np.arange(40.0))
 
 
 def write_bag(folder, rng, *, kind):
@@ -158,7 +119,6 @@ def write_planar_bag(folder, rng, *, kind):
 
 
 def write_plain_drive(folder, rng):
-    """Scans with stamps, and a TUM file of another rate."""
     for index in range(3):
         write_pcd(folder / f"{index}.pcd", cloud(rng))
     (folder / "times.txt").write_text("10.0\n10.1\n10.2\n")
@@ -167,21 +127,7 @@ def write_plain_drive(folder, rng):
 
 
 TORO_PLANAR = "VERTEX2 1 0 0 0\nVERTEX2 2 1 0 0.1\nEDGE2 1 2 1 0 0.1 9 0 9 9 0 0\nEQUIV 1 2\n"
-EDGES_ALONE = "EDGE_SE2 1 2 1 0 0.1 9 0 0 9 0 9\nEDGE_SE2 2 3 1 0 0.1 9 0 0 9 0 9\nEDGE_SE2 3 1 1 0 2 9 0 0 9 0 9\n"
-PLANAR_GRAPH = """VERTEX_SE2 7 0 0 0
-VERTEX_SE2 3 1 2 0.5
-FIX 3
-EDGE_SE2 7 3 1.1 2.1 0.4 11 12 13 22 23 99
-"""
-SPATIAL_GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
-VERTEX_SE3:QUAT 1 1 2 3 0 0 0.6 0.8
-EDGE_SE3:QUAT 0 1 1 2 3 0 0.6 0 0.8 9 0 0 0 0 0 8 0 0 0 0 7 0 0 0 6 0 0 5 0 4
-"""
-
-
-def write_graph(folder, _, *, text):
-    (folder / "a.g2o").write_text(text)
-    return folder / "a.g2o"
+GRAPHS = {"toro": TORO_PLANAR, "edges": EDGES, "planar": PLANAR, "spatial": spatial_text()[0]}
 
 
 def read_drive(path):
@@ -190,31 +136,34 @@ def read_drive(path):
 
 
 SCANS = {
-    "npy": write_npy_2d,
-    "npz": write_npz_2d,
-    "packed npz": partial(write_npz_2d, is_packed=True),
-    "ranges": write_ranges,
-    "log": write_log,
-    "packed log": partial(write_log, is_packed=True),
+    "npy": at("a.npy", lambda path, rng: np.save(path, points_2d(rng))),
+    "npz": at("a.npz", lambda path, rng: np.savez(path, **arrays_2d(rng))),
+    "packed npz": at("a.npz", lambda path, rng: np.savez_compressed(path, **arrays_2d(rng))),
+    "ranges": at(
+        "a.npz", lambda path, rng: np.savez(path, ranges=rng.uniform(1, 9, (4, 24)), angles=np.linspace(0, 6, 24))
+    ),
+    "log": at("a.log", lambda path, rng: path.write_bytes(log_bytes(rng))),
+    "packed log": at("a.log.gz", lambda path, rng: path.write_bytes(gzip.compress(log_bytes(rng)))),
     "pcd folder": write_pcd_folder,
     "pcd tar": write_pcd_tar,
 }
 LIDAR_FILES = {
-    "bin": lambda folder, rng: drives.write_bin(folder / "0.bin", cloud(rng)),
-    "npy": write_npy_3d,
-    "pcd": lambda folder, rng: write_pcd(folder / "0.pcd", cloud(rng)),
-    "ascii pcd": write_ascii_pcd,
-    "ply": lambda folder, rng: io.write_ply(folder / "0.ply", cloud(rng)),
-    "ascii ply": write_ascii_ply,
-    **{f"pcd, {kind}": partial(write_pcd_bytes, kind=kind) for kind in ("compressed", "padded")},
-    "las": partial(write_las_file, suffix=".las"),
-    "laz": partial(write_las_file, suffix=".laz"),
+    "bin": at("0.bin", lambda path, rng: drives.write_bin(path, cloud(rng))),
+    "npy": at("0.npy", lambda path, rng: np.save(path, cloud(rng))),
+    "pcd": at("0.pcd", lambda path, rng: write_pcd(path, cloud(rng))),
+    "ascii pcd": at("0.pcd", lambda path, rng: path.write_text(ASCII_PCD + ascii_rows(rng, " 7"))),
+    "ply": at("0.ply", lambda path, rng: io.write_ply(path, cloud(rng))),
+    "ascii ply": at("0.ply", lambda path, rng: path.write_text(f"{ASCII_PLY}end_header\n{ascii_rows(rng)}")),
+    "pcd, compressed": at("0.pcd", lambda path, rng: path.write_bytes(pcd_bytes(rng, kind="compressed"))),
+    "pcd, padded": at("0.pcd", lambda path, rng: path.write_bytes(pcd_bytes(rng, kind="padded"))),
+    "las": at("0.las", lambda path, rng: write_las(path, cloud(rng).astype(float), times=np.arange(40.0))),
+    "laz": at("0.laz", lambda path, rng: write_las(path, cloud(rng).astype(float), times=np.arange(40.0))),
 }
 POSES = {
-    "tum": partial(write_trajectory, name="t.txt", write=io.write_tum),
-    "kitti": partial(write_trajectory, name="k.txt", write=io.write_kitti),
-    "npy": partial(write_trajectory, name="p.npy", write=io.write_poses_npy),
-    "columns": write_columns,
+    "tum": at("t.txt", lambda path, rng: io.write_tum(path, trajectory(rng))),
+    "kitti": at("k.txt", lambda path, rng: io.write_kitti(path, trajectory(rng))),
+    "npy": at("p.npy", lambda path, rng: io.write_poses_npy(path, trajectory(rng))),
+    "columns": at("a.txt", lambda path, rng: np.savetxt(path, trajectory(rng), header="x_m y_m theta_rad")),
 }
 CASES: dict[str, tuple[Write, Read]] = {
     **{f"scans, {name}": (write, io.read_sequence) for name, write in SCANS.items()},
@@ -225,10 +174,10 @@ CASES: dict[str, tuple[Write, Read]] = {
     "drive, plain": (write_plain_drive, read_drive),
     **{f"drive, {kind}": (partial(write_bag, kind=kind), read_drive) for kind in KINDS},
     **{f"scans, {kind}": (partial(write_planar_bag, kind=kind), io.read_sequence) for kind in KINDS},
-    "graph, toro": (partial(write_graph, text=TORO_PLANAR), dpmjax.read_g2o),
-    "graph, edges": (partial(write_graph, text=EDGES_ALONE), dpmjax.read_g2o),
-    "graph, planar": (partial(write_graph, text=PLANAR_GRAPH), dpmjax.read_g2o),
-    "graph, spatial": (partial(write_graph, text=SPATIAL_GRAPH), dpmjax.read_g2o),
+    **{
+        f"graph, {name}": (at("a.g2o", lambda path, _, text=text: path.write_text(text)), dpmjax.read_g2o)
+        for name, text in GRAPHS.items()
+    },
     "depth folder": (
         lambda folder, _: write_pose_folder(folder),
         lambda path: io.read_pose_folder(path, height=6, width=8),
@@ -285,18 +234,15 @@ def spoil(path: Path, rng: np.random.Generator) -> None:
 
 
 def spoil_arrays(path: Path, rng: np.random.Generator) -> None:
-    """Writes valid NumPy files of wrong shapes, dtypes and values."""
     shape = tuple(int(n) for n in rng.choice([0, 1, 2, 3, 4, 5, 20], size=rng.integers(0, 5)))
     values = rng.normal(size=shape) * 10.0 ** rng.integers(-40, 41)
     values = np.where(rng.random(shape) < rng.choice([0, 0.1, 1]), rng.choice([np.nan, np.inf, 0.0, -np.inf]), values)
     dtype = rng.choice(["f8", "f4", "f2", "i8", "u1", "?", "c8", "U3", "S2", "M8[s]"])
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        values = (
-            np.nan_to_num(values, posinf=1, neginf=0).astype(dtype)
-            if dtype in ("i8", "u1", "M8[s]")
-            else values.astype(dtype)
-        )
+        if dtype in ("i8", "u1", "M8[s]"):
+            values = np.nan_to_num(values, posinf=1, neginf=0)
+        values = values.astype(dtype)
     if path.suffix == ".npy":
         np.save(path, values)
         return
@@ -309,9 +255,7 @@ def spoil_arrays(path: Path, rng: np.random.Generator) -> None:
 def total_size(result: object) -> int:
     if isinstance(result, list):
         return sum(total_size(entry) for entry in result)
-    arrays = (
-        [result] if isinstance(result, np.ndarray) else vars(result).values() if hasattr(result, "__dict__") else []
-    )
+    arrays = [result] if isinstance(result, np.ndarray) else getattr(result, "__dict__", {}).values()
     return sum(array.size for array in arrays if isinstance(array, np.ndarray))
 
 

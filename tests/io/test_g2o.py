@@ -1,7 +1,5 @@
 """g2o files: the order of the numbers, exact round trips, refusals in one line."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 
@@ -88,7 +86,11 @@ def test_gtsam_reads_the_same_cost_in_space(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "no vertices"),
-        (PLANAR + "VERTEX_SE3:QUAT 9 0 0 0 0 0 0 1\n", "is not read here"),
+        (PLANAR + "VERTEX_SE3:QUAT 9 0 0 0 0 0 0 1\n", "line 7: 'VERTEX_SE3:QUAT' is not read here"),
+        (PLANAR + "VERTEX_XY 2 1 1\n", "landmarks are not read"),
+        (PLANAR + "EDGE_SE2_MAXMIX 7 3 0.1 1 0 0 1 0 0 1 0 1\n", "switchable and mixture edges are not read"),
+        (PLANAR + "EDGE_PRIOR_SE2 7 1 0 0 1 0 0 1 0 1\n", "priors of single poses are not read"),
+        (PLANAR + "EDGE3 7 3 1\n", "in the plane, or one in space"),
         (PLANAR + "EDGE_SE2 7 3 1 2\n", "line 7: 4 values after EDGE_SE2"),
         (PLANAR + "VERTEX_SE2 8 0 zero 0\n", "line 7: could not convert string to float: 'zero'"),
         (PLANAR + "VERTEX_SE2 x 0 0 0\n", "line 7: invalid literal for int() with base 10: 'x'"),
@@ -101,7 +103,6 @@ def test_gtsam_reads_the_same_cost_in_space(tmp_path: Path) -> None:
         (PLANAR + "EDGE_SE2 7 3 1e200 2 3 1 0 0 1 0 1\n", "line 7: expected finite numbers below 1e+75, got 1e+200"),
         (PLANAR + "EDGE_SE2 7 3 1 2 3 1e200 0 0 1 0 1\n", "line 7: the information of edge 7 3 is not finite, or huge"),
         (SPATIAL, "line 4: 9 values after EDGE_SE3:QUAT, the information matrix is missing"),
-        (PLANAR + "EDGE_SE2 7 3 1 2 3 1 0 0 -1 0 1\n", "positive semidefinite"),
         (spatial_text()[0].replace("0.6 0.8", "0 0"), "quaternion"),
         ("VERTEX_SE2 99999999999999999999 0 0 0", "graph.g2o"),
     ],
@@ -152,20 +153,6 @@ def test_toro_writes_the_same_graphs_with_other_numbers(tmp_path: Path) -> None:
     np.testing.assert_allclose(graph.poses[1, :3, :3], turn, atol=1e-15)
     np.testing.assert_allclose(graph.edges.measurements[0, :3, 3], [1, 2, 3])
     np.testing.assert_allclose(graph.edges.information[0], roots @ roots.T, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("line", "advice"),
-    [
-        ("VERTEX_XY 2 1 1", "landmarks are not read"),
-        ("EDGE_SE2_MAXMIX 7 3 0.1 1 0 0 1 0 0 1 0 1", "switchable and mixture edges are not read"),
-        ("EDGE_PRIOR_SE2 7 1 0 0 1 0 0 1 0 1", "priors of single poses are not read"),
-        ("EDGE3 7 3 1", "in the plane, or one in space"),
-    ],
-)
-def test_the_line_that_is_not_read_is_the_one_that_is_named(tmp_path: Path, line: str, advice: str) -> None:
-    with pytest.raises(InputError, match=f"line 7: '{line.split()[0]}' is not read here.*{advice}"):
-        read_g2o(written(tmp_path, PLANAR + line + "\n"))
 
 
 def test_indefinite_information_names_its_edge_and_can_be_projected(tmp_path: Path) -> None:

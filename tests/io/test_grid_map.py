@@ -1,7 +1,5 @@
 """Laws of grid maps in the world's frame: walls are occupied, cells on beams free, all further cells unknown."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """LAS and LAZ scans, written by laspy."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

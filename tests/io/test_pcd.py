@@ -1,7 +1,5 @@
 """PCD files as the Point Cloud Library and drivers write them: compressed, padded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +31,6 @@ ROWS = np.array([[1, 2, 3], [4, 5, 6], [-7, 8.5, 0]], "<f4")
 
 
 def plain(fields: str = "x y z", encoding: str = "ascii", body: bytes = b"1 2 3\n4 5 6\n-7 8.5 0\n", **kinds) -> bytes:
-    """A file of three points, all fields of one kind."""
     num, each = len(fields.split()), {"size": "4", "kind": "F", "num_points": 3, **kinds}
     sizes, types = (" ".join([each[name]] * num) for name in ("size", "kind"))
     return header(fields, sizes, types, " ".join(["1"] * num), encoding, each["num_points"]) + body

@@ -1,7 +1,5 @@
 """Order and times of scans, and their reference poses: by time, by number, by order, or refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

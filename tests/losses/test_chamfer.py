@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,18 +29,6 @@ def test_distance_is_its_definition(dim: int, seed: int) -> None:
 
 
 @DIMS
-def test_masked_points_take_no_part(dim: int) -> None:
-    a, b = clouds(3, dim)
-    rng = np.random.default_rng(4)
-    mask_a, mask_b = rng.random(30) < 0.6, rng.random(20) < 0.6
-    expected = chamfer_in_scipy(a[mask_a], b[mask_b])
-    np.testing.assert_allclose(chamfer_distance(a, b, mask_a, mask_b), expected, **ACCUMULATED)
-    for gradient, mask in zip(GRADIENTS(a, b, mask_a, mask_b), (mask_a, mask_b), strict=True):
-        assert np.isfinite(gradient).all()
-        np.testing.assert_array_equal(np.asarray(gradient)[~mask], 0)
-
-
-@DIMS
 @pytest.mark.parametrize("empty", ["a", "b", "both"])
 def test_distance_to_an_empty_cloud_is_zero_with_zero_gradient(dim: int, empty: str) -> None:
     a, b = clouds(5, dim)
@@ -61,12 +47,3 @@ def test_gradient_is_finite_at_coincident_points(dim: int) -> None:
     a, _ = clouds(6, dim)
     for gradient in GRADIENTS(a, a):
         np.testing.assert_array_equal(gradient, 0)
-
-
-def test_wrong_arguments_are_named(as_user) -> None:
-    with pytest.raises(ValueError, match="^b: expected 2 columns"):
-        chamfer_distance(jnp.ones((4, 2)), jnp.ones((4, 3)))
-    with pytest.raises(ValueError, match="^mask_b: expected bool of shape"):
-        chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), None, jnp.ones(4, bool))
-    with pytest.raises(ValueError, match="^max_distance: expected a number above 0"):
-        chamfer_distance(jnp.ones((4, 2)), jnp.ones((5, 2)), max_distance=-1.0)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest
@@ -83,20 +81,3 @@ def test_zero_vectors_have_finite_gradients() -> None:
     queries[1] = keys[positives[2]] = 0
     assert np.isfinite(info_nce(queries, keys, positives))
     assert all(np.isfinite(gradient).all() for gradient in GRADIENTS(queries, keys, positives))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"keys": np.ones((9, 3), np.float32)}, "keys: expected shape"),
-        ({"positives": np.zeros(3, np.int32)}, "positives: expected shape"),
-        ({"positives": np.zeros(6)}, "positives: expected integers"),
-        ({"ignore": np.zeros((9, 6), bool)}, "ignore: expected bool of shape"),
-        ({"mask": np.ones(6)}, "mask: expected bool"),
-        ({"temperature": 0.0}, "temperature: expected a number above 0"),
-    ],
-)
-def test_wrong_arguments_are_named(change, message: str, as_user) -> None:
-    arguments = dict(zip(("queries", "keys", "positives"), example(0), strict=True))
-    with pytest.raises(ValueError, match=f"^{message}"):
-        info_nce(**(arguments | change))

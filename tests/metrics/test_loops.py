@@ -1,7 +1,5 @@
 """Recall of loops on drives made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -67,11 +65,3 @@ def test_without_revisits_there_is_no_recall() -> None:
     poses = there_and_back()[:90]
     found = loop_recall(poses, NONE, find_revisits(poses))
     assert np.isnan([found.recall, found.same_way, found.opposite]).all()
-
-
-def test_ends_that_are_no_scans_are_refused(as_user) -> None:
-    poses = there_and_back()
-    revisits = find_revisits(poses)
-    for ends in (np.zeros((2, 3), int), np.array([[0, 200]])):
-        with pytest.raises(ValueError, match="newer_ends"):
-            loop_recall(poses, ends, revisits)

@@ -1,7 +1,5 @@
 """The bound on positions, against the one world where it can be written down."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,6 @@ HALF_WIDTH = 100
 
 
 def bound_in_room(poses: np.ndarray, *, noise: float = 1.0, num_beams: int = 256) -> np.ndarray:
-    """The bound in a square room with walls one pixel thick."""
     grid = np.ones((2 * HALF_WIDTH + 2,) * 2, bool)
     grid[1:-1, 1:-1] = False
     return position_bound(lambda at: cast_scans(grid, at, num_beams=num_beams), poses, range_noise=noise)

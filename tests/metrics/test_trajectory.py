@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dpmjax import absolute_trajectory_error, align_rigid, point_distance, relative_pose_error
+from dpmjax.metrics import find_revisits, loop_recall, registration_recall, segment_error
 from tests.tolerances import DOUBLE
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
@@ -129,7 +128,7 @@ def test_float32_at_map_coordinates_has_the_errors_of_float64(dim: int, transfor
 
 ESTIMATED, REFERENCE = trajectories(9, 2)
 BROKEN = np.where(np.arange(25)[:, None, None] == 4, np.nan, ESTIMATED)
-POINTS, MASK = np.zeros((25, 6, 2)), np.ones((25, 6), bool)
+POINTS, MASK, POSES = np.zeros((25, 6, 2)), np.ones((25, 6), bool), np.tile(np.eye(4), (4, 1, 1))
 
 
 @pytest.mark.parametrize(
@@ -147,6 +146,11 @@ POINTS, MASK = np.zeros((25, 6, 2)), np.ones((25, 6), bool)
         (lambda: point_distance(POINTS, MASK[:, :3], ESTIMATED, REFERENCE), "mask: expected bool"),
         (lambda: point_distance(POINTS, ~MASK, ESTIMATED, REFERENCE), "mask: expected at least one"),
         (lambda: point_distance(POINTS, MASK, BROKEN, REFERENCE), "T_estimated: expected finite"),
+        (lambda: registration_recall(POSES[:2], POSES), "T_estimated"),
+        (lambda: segment_error(POSES, POSES[:3]), "reference"),
+        (lambda: segment_error(POSES, POSES, stride=0), "expected poses .* and a stride from 1"),
+        (lambda: loop_recall(POSES, np.zeros((2, 3), int), find_revisits(POSES)), "newer_ends"),
+        (lambda: loop_recall(POSES, np.array([[0, 4]]), find_revisits(POSES)), "newer_ends"),
     ],
 )
 def test_bad_input_is_named(call, message: str, as_user) -> None:

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -78,11 +76,8 @@ def test_gradient_is_finite(num_valid: int) -> None:
 def loss_and_gradient(model: Model, a: DescriptorCloud, b: DescriptorCloud) -> jax.Array:
     p, q = correlate(model, a, b)
     offsets = predict_offsets(model, p.features, q.features)
-    return (
-        jnp.sum(offsets**2)
-        + jnp.sum(decode(model, q.features, part="similarity_head") ** 2)
-        + decode(model, p, q, part="overlap_logit")
-    )
+    similar = decode(model, q.features, part="similarity_head")
+    return jnp.sum(offsets**2) + jnp.sum(similar**2) + decode(model, p, q, part="overlap_logit")
 
 
 def test_gradient_of_attention_in_chunks_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,9 +60,8 @@ def test_padded_equals_unpadded(model: Model) -> None:
 
 def test_order_of_neighbours_changes_nothing(model: Model) -> None:
     pyramid = pyramid_of(points(3))
-    levels = tuple(
-        level.replace(neighbours=tuple(block[:, ::-1] for block in level.neighbours)) for level in pyramid.levels
-    )
+    reverse = lambda blocks: tuple(block[:, ::-1] for block in blocks)  # noqa: E731
+    levels = tuple(level.replace(neighbours=reverse(level.neighbours)) for level in pyramid.levels)
     found = encode_pyramid(model, pyramid.replace(levels=levels))
     np.testing.assert_array_equal(found.features, encode_pyramid(model, pyramid).features)
 

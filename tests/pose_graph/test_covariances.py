@@ -1,7 +1,5 @@
 """Covariances of poses against a dense inverse by finite differences, and against solutions of drawn measurements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -40,9 +38,8 @@ def test_covariances_are_blocks_of_the_dense_inverse(tangent: int, monkeypatch: 
 
 def test_poses_of_drawn_measurements_spread_as_predicted() -> None:
     graph = optimize_pose_graph(random_graph(5, 3, noise=0.0, start=0.0)).graph
-    graph = replace(
-        graph, edges=graph.edges._replace(information=np.tile(np.eye(3) * 1e4, (len(graph.edges.source), 1, 1)))
-    )
+    information = np.tile(np.eye(3) * 1e4, (len(graph.edges.source), 1, 1))
+    graph = replace(graph, edges=graph.edges._replace(information=information))
     rng = np.random.default_rng(0)
     steps = []
     for _ in range(100):

@@ -1,7 +1,5 @@
 """The traced solver: the minimum of the host's solver, padding, batches, gradients against differences in float64."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

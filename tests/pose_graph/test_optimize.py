@@ -1,7 +1,5 @@
 """The solver against dense least squares in float64, written down without the library."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -72,9 +70,8 @@ def random_graph(seed: int, tangent: int, *, count: int = 8, noise: float = 0.1,
     ]
     poses = [true[0], *(T @ exponential(start * rng.normal(size=tangent)) for T in true[1:])]
     roots = rng.normal(size=(len(source), tangent, tangent)) + 3 * np.eye(tangent)
-    return PoseGraph.create(
-        from_matrices(poses), Edges(source, target, from_matrices(measured), roots @ np.swapaxes(roots, 1, 2))
-    )
+    edges = Edges(source, target, from_matrices(measured), roots @ np.swapaxes(roots, 1, 2))
+    return PoseGraph.create(from_matrices(poses), edges)
 
 
 def from_matrices(matrices: list[np.ndarray]) -> np.ndarray:
@@ -128,11 +125,8 @@ def test_edge_a_billion_times_stiffer_than_the_others_costs_few_steps(tangent: i
     assert solved.iterations <= 15
     # An edge that is a hundred times stiffer again changes nothing.
     information[11] *= 100
-    np.testing.assert_allclose(
-        optimize_pose_graph(PoseGraph.create(graph.poses, graph.edges._replace(information=information))).chi2,
-        solved.chi2,
-        rtol=1e-4,
-    )
+    stiffer = PoseGraph.create(graph.poses, graph.edges._replace(information=information))
+    np.testing.assert_allclose(optimize_pose_graph(stiffer).chi2, solved.chi2, rtol=1e-4)
 
 
 @KINDS
@@ -182,9 +176,8 @@ def test_chordal_start_solves_a_graph_without_any_first_guess(tangent: int) -> N
 def test_kernel_lets_a_wrong_loop_go(tangent: int) -> None:
     graph = random_graph(4, tangent, noise=0.0, start=0.02)
     measurements = graph.edges.measurements.copy()
-    measurements[-1] = from_matrices(
-        [to_matrix(measurements[-1]) @ exponential(np.array([6.0, -5.0, *[0.5] * (tangent - 2)]))]
-    )[0]
+    wrong = exponential(np.array([6.0, -5.0, *[0.5] * (tangent - 2)]))
+    measurements[-1] = from_matrices([to_matrix(measurements[-1]) @ wrong])[0]
     torn = PoseGraph.create(graph.poses, graph.edges._replace(measurements=measurements))
     steps_count_more = np.repeat([30.0, 1.0], [7, 3])
     config = PoseGraphConfig(outlier_chi2=10.0, tolerance=1e-9)
@@ -222,9 +215,8 @@ def test_fixed_nodes_stay_and_the_others_move() -> None:
 
 def test_edges_without_information_leave_their_poses_finite() -> None:
     graph = random_graph(7, 3)
-    solved = optimize_pose_graph(
-        PoseGraph.create(graph.poses, graph.edges._replace(information=0 * graph.edges.information))
-    )
+    nothing = graph.edges._replace(information=0 * graph.edges.information)
+    solved = optimize_pose_graph(PoseGraph.create(graph.poses, nothing))
     assert solved.chi2 == 0.0
     np.testing.assert_array_equal(solved.graph.poses, graph.poses)
 

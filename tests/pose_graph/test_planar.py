@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -25,9 +23,8 @@ def test_sparse_step_is_that_of_the_dense_system(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count, num_edges = 7, 16
     source = np.append(np.arange(1, count), rng.integers(1, count, num_edges - count + 1))
-    target = np.append(
-        np.arange(count - 1), (source[count - 1 :] + rng.integers(1, count, num_edges - count + 1)) % count
-    )
+    others = (source[count - 1 :] + rng.integers(1, count, num_edges - count + 1)) % count
+    target = np.append(np.arange(count - 1), others)
     roots = rng.normal(size=(num_edges, 3, 3))
     edges = Edges(source, target, rng.normal(size=(num_edges, 3)), roots @ np.swapaxes(roots, 1, 2))
     residual = rng.normal(size=(num_edges, 3))
@@ -53,11 +50,7 @@ def test_a_torn_loop_is_recovered_although_a_fifth_of_the_loops_lie() -> None:
     source, target = np.repeat(np.arange(28, 40), 2), np.tile([0, 1], 12) + np.repeat(np.arange(0, 12), 2)
     loops = edges_of(true, source, target)
     is_wrong = np.arange(len(source)) % 5 == 0
-    lies = np.where(
-        is_wrong[:, None],
-        loops.measurements + rng.uniform(20, 40, (len(source), 3)) * [1, -1, 0.05],
-        loops.measurements,
-    )
+    lies = loops.measurements + is_wrong[:, None] * rng.uniform(20, 40, (len(source), 3)) * [1, -1, 0.05]
     steps = edges_of(true, np.arange(1, 40), np.arange(39))
     drifted = steps._replace(measurements=steps.measurements + np.array([0.0, 0.0, np.radians(1.0)]))
     start = se2.compose(true[:1], se2.chain(drifted.measurements))

@@ -1,7 +1,5 @@
 """The residuals against those of g2o and the matrix logarithm, in NumPy with 64 bits; nodes that edges leave free."""
 
-from __future__ import annotations
-
 import logging
 
 import jax
@@ -82,9 +80,7 @@ def without_information(graph: PoseGraph, edge: int, *axes: int) -> PoseGraph:
         (6, (1, 3), ("y", "rotation about x")),
     ],
 )
-def test_nodes_that_an_edge_leaves_free_are_named(
-    tangent: int, axes: tuple[int, ...], names: tuple[str, ...], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nodes_that_an_edge_leaves_free_are_named(tangent: int, axes: tuple[int, ...], names, caplog) -> None:
     graph = without_information(random_graph(0, tangent, noise=0.0, start=0.0), 4, *axes)
     with caplog.at_level(logging.WARNING, "dpmjax"):
         (free,) = optimize_pose_graph(graph).free_nodes

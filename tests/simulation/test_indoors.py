@@ -87,17 +87,3 @@ def test_a_carried_lidar_tilts_and_a_robot_does_not(building):
     positions = robot.T_world_lidar[:, :3, 3]
     np.testing.assert_allclose(positions[:, 2] - building.plan.floor_at(positions[:, 0]), 1.3)
     assert np.linalg.norm(np.diff(person.T_world_lidar[:, :2, 3], axis=0), axis=1).max() < 0.55
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: make_building(-1),
-        lambda: BuildingConfig("tent"),
-        lambda: BuildingConfig(route_length_m=0.0),
-        lambda: WalkConfig(rate_hz=0.0),
-    ],
-)
-def test_senseless_wishes_are_refused(make):
-    with pytest.raises(ValueError, match=r"must|expected"):
-        make()

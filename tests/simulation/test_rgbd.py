@@ -1,7 +1,5 @@
 """Laws of the depth camera, its apartments and the readers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -55,17 +53,9 @@ def test_walks_keep_to_the_grid_and_neighbours_differ_by_one_step():
     np.testing.assert_allclose(grid, np.round(grid), atol=1e-9)
     moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     turned = np.degrees(np.arccos(np.clip((np.einsum("nij,nij->n", T[:-1, :3, :3], T[1:, :3, :3]) - 1) / 2, -1, 1)))
-    for distance, angle in zip(moved, turned, strict=True):
-        assert (distance, angle) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-5)) or (distance, angle) == (
-            pytest.approx(0.0),
-            pytest.approx(30.0),
-        )
-
-
-def test_a_seed_gives_one_walk():
-    one, two, other = (simulation.simulate_depth_sequence(0, 8, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.points, two.points)
-    assert not np.array_equal(one.points, other.points)
+    is_turn = turned > 15.0
+    np.testing.assert_allclose(moved, np.where(is_turn, 0.0, 0.3), atol=1e-6)
+    np.testing.assert_allclose(turned, np.where(is_turn, 30.0, 0.0), atol=1e-5)
 
 
 def test_all_images_of_a_walk_see_the_same_walls():
@@ -104,18 +94,8 @@ def test_noise_and_missing_pixels_grow_with_the_square_of_the_depth():
         assert (~noisy.mask[among]).mean() == pytest.approx(expected, rel=0.2)
 
 
-@pytest.fixture
-def pose_folder(tmp_path):
-    return write_pose_folder(tmp_path)
-
-
-@pytest.fixture
-def scene(tmp_path):
-    return write_scene(tmp_path)
-
-
-def test_pose_folders_are_read_in_natural_order(pose_folder):
-    sequence = io.read_pose_folder(pose_folder, height=6, width=8)
+def test_pose_folders_are_read_in_natural_order(tmp_path):
+    sequence = io.read_pose_folder(write_pose_folder(tmp_path), height=6, width=8)
     np.testing.assert_array_equal(sequence.T_world_camera[:, 0, 3], [2, 10])
     assert not sequence.is_planar
     assert not sequence.mask[:, 0, :2].any()
@@ -124,50 +104,44 @@ def test_pose_folders_are_read_in_natural_order(pose_folder):
     np.testing.assert_allclose([x, y, z], [3.5 / 6.0, 2.5 / 6.5, 1.0], **ROUNDING)
 
 
+INTRINSICS, POSE = "camera-intrinsics.txt", "frame-10.pose.txt"
+
+
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("name", "content", "message"),
     [
-        (lambda path: (path / "frame-2.pose.txt").unlink(), "no frame-2.pose.txt"),
-        (lambda path: (path / "camera-intrinsics.txt").unlink(), "intrinsics"),
-        (lambda path: (path / "frame-2.depth.png").write_bytes(b"no picture"), "not a readable PNG"),
-        (lambda path: (path / "frame-2.depth.png").unlink(), "at least two"),
-        (lambda path: (path / "frame-2.pose.txt").write_text("1 2 3"), "a matrix of"),
-        (
-            lambda path: (path / "camera-intrinsics.txt").write_text("6 0 3.5\n0 -6.5 2.5\n0 0 1"),
-            "focal lengths above 0",
-        ),
-        (
-            lambda path: (path / "camera-intrinsics.txt").write_text("6 0 0\n0 6 0\n3 2 1"),
-            "axis at column 0, row 0, beside",
-        ),
-        (
-            lambda path: (path / "camera-intrinsics.txt").write_text("12 0 7\n0 13 5\n0 0 1"),
-            "beside the images of 8 x 6",
-        ),
-        (
-            lambda path: np.savetxt(path / "frame-10.pose.txt", np.zeros((4, 4))),
-            "frame-10.pose.txt: pose 0 is no rigid",
-        ),
-        (lambda path: np.savetxt(path / "frame-10.pose.txt", np.diag([2, 2, 2, 1])), "no rigid motion"),
+        (POSE, None, f"no {POSE}"),
+        (INTRINSICS, None, "intrinsics"),
+        ("frame-2.depth.png", "no picture", "not a readable PNG"),
+        ("frame-2.depth.png", None, "at least two"),
+        (POSE, "1 2 3", "a matrix of"),
+        (INTRINSICS, "6 0 3.5\n0 -6.5 2.5\n0 0 1", "focal lengths above 0"),
+        (INTRINSICS, "6 0 0\n0 6 0\n3 2 1", "axis at column 0, row 0, beside"),
+        (INTRINSICS, "12 0 7\n0 13 5\n0 0 1", "beside the images of 8 x 6"),
+        (POSE, "0 0 0 0\n" * 4, f"{POSE}: pose 0 is no rigid"),
+        (POSE, "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n", "no rigid motion"),
     ],
 )
-def test_damaged_pose_folders_are_told_in_one_line(pose_folder, spoil, message):
-    spoil(pose_folder)
+def test_damaged_pose_folders_are_told_in_one_line(tmp_path, name, content, message):
+    path = write_pose_folder(tmp_path) / name
+    path.unlink() if content is None else path.write_text(content)
     with pytest.raises(InputError, match=message) as caught:
-        io.read_pose_folder(pose_folder, height=6, width=8)
+        io.read_pose_folder(tmp_path, height=6, width=8)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("scale", [0, 3, 10])
-def test_depth_of_another_unit_is_refused_where_an_image_is_empty(pose_folder, scale):
+def test_depth_of_another_unit_is_refused_where_an_image_is_empty(tmp_path, scale):
     """Images of 1 and 5 m."""
+    write_pose_folder(tmp_path)
     for index in (2, 10):
-        write_png(pose_folder / f"frame-{index}.depth.png", np.full((6, 8), 500 * index * scale))
+        write_png(tmp_path / f"frame-{index}.depth.png", np.full((6, 8), 500 * index * scale))
     with pytest.raises(InputError, match=f"median depth is {3 * scale} m, .* give millimetres"):
-        io.read_pose_folder(pose_folder, height=6, width=8)
+        io.read_pose_folder(tmp_path, height=6, width=8)
 
 
-def test_active_vision_scenes_are_walked_along_their_links(scene):
+def test_active_vision_scenes_are_walked_along_their_links(tmp_path):
+    scene = write_scene(tmp_path)
     sequence = io.read_active_vision(scene, 8, seed=3, height=6, width=8)
     assert sequence.is_planar
     assert len(sequence) == 8
@@ -191,18 +165,8 @@ def test_active_vision_scenes_are_walked_along_their_links(scene):
         ("cameras.txt", "# nothing\n", "no camera"),
     ],
 )
-def test_damaged_scenes_are_told_in_one_line(scene, name, content, message):
+def test_damaged_scenes_are_told_in_one_line(tmp_path, name, content, message):
+    scene = write_scene(tmp_path)
     (scene / name).write_text(content)
     with pytest.raises(InputError, match=message):
         io.read_active_vision(scene, 8, height=6, width=8)
-
-
-def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="num_views"):
-        simulation.simulate_depth_sequence(0, 1)
-    with pytest.raises(ValueError, match="seed"):
-        simulation.make_apartment(-1)
-    with pytest.raises(ValueError, match="dropout_share"):
-        simulation.DepthWalkConfig(dropout_share=2.0)
-    with pytest.raises(ValueError, match="min_spread_m: no walk of 2 views"):
-        simulation.simulate_depth_sequence(0, 2, config=simulation.DepthWalkConfig(min_spread_m=2.0))

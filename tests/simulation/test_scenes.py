@@ -10,13 +10,20 @@ import pytest
 from dpmjax.simulation import (
     TRAINING_MIXTURE,
     BuildingConfig,
+    DepthWalkConfig,
+    DriveConfig,
     LidarSensor,
     SceneMixture,
     TownConfig,
+    WalkConfig,
     draw_scene,
+    make_apartment,
+    make_building,
     make_town,
+    make_world,
+    simulate_depth_sequence,
     simulate_scene,
-)
+)  # fmt: skip
 from dpmjax.simulation.town.cast import cast_turn, near_world
 from dpmjax.simulation.town.kinds import KINDS
 from dpmjax.simulation.town.primitives import SOFT, SOLID, pack_bodies
@@ -97,7 +104,6 @@ def test_nothing_solid_stands_in_the_lane_of_any_kind(kind):
 
 
 def soft_town(rows):
-    """An empty town with boxes only."""
     town = make_town(0, TownConfig(route_length_m=100)).primitives
     empty = [bodies._replace(mask=jnp.zeros_like(bodies.mask)) for bodies in town[:3]]
     traffic = town.traffic._replace(mask=jnp.zeros_like(town.traffic.mask))
@@ -155,11 +161,28 @@ def test_a_moving_lidar_sees_the_same_walls_from_where_its_beam_left():
         lambda: SceneMixture(kinds=(("moon", 1.0),)),
         lambda: SceneMixture(kinds=(("wood", 0.0),)),
         lambda: SceneMixture(length_m=0.0),
-        lambda: SceneMixture(indoor_scale=(2.0, 1.0)),
-        lambda: SceneMixture(indoor_scale=(0.0, 1.0)),
+        *(lambda low=low: SceneMixture(indoor_scale=(low, 1.0)) for low in (2.0, 0.0)),
+        lambda: BuildingConfig("tent"),
+        lambda: BuildingConfig(route_length_m=0.0),
+        lambda: make_building(-1),
+        lambda: WalkConfig(rate_hz=0.0),
         lambda: TownConfig(kind="moon"),
+        lambda: TownConfig(route="spiral"),
+        lambda: TownConfig(route_length_m=0),
+        lambda: LidarSensor("none", (), 100),
+        lambda: LidarSensor("near", (0.0,), 100, min_range_m=5, max_range_m=4),
+        *(lambda bad=bad: DriveConfig(**bad) for bad in ({"speed_m_s": 0}, {"max_turn_deg_s": 0}, {"rate_hz": np.nan})),
+        lambda: make_town(-1),
+        lambda: make_town(0, trajectory=np.zeros((5, 3))),
+        lambda: make_town(0, trajectory=np.tile(np.eye(4), (5, 1, 1))),
+        lambda: make_town(0, trajectory=np.linspace(np.eye(4), np.eye(4) + 458e3 * np.eye(4, k=3), 30)),
+        lambda: simulate_depth_sequence(0, 1),
+        lambda: simulate_depth_sequence(0, 2, config=DepthWalkConfig(min_spread_m=2.0)),
+        lambda: make_apartment(-1),
+        lambda: DepthWalkConfig(dropout_share=2.0),
+        *(lambda bad=bad: make_world(bad) for bad in (-1, "forest", "grove-", "grove--1", "grove-1x", "")),
     ],
 )
 def test_senseless_wishes_are_refused(make):
-    with pytest.raises(ValueError, match=r"must|expected"):
+    with pytest.raises(ValueError, match=r"must|needs|expected|no walk of 2 views"):
         make()

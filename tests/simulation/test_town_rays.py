@@ -4,22 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dpmjax.simulation import LidarSensor
+from dpmjax.simulation.town import primitives
 from dpmjax.simulation.town.cast import cast_turn, near_world
 from dpmjax.simulation.town.intersect import cross_box, cross_cylinder, cross_ground, cross_spheroid, ground_height
-from dpmjax.simulation.town.primitives import (
-    GROUND,
-    NOTHING,
-    POLE,
-    SOFT,
-    SOLID,
-    Bodies,
-    Ground,
-    RoadUsers,
-    TownPrimitives,
-    pack_bodies,
-)
 from dpmjax.simulation.town.scan import make_rays
 from tests.tolerances import ACCUMULATED
 
@@ -78,7 +68,9 @@ def ground_oracle(heights, origin, cell, start, ray, max_range):
 def hull(centre, half_size, heading):
     shape = [np.atleast_2d(np.asarray(x, np.float32)) for x in (centre, half_size, heading)]
     zero = jnp.zeros(len(shape[0]))
-    return Bodies(*map(jnp.asarray, shape), zero, zero, jnp.full(len(zero), SOLID), jnp.ones(len(zero), bool))
+    return primitives.Bodies(
+        *map(jnp.asarray, shape), zero, zero, jnp.full(len(zero), primitives.SOLID), jnp.ones(len(zero), bool)
+    )
 
 
 def first_hit(crossing):
@@ -125,9 +117,13 @@ def land():
     return heights, np.array([-40.0, -35.0])
 
 
+def ground_of(heights, origin):
+    return primitives.Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
+
+
 def test_ground_is_met_where_a_ray_first_goes_below_it(land):
     heights, origin = land
-    ground = Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0))
+    ground = ground_of(heights, origin)
     rays = directions(np.random.default_rng(5), 150)
     start = np.array([1.0, 2.0, float(ground_height(ground, jnp.array([1.0, 2.0]))) + 1.73])
     found = cross_ground(ground, jnp.asarray(start, jnp.float32), jnp.asarray(rays, jnp.float32)[:, None], 40.0)[:, 0]
@@ -147,29 +143,17 @@ def small_town(land, rng):
     thickness = rng.uniform(0.05, 0.4, len(place))
     poles = np.column_stack([place + np.array([3, -2, 0]), thickness, thickness, sizes[:, 2] + 1, zero])
     tufts = np.column_stack([place + np.array([-2, 3, 1]), sizes[:, [0, 0, 1]] * 0.5, zero])
-    traffic = RoadUsers(
-        lane_points=jnp.zeros((2, 64, 3)),
-        lane_lengths=jnp.ones(2),
-        lanes=jnp.zeros(4, jnp.int32),
-        starts=jnp.zeros(4),
-        speeds=jnp.zeros(4),
-        sides=jnp.zeros(4),
-        half_sizes=jnp.ones((4, 3)),
-        mask=jnp.zeros(4, bool),
+    lanes = jnp.zeros((2, 64, 3)), jnp.ones(2), jnp.zeros(4, jnp.int32)
+    traffic = primitives.RoadUsers(*lanes, *[jnp.zeros(4)] * 3, half_sizes=jnp.ones((4, 3)), mask=jnp.zeros(4, bool))
+    bodies = (
+        primitives.pack_bodies(boxes, primitives.SOLID),
+        primitives.pack_bodies(poles, primitives.POLE),
+        primitives.pack_bodies(tufts, primitives.SOFT),
     )
-    town = TownPrimitives(
-        pack_bodies(boxes, SOLID),
-        pack_bodies(poles, POLE),
-        pack_bodies(tufts, SOFT),
-        Ground(jnp.asarray(heights, jnp.float32), jnp.asarray(origin, jnp.float32), jnp.float32(1.0)),
-        traffic,
-    )
-    return town, boxes, poles, tufts
+    return primitives.TownPrimitives(*bodies, ground_of(heights, origin), traffic), boxes, poles, tufts
 
 
 def tilted_pose():
-    from scipy.spatial.transform import Rotation
-
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.06, -0.05]).as_matrix()
     pose[:3, 3] = [0.5, -0.3, 2.2]
@@ -178,7 +162,6 @@ def tilted_pose():
 
 @pytest.fixture(scope="module")
 def turn(land):
-    """A small town and what a turn of the sensor meets there."""
     town, *tables = small_town(land, np.random.default_rng(11))
     rays = make_rays(SENSOR, jnp.float32(0.01), jnp.zeros(6))
 
@@ -202,33 +185,32 @@ def test_a_turn_meets_the_nearest_of_all_bodies(turn, land):
     wanted, kinds = [], []
     for ray in world:
         options = {
-            SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
-            POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[5]) for p in poles),
-            SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[5]) for s in tufts),
-            GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
+            primitives.SOLID: min(box_oracle(ray, b[:3] - start, b[3:6], b[6]) for b in boxes),
+            primitives.POLE: min(cylinder_oracle(ray, p[:3] - start, p[3], p[5]) for p in poles),
+            primitives.SOFT: min(spheroid_oracle(ray, s[:3] - start, s[3], s[5]) for s in tufts),
+            primitives.GROUND: ground_oracle(land[0], land[1], 1.0, start, ray, SENSOR.max_range_m),
         }
         kind = min(options, key=options.get)
         wanted.append(min(options[kind], np.inf) if options[kind] <= SENSOR.max_range_m else np.inf)
-        kinds.append(kind if np.isfinite(wanted[-1]) else NOTHING)
+        kinds.append(kind if np.isfinite(wanted[-1]) else primitives.NOTHING)
     wanted, kinds = np.array(wanted), np.array(kinds)
     same = np.isclose(found, wanted, rtol=0, atol=0.03)
     assert same.mean() > 0.985
     assert (surfaces == kinds)[same].mean() > 0.98
-    assert {SOLID, POLE, SOFT, GROUND} <= set(surfaces.tolist())
+    assert {primitives.SOLID, primitives.POLE, primitives.SOFT, primitives.GROUND} <= set(surfaces.tolist())
 
 
 @pytest.mark.slow
 def test_padding_takes_no_part(turn):
     look, town, _, _ = turn
     pose = jnp.asarray(tilted_pose(), jnp.float32)
-    garbage = jax.tree.map(lambda x: x, town)
     full = np.asarray(town.boxes.mask)
     centres = np.asarray(town.boxes.centres).copy()
     centres[~full] = pose[:3, 3] + np.array([3.0, 0, 0], np.float32)
     sizes = np.asarray(town.boxes.half_sizes).copy()
     sizes[~full] = 2.0
     boxes = town.boxes._replace(centres=jnp.asarray(centres), half_sizes=jnp.asarray(sizes))
-    garbage = garbage._replace(boxes=boxes)
+    garbage = town._replace(boxes=boxes)
     np.testing.assert_array_equal(look(town, pose).ranges, look(garbage, pose).ranges)
 
 
@@ -239,7 +221,7 @@ def test_windows_lie_behind_their_wall(turn):
     depth = 0.3
     boxes = town.boxes._replace(window_depth=jnp.full_like(town.boxes.window_depth, depth))
     fronts = look(town._replace(boxes=boxes), pose)
-    is_wall = np.asarray(walls.surfaces) == SOLID
+    is_wall = np.asarray(walls.surfaces) == primitives.SOLID
     deeper = np.asarray(fronts.ranges)[is_wall] - np.asarray(walls.ranges)[is_wall]
     cosines = np.asarray(walls.cosines)[is_wall]
     assert (deeper >= 0).all()

@@ -38,14 +38,7 @@ def test_a_name_is_a_kind_with_a_seed():
     assert (world("grove").is_obstacle != world("grove-4").is_obstacle).mean() > 0.02
 
 
-@pytest.mark.parametrize("bad", [-1, "forest", "grove-", "grove--1", "grove-1x", ""])
-def test_what_is_no_world_is_refused(bad):
-    with pytest.raises(ValueError, match=r"index|world: expected"):
-        make_world(bad)
-
-
 def longest_straight_edge(grid):
-    """Pixels of the longest edge along a row or a column."""
     edges = [grid[1:] != grid[:-1], (grid[:, 1:] != grid[:, :-1]).T]
     starts = [np.flatnonzero(np.diff(np.pad(line, 1).astype(int))) for edge in edges for line in edge]
     return max((int((run[1::2] - run[::2]).max()) for run in starts if len(run)), default=0)
@@ -88,13 +81,6 @@ def test_walk_explores_and_comes_back(index):
     assert np.mean(seen_again) > 0.05
 
 
-def test_walk_is_a_function_of_the_generator():
-    a, b, c = (simulate_trajectory(world(0), 40, rng=np.random.default_rng(s)) for s in (1, 1, 2))
-    np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(a, c)
-    assert simulate_trajectory(world(0), 1, rng=np.random.default_rng(0)).shape == (1, 3)
-
-
 def test_world_too_narrow_is_refused():
     grid = np.ones((100, 100), bool)
     grid[50:60, 10:90] = False
@@ -111,10 +97,8 @@ def test_odometry_without_errors_is_the_walk_seen_from_its_first_pose():
     assert 0.01 < np.linalg.norm(drifting[-1, :2] - odometry[-1, :2]) < 100
 
 
-def test_sequence_is_deterministic_and_its_walk_knows_nothing_of_noise():
-    clean, again = simulate_sequence(0, 6, seed=3), simulate_sequence(0, 6, seed=3)
-    noisy = simulate_sequence(0, 6, seed=3, range_noise_px=1.0, with_odometry=True)
-    np.testing.assert_array_equal(clean.points, again.points)
+def test_the_walk_of_a_sequence_knows_nothing_of_noise():
+    clean, noisy = (simulate_sequence(0, 6, seed=3, range_noise_px=x, with_odometry=x > 0) for x in (0.0, 1.0))
     np.testing.assert_array_equal(clean.reference_poses, noisy.reference_poses)
     assert not np.array_equal(clean.points, noisy.points)
     assert clean.points.shape == (6, 256, 2)

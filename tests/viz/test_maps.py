@@ -1,7 +1,5 @@
 """Pictures of SLAM, of registered scans and of pairs show all of their data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,13 +14,11 @@ from tests.viz.test_figures import as_bytes, circle, colors_of, labels
 
 
 def line_of(axes, color: str, num: int) -> np.ndarray:
-    """Returns the positions of the line of this colour and length."""
     (line,) = (line for line in axes.lines if line.get_color() == color and len(line.get_xydata()) == num)
     return line.get_xydata()
 
 
 def room(num_scans: int = 6, num_beams: int = 40):
-    """Returns scans of walls, their poses and the walls in the world."""
     rng = np.random.default_rng(3)
     poses = np.stack([np.linspace(10, 60, num_scans), 20 + np.sin(np.arange(num_scans)), np.arange(num_scans) / 5], 1)
     walls = np.stack([rng.uniform(0, 80, (num_scans, num_beams)), rng.choice([0.0, 50.0], (num_scans, num_beams))], -1)

@@ -1,7 +1,5 @@
 """State dictionaries of the published layout, made up at any size, and files of them as PyTorch writes them."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import zipfile
@@ -45,15 +43,13 @@ def write_checkpoint(path: Path, tensors: dict[str, Tensors], config: ModelConfi
         content = pickle.EMPTY_DICT + pickle.MARK + content + pickle.SETITEMS
         file.writestr("archive/data.pkl", pickle.PROTO + b"\x02" + content + pickle.STOP)
     stages = config.pyramid.stages
-    settings = {
-        "encoder": {
-            "npoint": [stage.num_points for stage in stages],
-            "radius_list": [stage.radii for stage in stages],
-            "nsample_list": [[stage.num_neighbours] * len(stage.radii) for stage in stages],
-            "upsample_layers": config.pyramid.num_interpolations,
-        },
-        "coordinate_scale": config.scale_m,
+    encoder = {
+        "npoint": [stage.num_points for stage in stages],
+        "radius_list": [stage.radii for stage in stages],
+        "nsample_list": [[stage.num_neighbours] * len(stage.radii) for stage in stages],
+        "upsample_layers": config.pyramid.num_interpolations,
     }
+    settings = {"encoder": encoder, "coordinate_scale": config.scale_m}
     path.with_name("config.json").write_text(json.dumps(settings))
     return settings
 
@@ -116,9 +112,8 @@ def _decoder_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
             shapes |= _norm(f"{name}.norm{number}", width)
     for name, num in (("similarity_head", width), ("coarse_pairing_head", narrow), ("loop_head.mlp", width)):
         shapes |= _linear(f"{name}.0", num, num, 1) | _linear(f"{name}.2", num, num, 1)
-    shapes |= _linear("loop_head.projection.0", 2 * width, 2 * width, 0) | _linear(
-        "loop_head.projection.2", 2 * width, 1, 0
-    )
+    shapes |= _linear("loop_head.projection.0", 2 * width, 2 * width, 0)
+    shapes |= _linear("loop_head.projection.2", 2 * width, 1, 0)
     for number, (num_in, num_out) in enumerate(((2 * width, width), (width, width // 2), (width // 2, width // 4))):
         shapes |= _linear(f"offset_head.mlp.{2 * number}", num_in, num_out, 1)
     shapes |= _linear("offset_head.downsample", 2 * width, width // 4, 1)

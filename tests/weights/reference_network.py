@@ -4,8 +4,6 @@ It reads tensors by the names of the published checkpoints, and is written from 
 published configuration. Points are rows, channels columns. Nothing of the library is used.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

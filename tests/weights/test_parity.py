@@ -5,8 +5,6 @@ compares the reference itself with numbers of the published program; they lie ou
 `$DPMJAX_PARITY` names their folder.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The shipped weights: they load by name, are small, and register simulated scans that they have never seen."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Evaluation of registrations: each row has the descriptors of its scan."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """Refinement of labels: poses that are off become right, and what cannot be aligned keeps its pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,53 +10,35 @@ from dpmjax.deeppointmap.training.label_refinement import aligned_motion
 from dpmjax.geometry import rigid
 from dpmjax.sequences import LidarSequence
 from tests.deeppointmap import toy
-
-
-def room(rng: np.random.Generator, num: int = 3000) -> np.ndarray:
-    """Points on the floor, the ceiling and the walls of a room of 40 x 30 x 8 m."""
-    size = np.array([40.0, 30.0, 8.0])
-    points = rng.uniform(-0.5, 0.5, (num, 3)) * size
-    axis, side = rng.integers(3, size=num), rng.choice([-0.5, 0.5], num)
-    points[np.arange(num), axis] = side * size[axis]
-    return points
-
-
-def motion(shift: tuple[float, float, float], yaw: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:3, 3] = shift
-    return T
+from tests.deeppointmap.test_compact import room
+from tests.scans.surface_scenes import motion, seen_from
 
 
 @pytest.mark.parametrize("shift", [(0.3, -0.2, 0.1), (-0.4, 0.1, -0.1)])
 def test_a_motion_that_is_decimetres_off_becomes_right_to_centimetres(shift) -> None:
-    rng = np.random.default_rng(0)
-    T_true = motion((3.0, 1.0, 0.0), 0.3)
-    target, source = room(rng), (room(rng) - T_true[:3, 3]) @ T_true[:3, :3]
-    refined = aligned_motion(target, source, T_true @ motion(shift, 0.02))
+    T_true = motion(17.0, (3.0, 1.0, 0.0))
+    target, source = room(3000, 0), seen_from(room(3000, 1), T_true)
+    refined = aligned_motion(target, source, T_true @ motion(1.1, shift))
     assert np.linalg.norm((rigid.inverse(T_true) @ refined)[:3, 3]) < 0.03
     np.testing.assert_allclose(refined[:3, :3], T_true[:3, :3], atol=2e-3)
 
 
 @pytest.mark.parametrize("num", [0, 1, 500])
 def test_scans_that_share_nothing_keep_the_given_motion(num: int) -> None:
-    rng = np.random.default_rng(1)
-    given = motion((1.0, 0.0, 0.0), 0.1)
-    other = rng.uniform(100, 150, (num, 3))
-    np.testing.assert_array_equal(aligned_motion(room(rng), other, given), given)
-    np.testing.assert_array_equal(aligned_motion(other, room(rng), given), given)
+    given, other = motion(6.0, (1.0, 0.0, 0.0)), np.random.default_rng(1).uniform(100, 150, (num, 3))
+    np.testing.assert_array_equal(aligned_motion(room(3000), other, given), given)
+    np.testing.assert_array_equal(aligned_motion(other, room(3000), given), given)
 
 
 @pytest.mark.slow
 def test_samples_of_a_drive_with_wrong_poses_have_better_labels() -> None:
     """The second map is the frame: motions between the maps, and the scans within each, are nearer to the truth."""
     rng = np.random.default_rng(3)
-    world = room(rng, 12_000)
+    world = room(12_000)
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[:, 0, 3] = 1.5 * np.arange(8) - 6
-    true = LidarSequence(
-        "room", tuple("abcdefgh"), lambda index: (world - poses[index, :3, 3]).astype(np.float32), poses
-    )
+    scan = lambda index: (world - poses[index, :3, 3]).astype(np.float32)  # noqa: E731
+    true = LidarSequence("room", tuple("abcdefgh"), scan, poses)
     wrong = np.array(poses)
     wrong[:, :3, 3] += rng.normal(0, 0.15, (8, 3))
     config = replace(toy.TRAINING, model=replace(toy.MODEL, preprocess=replace(toy.MODEL.preprocess, capacity=8192)))

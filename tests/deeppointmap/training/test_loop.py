@@ -1,7 +1,5 @@
 """`dpmjax.train`: drives in, a model out; a continued training; input that cannot be trained on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -33,9 +31,8 @@ def test_three_steps_train_and_the_model_can_be_written_and_read(whole, tmp_path
     assert steps == [1, 2, 3]
     assert (num_steps(trained), trained.stopped_by) == (3, 0)
     start = begin_training(TRAINING).state.params
-    assert any(
-        np.any(a != b) for a, b in zip(jax.tree.leaves(trained.model.params), jax.tree.leaves(start), strict=True)
-    )
+    moved = jax.tree.map(lambda a, b: np.any(a != b), trained.model.params, start)
+    assert any(jax.tree.leaves(moved))
     dpmjax.save_model(trained.model, tmp_path / "model.safetensors")
     toy.assert_trees_equal(dpmjax.load_model(tmp_path / "model.safetensors").params, trained.model.params)
 
@@ -63,16 +60,17 @@ def test_training_runs_with_64_bits_and_keeps_parameters_float32(float64) -> Non
     assert any(np.any(a != b) for a, b in zip(params, start, strict=True))
 
 
-def test_the_best_model_is_that_of_the_best_score(whole) -> None:
-    scores, seen = iter([0.2, 0.9, 0.4]), []
+@pytest.mark.parametrize(("scores", "best"), [((0.2, 0.9, 0.4), 2), ((0.2, 0.9, 0.9), 3)])
+def test_the_best_model_is_the_last_one_of_the_best_score(scores, best: int) -> None:
+    left, seen = iter(scores), []
 
     def evaluate(model):
         seen.append(model)
-        return next(scores)
+        return next(left)
 
     trained = dpmjax.train([toy.drive()], TRAINING, hooks=TrainingHooks(evaluate=evaluate, evaluate_every=1))
-    assert int(trained.progress.best_step) == 2
-    toy.assert_trees_equal(trained.model.params, seen[1].params)
+    assert int(trained.progress.best_step) == best
+    toy.assert_trees_equal(trained.model.params, seen[best - 1].params)
 
 
 @pytest.mark.slow

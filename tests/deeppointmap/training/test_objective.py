@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -39,20 +37,6 @@ def sides(seed: int, mask_a=None, mask_b=None, poison: bool = False) -> tuple[Tr
         place, matched, coarse = (jnp.asarray(array) for array in arrays)
         result.append(TrainingSide(place, jnp.asarray(mask), matched, coarse, pairs, jnp.asarray(offsets)))
     return result[0], result[1]
-
-
-def test_close_pairs_are_all_pairs_within_the_radius() -> None:
-    a, b = positions(1)
-    of_a, of_b = jax.device_get(training_pairs(toy.cloud(a), toy.cloud(b), T_B_A, config=replace(CONFIG, max_close=50)))
-    in_a = np.asarray(rigid.transform_points(np.linalg.inv(T_B_A), b))
-    is_close = np.linalg.norm(a[:, None] - in_a, axis=-1) <= 2
-    np.testing.assert_array_equal(of_a.mask.sum(axis=1), is_close.sum(axis=1))
-    np.testing.assert_array_equal(of_b.mask.sum(axis=1), is_close.sum(axis=0))
-    # Moved by its offset, a descriptor lies on its partner.
-    landed = a[:, None] + of_a.offsets
-    np.testing.assert_allclose(landed[of_a.mask], in_a[of_a.indices][of_a.mask], atol=1e-4)
-    in_b = np.asarray(rigid.transform_points(T_B_A, a))
-    np.testing.assert_allclose((b[:, None] + of_b.offsets)[of_b.mask], in_b[of_b.indices][of_b.mask], atol=1e-4)
 
 
 @jax.jit
@@ -101,8 +85,3 @@ def test_without_weight_offsets_reach_neither_loss_nor_gradient() -> None:
     assert of_bare.offset == 0 < terms.offset
     gradient = jax.grad(lambda x: matching_loss(a.replace(offsets=x), b, T_B_A, config=bare)[0])(lost.offsets)
     assert not np.any(gradient)
-
-
-def test_a_negative_weight_is_refused(as_user) -> None:
-    with pytest.raises(ValueError, match="^offset_weight: expected"):
-        ObjectiveConfig(offset_weight=-1)

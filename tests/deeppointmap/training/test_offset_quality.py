@@ -1,7 +1,5 @@
 """Accuracy of predicted offsets in the frame of the wall, against NumPy."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The second stage: pairs and labels by true distances, a frozen network, exact resumption, and a head that learns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
@@ -113,9 +111,8 @@ def test_only_the_head_changes_and_a_stopped_stage_goes_on_exactly(model, config
         for name, value in model.params[part].items():
             if name != "overlap_head":
                 toy.assert_trees_equal(whole.params[part][name], value)
-    assert any(
-        np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (last.head, init_overlap(model).head)), strict=True)
-    )
+    moved = jax.tree.map(lambda a, b: np.any(a != b), last.head, init_overlap(model).head)
+    assert any(jax.tree.leaves(moved))
     calls = iter([0, 0, 1])
     first, state = train_overlap(store, model, config, hooks=OverlapHooks(stop=lambda: next(calls)))
     assert (int(state.step), first.config.trained) == (2, ("registration",))
@@ -138,9 +135,3 @@ def test_drives_that_teach_no_overlap_are_refused() -> None:
     config = replace(toy.TRAINING, stages=("registration", "overlap"))
     with pytest.raises(ValueError, match="^drives: all scans are less than 20 m apart.*leave the stage overlap out$"):
         dpmjax.train(toy.store(toy.drive(num_scans=4)), config)
-
-
-@pytest.mark.parametrize("settings", [{"num_epochs": 0}, {"rate_share": 0.0}])
-def test_settings_out_of_range_are_refused(settings) -> None:
-    with pytest.raises(ValueError, match=next(name for name in reversed(settings))):
-        OverlapConfig(**settings)

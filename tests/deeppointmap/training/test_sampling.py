@@ -1,13 +1,11 @@
 """Groups and pairs of scans: who may be in one, and how often."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import CurriculumStage, SamplingConfig, TrainingConfig, training_preset
+from dpmjax import deeppointmap as dpm
 from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.deeppointmap.training.sampling import Group, PlacedScans, ScanTable, arrange_groups, draw_groups
 
@@ -26,9 +24,9 @@ def placed(T_world_scan: np.ndarray) -> PlacedScans:
     return PlacedScans(T_world_scan, positions_world, np.ones((len(T_world_scan), 4), bool))
 
 
-def drawn_layouts(config: TrainingConfig, max_group: int, num: int = 4_000) -> list[Layout]:
+def drawn_layouts(config: dpm.TrainingConfig, max_group: int, num: int = 4_000) -> list[Layout]:
     """The layouts of the steps of one stage, as a training draws them."""
-    stage = replace(config, curriculum=(CurriculumStage(max_group, num),))
+    stage = replace(config, curriculum=(dpm.CurriculumStage(max_group, num),))
     return [stage.layout_at(step, seed=7) for step in range(num)]
 
 
@@ -37,7 +35,7 @@ def drawn_layouts(config: TrainingConfig, max_group: int, num: int = 4_000) -> l
 )
 def test_the_share_of_scan_pairs_and_the_mean_size_are_those_of_the_published_draw(preset: str, max_group: int) -> None:
     """Published: a pair with the probability 0.34, else a size from 2 to K. All groups of a step have one size."""
-    layouts = drawn_layouts(training_preset(preset), max_group)
+    layouts = drawn_layouts(dpm.training_preset(preset), max_group)
     is_pair = [(layout.num_source, layout.num_target) == (1, 1) for layout in layouts]
     assert abs(np.mean(is_pair) - (0.34 + 0.66 / (max_group - 1))) < 0.03
     sizes = np.array([layout.num_source + layout.num_target for layout in layouts])
@@ -48,7 +46,7 @@ def test_the_share_of_scan_pairs_and_the_mean_size_are_those_of_the_published_dr
 
 @pytest.mark.parametrize("max_group", [8, 32])
 def test_half_of_the_groups_that_fit_in_one_map_are_split_into_a_scan_and_a_map(max_group: int) -> None:
-    config = training_preset("paper")
+    config = dpm.training_preset("paper")
     layouts = [layout for layout in drawn_layouts(config, max_group) if 3 < sum(layout[:2]) <= config.sampling.max_side]
     # Half against all others; else uniform, of whose splits the first and the last are such groups, too.
     expected = np.mean([0.5 + 0.5 * 2 / (sum(layout[:2]) - 1) for layout in layouts])
@@ -59,7 +57,7 @@ def test_half_of_the_groups_that_fit_in_one_map_are_split_into_a_scan_and_a_map(
 @pytest.mark.parametrize("num_scans", [16, 32, 96])
 @pytest.mark.parametrize("max_group", [2, 4, 16])
 def test_a_step_is_full_and_its_capacity_holds_it(max_group: int, num_scans: int) -> None:
-    config = replace(training_preset("small"), sampling=SamplingConfig(num_scans))
+    config = replace(dpm.training_preset("small"), sampling=dpm.SamplingConfig(num_scans))
     capacities = set()
     for layout in drawn_layouts(config, max_group, 300):
         source, target, num_groups, total = layout
@@ -79,7 +77,7 @@ def test_a_step_is_full_and_its_capacity_holds_it(max_group: int, num_scans: int
 
 @pytest.mark.parametrize("layout", [Layout(1, 1, 16, 32), Layout(3, 5, 4, 32)])
 def test_groups_hold_scans_of_one_place(layout: Layout) -> None:
-    scans, config = table(), SamplingConfig()
+    scans, config = table(), dpm.SamplingConfig()
     for seed in range(20):
         groups = draw_groups(scans, 5, layout, config, np.random.default_rng(seed))
         assert len(groups) == layout.num_groups
@@ -93,7 +91,7 @@ def test_groups_hold_scans_of_one_place(layout: Layout) -> None:
 
 def test_groups_are_smaller_where_scans_are_rare() -> None:
     layout = Layout(3, 5, 1, 8)
-    (group,) = draw_groups(table(step_m=15.0), 4, layout, SamplingConfig(), np.random.default_rng(0))
+    (group,) = draw_groups(table(step_m=15.0), 4, layout, dpm.SamplingConfig(), np.random.default_rng(0))
     assert 4 in group.rows
     assert len(group.rows) <= 3
     assert len(group.target) >= 1
@@ -116,7 +114,7 @@ def test_groups_keep_their_true_motions_and_missing_ones_are_masked() -> None:
 def test_the_scan_nearest_to_the_other_map_stands_first() -> None:
     scans = table()
     for seed in range(10):
-        (group,) = draw_groups(scans, 20, Layout(2, 6, 1, 8), SamplingConfig(), np.random.default_rng(seed))
+        (group,) = draw_groups(scans, 20, Layout(2, 6, 1, 8), dpm.SamplingConfig(), np.random.default_rng(seed))
         x = scans.positions[:, 0]
         assert np.all(np.diff(np.abs(x[group.source] - x[group.target[0]])) >= 0)
         assert np.ptp(x[group.rows]) > np.abs(x[group.source[0]] - x[group.target[0]])
@@ -134,11 +132,11 @@ def test_a_map_describes_no_place_twice_but_for_the_paper(thins: bool, expected:
 
 def test_a_lonely_scan_has_no_group() -> None:
     with pytest.raises(ValueError, match="none in"):
-        draw_groups(table(step_m=100.0), 0, Layout(1, 1, 16, 32), SamplingConfig(), np.random.default_rng(0))
+        draw_groups(table(step_m=100.0), 0, Layout(1, 1, 16, 32), dpm.SamplingConfig(), np.random.default_rng(0))
 
 
 def test_stages_follow_each_other() -> None:
-    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(4, 2)))
+    config = dpm.TrainingConfig(curriculum=(dpm.CurriculumStage(2, 3), dpm.CurriculumStage(4, 2)))
     assert [config.stage_at(step).max_group for step in range(7)] == [2, 2, 2, 4, 4, 4, 4]
     assert config.with_steps(60).num_steps == 60
     assert config.with_steps(1).num_steps == 2
@@ -147,15 +145,20 @@ def test_stages_follow_each_other() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: CurriculumStage(1, 3), "max_group"),
-        (lambda: SamplingConfig(max_distance_m=0.2), "max_distance_m"),
-        (lambda: TrainingConfig(sampling=SamplingConfig(num_scans=16)), "num_scans"),
-        (lambda: TrainingConfig(sampling=SamplingConfig(max_side=8)), "max_side"),
-        (lambda: TrainingConfig(learning_rate=0.0), "learning_rate"),
-        (lambda: TrainingConfig(max_gradient_norm=0.0), "max_gradient_norm"),
-        (lambda: TrainingConfig(num_epochs=0.0), "num_epochs"),
-        (lambda: TrainingConfig(initialization="zero"), "initialization"),
+        (lambda: dpm.CurriculumStage(1, 3), "max_group"),
+        (lambda: dpm.SamplingConfig(max_distance_m=0.2), "max_distance_m"),
+        (lambda: dpm.TrainingConfig(sampling=dpm.SamplingConfig(num_scans=16)), "num_scans"),
+        (lambda: dpm.TrainingConfig(sampling=dpm.SamplingConfig(max_side=8)), "max_side"),
+        (lambda: dpm.TrainingConfig(learning_rate=0.0), "learning_rate"),
+        (lambda: dpm.TrainingConfig(max_gradient_norm=0.0), "max_gradient_norm"),
+        (lambda: dpm.TrainingConfig(num_epochs=0.0), "num_epochs"),
+        (lambda: dpm.TrainingConfig(initialization="zero"), "initialization"),
         (lambda: ScanTable(np.zeros((3, 4, 4)), np.zeros(2, int)), "T_world_lidar"),
+        (lambda: dpm.ObjectiveConfig(offset_weight=-1), "offset_weight"),
+        (lambda: dpm.OverlapConfig(num_epochs=0), "num_epochs"),
+        (lambda: dpm.OverlapConfig(rate_share=0.0), "rate_share"),
+        (lambda: dpm.MatchConfig(pair_ratio=5.0), "pair_ratio"),
+        (lambda: dpm.VerificationConfig(num_samples=0), "num_samples"),
     ],
 )
 def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
@@ -164,14 +167,14 @@ def test_what_makes_no_sense_is_refused(as_user, make, message: str) -> None:
 
 
 def test_the_layout_of_a_step_depends_on_the_seed_and_its_stage_alone() -> None:
-    config = TrainingConfig(curriculum=(CurriculumStage(2, 3), CurriculumStage(8, 40)))
+    config = dpm.TrainingConfig(curriculum=(dpm.CurriculumStage(2, 3), dpm.CurriculumStage(8, 40)))
     first, again, other = ([config.layout_at(step, seed=seed) for step in range(43)] for seed in (0, 0, 1))
     assert first == again != other
     assert first[:3] == [Layout(1, 1, 16, 32)] * 3
 
 
 def test_an_epoch_is_every_scan_once_as_anchor_by_all_devices_together() -> None:
-    paper = training_preset("paper")
+    paper = dpm.training_preset("paper")
     assert paper.num_epochs == 12
     steps = paper.for_scans(14_169)
     assert abs(steps.num_steps - 12 * 14_169) <= 5
@@ -186,7 +189,7 @@ def test_an_epoch_is_every_scan_once_as_anchor_by_all_devices_together() -> None
 
 def test_the_paper_preset_is_as_published() -> None:
     """The points of section 3.3 and of the published configuration that presets may differ in."""
-    paper = training_preset("paper")
+    paper = dpm.training_preset("paper")
     assert (paper.learning_rate, paper.final_learning_rate, paper.warmup_steps) == (1e-3, 1e-5, 0)
     assert [stage.max_group for stage in paper.curriculum] == [2, 4, 8, 16, 32]
     assert (paper.num_variants, paper.thins_as_in_use, paper.thins_maps) == (0, False, False)

@@ -1,52 +1,35 @@
 """The step of training: its changes, its invariants, the number of its compilations, and several devices."""
 
-from __future__ import annotations
-
 import functools
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from dpmjax.deeppointmap import (
-    CurriculumStage,
-    Model,
-    SampleMaker,
-    TrainingConfig,
-    finish,
-    init_training,
-    make_step,
-    training_preset,
-    without,
-)
+from dpmjax import deeppointmap as dpm
 from dpmjax.deeppointmap.model import predict_offsets
 from dpmjax.deeppointmap.training.curriculum import Layout, layout_capacity
 from dpmjax.deeppointmap.training.sampling import RegistrationSample
 from dpmjax.deeppointmap.training.step import WEIGHT_DECAY, TrainingState, _learning_rate, batch_loss
 from tests.deeppointmap import toy
+from tests.processes import run_python
 from tests.tolerances import ACCUMULATED
-
-REPOSITORY = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
-def maker() -> SampleMaker:
-    return SampleMaker(toy.store(), toy.TRAINING, seed=0)
+def maker() -> dpm.SampleMaker:
+    return dpm.SampleMaker(toy.store(), toy.TRAINING, seed=0)
 
 
 @pytest.fixture(scope="module")
 def step():
-    return make_step(toy.TRAINING)
+    return dpm.make_step(toy.TRAINING)
 
 
 @pytest.fixture(scope="module")
 def start() -> TrainingState:
-    return init_training(jax.random.key(0), toy.TRAINING)
+    return dpm.init_training(jax.random.key(0), toy.TRAINING)
 
 
 def capacity_of(step: int, seed: int) -> Layout:
@@ -71,13 +54,13 @@ def test_loss_falls_on_one_batch_and_all_parts_but_the_overlap_head_learn(maker,
 def test_without_the_offset_head_it_does_not_learn_and_a_pair_is_registered_by_positions(maker, start) -> None:
     decoder = replace(toy.MODEL.decoder, predicts_offsets=False)
     config = replace(toy.TRAINING, model=replace(toy.MODEL, decoder=decoder))
-    after, report = make_step(config)(start, maker(0))
+    after, report = dpm.make_step(config)(start, maker(0))
     assert report.terms.offset == 0
     head = (state.params["decoder"]["offset_head"] for state in (start, after))
     kept = 1 - float(report.learning_rate) * WEIGHT_DECAY  # AdamW's decay, no gradient
     for before, now in zip(*map(jax.tree.leaves, head), strict=True):
         np.testing.assert_allclose(now, kept * before, atol=1e-7)
-    model = Model(start.params, config.model)
+    model = dpm.Model(start.params, config.model)
     features = np.ones((5, 1, config.model.decoder.model_channels), np.float32)
     rows = np.zeros((5, 3), np.int32)
     assert not np.any(predict_offsets(model, features, features[:, 0], None, rows))
@@ -85,19 +68,19 @@ def test_without_the_offset_head_it_does_not_learn_and_a_pair_is_registered_by_p
 
 
 def test_parts_of_the_training_can_be_left_out() -> None:
-    config = training_preset("small")
-    assert without(config, "curriculum").curriculum == (CurriculumStage(16, config.num_steps),)
-    assert without(config, "coarse-loss").objective.coarse_weight == 0
-    bare = without(config, "occlusion").augment
+    config = dpm.training_preset("small")
+    assert dpm.without(config, "curriculum").curriculum == (dpm.CurriculumStage(16, config.num_steps),)
+    assert dpm.without(config, "coarse-loss").objective.coarse_weight == 0
+    bare = dpm.without(config, "occlusion").augment
     assert (bare.sector_probability, bare.box_probability, bare.max_drop_ratio) == (0, 0, 0.5)
-    paper = training_preset("paper")
+    paper = dpm.training_preset("paper")
     assert paper.model.decoder.predicts_offsets
-    assert not without(paper, "offset-head").model.decoder.predicts_offsets
+    assert not dpm.without(paper, "offset-head").model.decoder.predicts_offsets
 
 
 @pytest.mark.slow
 def test_a_step_compiles_once_for_each_capacity(maker, start, assert_compiles_nothing) -> None:
-    step, other = make_step(toy.TRAINING), SampleMaker(toy.store(), toy.TRAINING, seed=1)
+    step, other = dpm.make_step(toy.TRAINING), dpm.SampleMaker(toy.store(), toy.TRAINING, seed=1)
     state = start
     capacities = [[capacity_of(number, seed) for number in range(5)] for seed in (0, 1)]
     for number, capacity in enumerate(capacities[0]):
@@ -145,13 +128,13 @@ def test_a_batch_of_empty_scans_has_no_loss_and_a_finite_gradient(maker, step, s
 
 
 def test_a_sample_depends_on_seed_and_step_alone(maker) -> None:
-    fresh = SampleMaker(toy.store(), toy.TRAINING, seed=0)
+    fresh = dpm.SampleMaker(toy.store(), toy.TRAINING, seed=0)
     toy.assert_trees_equal(fresh(4), maker(4))
     assert np.any(fresh(4).scans.T_augmented_lidar[:, 0] != fresh(3).scans.T_augmented_lidar[:, 0])
 
 
 def test_devices_share_the_anchors_of_an_epoch(maker) -> None:
-    both = SampleMaker(toy.store(), toy.TRAINING, seed=0, numbers=(0, 1), num_in_step=2)
+    both = dpm.SampleMaker(toy.store(), toy.TRAINING, seed=0, numbers=(0, 1), num_in_step=2)
     toy.assert_trees_equal(jax.tree.map(lambda leaf: leaf[:1], both(0)), maker(0))
     num = len(toy.store().table)
     alone = [maker._anchor(step, 0) for step in range(num)]
@@ -160,36 +143,36 @@ def test_devices_share_the_anchors_of_an_epoch(maker) -> None:
 
 
 def test_the_learning_rate_is_a_cosine_over_the_whole_training(start) -> None:
-    config = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 100),), warmup_steps=4)
-    state = init_training(jax.random.key(0), config)
+    config = replace(toy.TRAINING, curriculum=(dpm.CurriculumStage(2, 100),), warmup_steps=4)
+    state = dpm.init_training(jax.random.key(0), config)
     found = [rate(state, step, config) for step in range(101)]
     cosine = 1e-5 + (1e-3 - 1e-5) * (1 + np.cos(np.pi * np.arange(101) / 100)) / 2
     np.testing.assert_allclose(found[4:], cosine[4:], rtol=1e-4)
     np.testing.assert_allclose(found[:4], cosine[:4] * np.arange(1, 5) / 4, rtol=1e-4)
     np.testing.assert_allclose([found[50], found[80]], [5.05e-4, 1.045e-4], rtol=1e-3)
-    assert training_preset("paper").warmup_steps == 0
+    assert dpm.training_preset("paper").warmup_steps == 0
 
 
 def test_a_training_that_finishes_early_passes_through_the_rest_of_the_cosine(start) -> None:
-    config = replace(toy.TRAINING, curriculum=(CurriculumStage(2, 100),), warmup_steps=0)
-    state = replace(init_training(jax.random.key(0), config), step=jax.numpy.asarray(40))
-    early = finish(state, 10)
+    config = replace(toy.TRAINING, curriculum=(dpm.CurriculumStage(2, 100),), warmup_steps=0)
+    state = replace(dpm.init_training(jax.random.key(0), config), step=jax.numpy.asarray(40))
+    early = dpm.finish(state, 10)
     assert (int(early.planned_at), int(early.end)) == (40, 50)
     np.testing.assert_allclose(rate(early, 40, config), rate(state, 40, config), rtol=1e-5)
     np.testing.assert_allclose(rate(early, 45, config), rate(state, 70, config), rtol=1e-4)
     np.testing.assert_allclose(rate(early, 50, config), 1e-5, rtol=1e-4)
-    again = finish(replace(early, step=jax.numpy.asarray(45)), 30)
+    again = dpm.finish(replace(early, step=jax.numpy.asarray(45)), 30)
     np.testing.assert_allclose(rate(again, 60, config), rate(state, 85, config), rtol=1e-4)
     with pytest.raises(ValueError, match="^num_steps: expected at least 1, got 0"):
-        finish(state, 0)
+        dpm.finish(state, 0)
 
 
-def rate(state: TrainingState, step: int, config: TrainingConfig) -> float:
+def rate(state: TrainingState, step: int, config: dpm.TrainingConfig) -> float:
     return float(_learning_rate(replace(state, step=jax.numpy.asarray(step)), config))
 
 
 def test_uniform_parameters_are_those_of_pytorchs_linear_layers() -> None:
-    params = init_training(jax.random.key(0), replace(toy.TRAINING, initialization="uniform")).params
+    params = dpm.init_training(jax.random.key(0), replace(toy.TRAINING, initialization="uniform")).params
     of_path = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree.leaves_with_path(params)}
     kernels = {path.removesuffix("['kernel']"): leaf for path, leaf in of_path.items() if path.endswith("['kernel']")}
     assert len(kernels) > 10
@@ -233,9 +216,5 @@ for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
 @pytest.mark.slow
 def test_eight_devices_find_the_gradient_of_one() -> None:
     flags = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)])
-    done = subprocess.run(
-        [sys.executable, "-c", EIGHT_DEVICES], cwd=REPOSITORY, env=environment, capture_output=True, text=True
-    )
+    done = run_python("-c", EIGHT_DEVICES, variables={"XLA_FLAGS": flags})
     assert done.returncode == 0, done.stderr
