@@ -38,11 +38,11 @@ _MIN_FITNESS, _MAX_CONTRADICTED = 0.5, 0.05
 # A robot stands still where it moves by less than this share of the least distance of registered scans.
 _STANDING = 0.02
 # Odometry that repeats its pose for this many steps may have failed; low rates repeat it for fewer. Number of scans of
-# such a run that are compared with its first one.
+# such a run that are compared.
 _LEAST_SILENT, _MAX_COMPARED = 3, 8
 # A beam has changed by more than these standard deviations of the noise, and this share of the typical range; the
 # robot has stood where a smaller share of the beams has changed, in most scans.
-_NOISE, _LEAST_CHANGE, _CHANGED_SHARE, _MOST = 6.0, 0.01, 0.01, 0.8
+_NOISE, _LEAST_CHANGE, _CHANGED_SHARE, _MOST = 6.0, 0.02, 0.015, 0.6
 
 
 class Recording(NamedTuple):
@@ -133,15 +133,14 @@ def find_silent_steps(scans: ScanSet, odometry: Floats) -> Booleans:
 
 
 def _has_stood(scans: PlanarScans) -> bool:
-    """Returns True if the scans fit the first one without a motion, and do not fit as well at another place."""
+    """Returns True if most scans fit the one before without a motion, and do not fit as well at another place."""
     ranges = np.linalg.norm(scans.points, axis=-1)
-    off = np.abs(ranges[1:] - ranges[0]) > max(_NOISE * scans.noise, _LEAST_CHANGE * scans.typical_range)
-    both = scans.mask[1:] & scans.mask[0]
+    off = np.abs(np.diff(ranges, axis=0)) > max(_NOISE * scans.noise, _LEAST_CHANGE * scans.typical_range)
+    both = scans.mask[1:] & scans.mask[:-1]
     changed = (off & both).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
     if np.quantile(changed, _MOST) < _CHANGED_SHARE:
         return True
-    others = np.arange(1, len(scans))
-    slides = slide_steps(scans, np.zeros((len(others), 3)), pairs=(others, np.zeros_like(others)))
+    slides = slide_steps(scans, np.zeros((len(scans) - 1, 3)))
     return bool(((slides.scores > WEAK_SCORE) & ~slides.is_torn & ~slides.is_open).mean() >= _MOST)
 
 
