@@ -63,10 +63,6 @@ SCANS_2D = Group("2-D scans", (
         "max_offset": ("scans", "higher if places are seen again soon; lower if neighbouring scans hardly overlap"),
         "scans_per_window": ("scans", "shorter windows if scans are far apart; None: one L-Net for the whole set"),
     }),
-    Section("RefinementConfig", "dpmjax.registration2d", "`refine(scans, poses, config)`", {
-        "radius": ("typical ranges", "how far apart neighbours in space may be"),
-        "loops": ("", "None: no search of loops"),
-    }),
 ))  # fmt: skip
 
 SCANS_3D = Group("3-D scans", (
@@ -91,14 +87,10 @@ SLAM = Group("SLAM", (
     Section("FrontEndConfig", "dpmjax.slam", "`SlamConfig(front_end=...)`", {
         "keyframe_share": ("share of the median range", "higher: fewer keyframes, smaller maps, fewer loops"),
         "max_keyframe_m": ("m", "longest way between two keyframes"),
-        "num_lost": ("scans", "after this number of rejected scans a new part of the map begins"),
     }),
     Section("LoopClosureConfig", "dpmjax.slam", "`SlamConfig(loops=...)`", {
         "is_on": ("", "False: odometry alone (`--no-loop`)"),
-        "num_similar": ("keyframes", "more candidates by appearance: more loops, slower"),
-        "min_overlap": ("probability", "lower for places that are seen from far apart; slower"),
         "min_probability": ("probability", "higher if wrong loops occur"),
-        "min_support": ("registrations", "1: a loop needs no second one; risky in places that look alike"),
     }),
     Section("DescriptorConfig", "dpmjax.slam", "`SlamConfig(method=\"descriptors\", descriptors=...)`", {
         "keyframe_m": ("m", "fewer keyframes; the paper has 10 for KITTI, 7 for KITTI-360, 3 for MulRan"),
@@ -107,9 +99,6 @@ SLAM = Group("SLAM", (
         "min_overlap": ("probability", "lower for more loops"),
     }),
     Section("LocalizationConfig", "dpmjax.slam", "`localize(model, slam_map, scan, config)`", {
-        "num_similar": ("keyframes", "more for large maps"),
-        "num_registered": ("keyframes", "more: more scans are found, slower"),
-        "min_support": ("registrations", "1 for maps with few keyframes; riskier"),
         "min_best": ("probability", "lower: more scans are found, at a higher risk"),
     }),
     Section("PoseGraphConfig", "dpmjax.pose_graph", "`optimize_pose_graph(graph, config)`", {

@@ -70,7 +70,7 @@ def align_incrementally(task: Task, metric: Literal["point", "plane"] = "plane")
 
 def search(task: Task) -> np.ndarray:
     """Returns poses by global registration, from nothing but the scans: no odometry, no first guess, no refinement."""
-    return registration2d.register_globally(task.planar).poses
+    return registration2d.register_globally(task.planar)
 
 
 def refine(task: Task, poses: np.ndarray) -> np.ndarray:

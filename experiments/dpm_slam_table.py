@@ -168,7 +168,7 @@ def map_by_agents(folder: Path, drive: LidarSequence, methods: slam.SlamMethods)
     T_world_scan, num_maps = np.concatenate(found.T_world_scan), max(found.component) + 1
     folder.mkdir(parents=True, exist_ok=True)
     for component in range(num_maps):
-        save_map(folder / f"map_{component + 1}.npz", slam.take_component(found.joined, component))
+        save_map(folder / f"map_{component + 1}.npz", found.joined.maps[component])
     cli.write_poses(folder, T_world_scan, frame="T_world_lidar")
     scans = np.concatenate([start + agent.keyframes for start, agent in zip(starts, found.agents, strict=False)])
     loops = found_loops(found.joined.loops, scans)

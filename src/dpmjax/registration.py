@@ -124,7 +124,8 @@ def register_scans(
     hooks = options.pop("hooks", None)
     with progress_bar("registration", is_shown=progress and hooks is None) as bar:
 
-        def show(share: float) -> None:
+        def show(stage: str, share: float) -> None:
+            bar.set_description(stage, refresh=False)
             bar.update(share - bar.n)
 
-        return registration2d.register_scans(*scans, hooks=hooks or RegistrationHooks(on_share=show), **options)
+        return registration2d.register_scans(*scans, hooks=hooks or RegistrationHooks(show), **options)

@@ -9,7 +9,7 @@ import pytest
 import dpmjax
 from dpmjax.cli.program import main
 from dpmjax.cli.run import EXIT_BAD_INPUT, EXIT_OK, load_json
-from dpmjax.slam import JoinedMaps, MergedMaps
+from dpmjax.slam import MergedMaps, take_keyframes
 from dpmjax.slam.keyframe_map import MapEdge
 from dpmjax.slam.loops import Loop
 from tests.deeppointmap import toy
@@ -36,15 +36,15 @@ def run(*arguments) -> int:
 def joined_by_a_loop(model, *maps, on_keyframe=None) -> MergedMaps:
     """The first two maps meet at their first keyframes; a third one meets nobody."""
     starts = np.cumsum([0, *map(len, maps)])
-    everything = dpmjax.merge_maps(model, *maps).joined.slam_map
+    everything = dpmjax.merge_maps(model, *maps).slam_map
     loop = Loop(int(starts[1]), 0, "retrieval", "accepted", 0.9, 0.95, 0.03, np.eye(4), np.eye(6))
     rejected = loop._replace(source=int(starts[1]) + 1, status="improbable", T_target_source=None, information=None)
     edge = MapEdge(loop.source, loop.target, np.eye(4), np.eye(6), "loop")
     everything = replace(everything, edges=(*everything.edges, edge))
     component = (0, 0, *range(1, len(maps) - 1))
-    joined = JoinedMaps(everything, np.repeat(np.arange(len(maps)), [len(each) for each in maps]), component, ())
-    parts = (dpmjax.slam.take_component(joined, 0), *maps[2:])
-    return MergedMaps(parts, joined._replace(loops=(loop, rejected)))
+    parts = (take_keyframes(everything, range(starts[2])), *maps[2:])
+    map_of_keyframe = np.repeat(np.arange(len(maps)), [len(each) for each in maps])
+    return MergedMaps(parts, component, (loop, rejected), everything, map_of_keyframe)
 
 
 def test_maps_that_meet_become_one_file(case, tmp_path, monkeypatch, capsys) -> None:
@@ -79,8 +79,8 @@ def test_guessed_motions_within_a_map_are_told(case, tmp_path, monkeypatch, caps
     assert "one map now, in 2 parts whose relative poses are guesses" in capsys.readouterr().out
     metrics = load_json(tmp_path / "out" / "metrics.json")
     assert (metrics["status"], metrics["parts"][0]["num_measured_parts"]) == ("uncertain", 2)
-    assert not dpmjax.slam.MergedMaps((dpmjax.load_map(tmp_path / "out" / "map.npz"),), None).is_joined
-    assert dpmjax.slam.MergedMaps((a,), None).is_joined
+    assert not MergedMaps((dpmjax.load_map(tmp_path / "out" / "map.npz"),), (), (), None, None).is_joined
+    assert MergedMaps((a,), (), (), None, None).is_joined
 
 
 @pytest.mark.slow

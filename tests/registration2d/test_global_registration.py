@@ -1,4 +1,4 @@
-"""Global registration: the exhaustive search of pairs, and maps grown from pairs."""
+"""Global registration: the exhaustive search of pairs, maps grown from pairs, and sequences."""
 
 from __future__ import annotations
 
@@ -10,12 +10,21 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.metrics import absolute_trajectory_error
-from dpmjax.registration2d import GlobalConfig, PlanarScans, nearest_tour, planar_scans, refine, register_globally
+from dpmjax.registration2d import (
+    PlanarScans,
+    global_registration,
+    incremental_icp,
+    nearest_tour,
+    pair_search,
+    planar_scans,
+    refine,
+    register_globally,
+)
 from dpmjax.registration2d.global_registration import find_unregistered
 from dpmjax.registration2d.map_assembly import add_up, agreeing_edges, assemble, weakest_cuts
 from dpmjax.registration2d.pair_search import (
-    Candidates,
     CorrelativeConfig,
+    Hypotheses,
     search_pairs,
 )
 from dpmjax.simulation import simulate_sequence
@@ -23,7 +32,11 @@ from tests.registration2d.conftest import ate, scans_of
 
 # Coarse, so that a test takes a second. The laws do not depend on it.
 COARSE = CorrelativeConfig(num_cells=64, cell=0.075, num_turns=72, block=8, num_levels=5, num_candidates=3)
-CONFIG = GlobalConfig(search=COARSE)
+
+
+@pytest.fixture(autouse=True)
+def coarse_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(global_registration, "_SEARCH", COARSE)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +56,7 @@ def scans(sequence) -> PlanarScans:
 
 
 @pytest.fixture(scope="module")
-def found(scans) -> Candidates:
+def found(scans) -> Hypotheses:
     """All pairs, searched."""
     return search_pairs(scans, *np.tril_indices(len(scans), k=-1), COARSE)
 
@@ -62,10 +75,11 @@ def test_search_finds_the_relative_pose_from_any_yaw(sequence, truth) -> None:
     some = planar_scans(np.stack([sequence.points[0], *turned]), sequence.mask[[0, 1, 1, 1, 1]])
     found = search_pairs(some, np.arange(1, 5), np.zeros(4, int), COARSE)
     expected = se2.relative(truth[0], truth[1] + yaws[:, None] * [0.0, 0.0, 1.0])
-    error = se2.relative(expected, found.poses[:, 0])
+    first = np.unique(found.pair, return_index=True)[1]
+    error = se2.relative(expected, found.poses[first])
     assert (np.hypot(error[:, 0], error[:, 1]) < 3.0).all()
     assert (np.abs(error[:, 2]) < 0.03).all()
-    assert (found.scores[:, 0] > found.scores[:, 1] + 20).all()
+    assert (found.scores[first] > found.scores[first + 1] + 20).all()
 
 
 @pytest.mark.slow
@@ -73,17 +87,16 @@ def test_only_the_given_turns_are_searched(scans) -> None:
     turns = np.zeros((1, COARSE.num_turns), bool)
     turns[0, 18] = True
     found = search_pairs(scans, np.array([1]), np.array([0]), COARSE, turns=turns)
-    headings = found.poses[0, np.isfinite(found.scores[0]), 2]
     # Refinement moves a heading by less than a turn.
-    np.testing.assert_allclose(headings, np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
+    np.testing.assert_allclose(found.poses[:, 2], np.pi / 2, atol=2 * 2 * np.pi / COARSE.num_turns)
 
 
 @pytest.mark.slow
 def test_assembly_rejects_a_wrong_pair(sequence, scans, found) -> None:
     wrong = int(np.flatnonzero((found.source == 6) & (found.target == 0))[0])
     poses, scores = found.poses.copy(), found.scores.copy()
-    poses[wrong, 0] = [5.0, -20.0, 2.0]
-    scores[wrong, 0] = 0.9 * scores.max()
+    poses[wrong] = [5.0, -20.0, 2.0]
+    scores[wrong] = 0.9 * scores.max()
     candidates = found._replace(poses=poses, scores=scores)
     assembled = assemble(scans, candidates, is_ordered=False)
     assert ate(assembled, sequence.reference_poses) < 4.0
@@ -103,9 +116,9 @@ def test_weakest_cut_is_between_two_groups() -> None:
 @pytest.mark.slow
 def test_shuffling_the_scans_permutes_the_result(sequence) -> None:
     order = np.array([3, 0, 6, 2, 5, 1, 4])
-    one = register_globally(scans_of(sequence, is_ordered=False), CONFIG).poses
+    one = register_globally(scans_of(sequence, is_ordered=False))
     shuffled = planar_scans(sequence.points[order], sequence.mask[order], is_ordered=False)
-    other = register_globally(shuffled, CONFIG).poses
+    other = register_globally(shuffled)
     assert ate(one, sequence.reference_poses) < 4.0
     assert absolute_trajectory_error(one[order][:, :2], other[:, :2]) < 4.0
 
@@ -122,16 +135,15 @@ def test_scans_are_registered_at_180_degrees_and_with_noise(is_ordered: bool, no
     # 30 px apart, so that half circles overlap; the world is 1024 px wide.
     walk = half_circle(simulate_sequence(0, 37, seed=1, range_noise_px=noise).take(slice(0, None, 4)))
     assert walk.mask.mean() < 0.6
-    found = register_globally(scans_of(walk, is_ordered=is_ordered), CONFIG)
-    assert ate(found.poses, walk.reference_poses) < 4.0
-    np.testing.assert_array_equal(found.poses[0], np.zeros(3))
+    found = register_globally(scans_of(walk, is_ordered=is_ordered))
+    assert ate(found, walk.reference_poses) < 4.0
+    np.testing.assert_array_equal(found[0], np.zeros(3))
 
 
 @pytest.mark.slow
-def test_scans_beyond_the_keyframes_find_their_poses(sequence) -> None:
-    start = register_globally(scans_of(sequence, is_ordered=False), replace(CONFIG, max_keyframes=4))
-    assert len(start.keyframes) == 4
-    assert ate(start.poses, sequence.reference_poses) < 4.0
+def test_scans_beyond_the_keyframes_find_their_poses(sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(global_registration, "_MAX_KEYFRAMES", 4)
+    assert ate(register_globally(scans_of(sequence, is_ordered=False)), sequence.reference_poses) < 4.0
 
 
 @pytest.mark.slow
@@ -152,3 +164,65 @@ def test_unregistered_scans_do_not_support_each_other(walk, walk_scans) -> None:
 def test_a_tour_goes_from_each_pose_to_the_nearest_left() -> None:
     poses = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [1.0, 0.0, 3.0], [-2.5, 0.0, 0.0]])
     np.testing.assert_array_equal(nearest_tour(poses), [0, 2, 3, 1])
+
+
+@pytest.fixture(scope="module")
+def there() -> ScanSequence:
+    """Thirteen scans of the office, 30 px apart."""
+    return simulate_sequence(0, 49, seed=1).take(slice(0, None, 4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_torn", [1, 12])
+def test_torn_steps_are_healed_from_the_scans_alone(there, monkeypatch: pytest.MonkeyPatch, num_torn: int) -> None:
+    """One weak step starts the search of all pairs of few scans. Many scans need many weak steps."""
+    walk, max_keyframes = (there.take(slice(0, None, 2)), 32) if num_torn == 1 else (there, 6)
+    truth = np.asarray(walk.reference_poses)
+    torn = se2.relative(truth[0], truth)
+    for step in range(1, num_torn + 1):
+        torn[step:] = se2.compose(np.array([400.0, -300.0, 1.0]), torn[step:])
+    known = incremental_icp(scans_of(walk.take(slice(2))))
+    monkeypatch.setattr(global_registration, "incremental_icp", lambda _: known._replace(poses=torn))
+    monkeypatch.setattr(global_registration, "_MAX_KEYFRAMES", max_keyframes)
+    assert ate(torn, truth) > 50.0
+    assert ate(register_globally(scans_of(walk)), truth) < 4.0
+
+
+@pytest.mark.slow
+def test_a_sequence_of_strong_steps_needs_no_other_search(there, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(global_registration, "search_pairs", None)
+    assert ate(register_globally(scans_of(there)), np.asarray(there.reference_poses)) < 1.0
+
+
+@pytest.mark.slow
+def test_a_robot_may_go_out_and_back_between_two_keyframes(there, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = there.take(slice(5))
+    truth = np.asarray(out.reference_poses)
+    turns = np.arange(1, 5) * np.pi / 4
+    poses = np.concatenate(
+        [truth, truth[-1] + turns[:, None] * [0.0, 0.0, 1.0], truth[-2::-1] + np.array([0.0, 0.0, np.pi])]
+    )
+    rows = np.concatenate([np.arange(5), np.full(4, 4), np.arange(3, -1, -1)])
+    turned = se2.transform_points(se2.relative(poses, out.reference_poses[rows]), out.points[rows])
+    # Both keyframes lie where the robot starts and ends.
+    monkeypatch.setattr(global_registration, "_MAX_KEYFRAMES", 2)
+    scans = planar_scans(turned.astype(np.float32), out.mask[rows])
+    assert ate(register_globally(scans), poses) < 2.0
+    # The sequence tells nothing.
+    monkeypatch.setattr(global_registration, "weak_steps", lambda *_: np.ones(len(scans) - 1, bool))
+    assert ate(register_globally(scans), poses) < 4.0
+
+
+@pytest.mark.slow
+def test_pairs_in_batches_are_those_of_one_search(there, monkeypatch: pytest.MonkeyPatch) -> None:
+    scans, source, target = scans_of(there), np.array([5, 1, 3, 1, 2]), np.array([4, 0, 2, 3, 1])
+    turns = np.zeros((5, COARSE.num_turns), bool)
+    turns[:, [0, 1, -1]] = True
+    search = COARSE._replace(num_levels=1)
+    whole = search_pairs(scans, source, target, search, turns=turns)
+    monkeypatch.setattr(pair_search, "_SEARCH_BATCH", 2)
+    batched = search_pairs(scans, source, target, search, turns=turns)
+    np.testing.assert_array_equal(whole.source[np.unique(whole.pair, return_index=True)[1]], source)
+    np.testing.assert_array_equal(batched.target, whole.target)
+    np.testing.assert_allclose(batched.poses, whole.poses, atol=1e-4)
+    np.testing.assert_allclose(batched.scores, whole.scores, rtol=1e-4)

@@ -98,11 +98,6 @@ def test_pairs_are_aligned_from_the_best_guess_pixels_away(walk, walk_scans) -> 
     assert (found.fitness > 0.3).all()
 
 
-def test_no_pair_is_no_match(walk_scans) -> None:
-    none = walk_scans.take(slice(0))
-    assert match_pairs(none, none, np.zeros((0, 3, 3)), FINE).poses.shape == (0, 3)
-
-
 @pytest.mark.slow
 def test_scans_without_a_beam_stay_at_their_guess(walk_scans) -> None:
     one = replace(walk_scans, is_on_line=np.zeros_like(walk_scans.mask)).take([0])

@@ -97,11 +97,6 @@ def test_scans_of_single_beams_have_a_code_length(walk) -> None:
     assert np.isfinite(map_code_length(planar_scans(walk.points, mask), walk.reference_poses))
 
 
-def test_a_choice_needs_a_candidate(walk_scans) -> None:
-    with pytest.raises(ValueError, match="at least one trajectory"):
-        choose_trajectory(walk_scans, {})
-
-
 def test_truth_is_trusted_in_any_frame_and_torn_or_collapsed_maps_are_not(walk, walk_scans) -> None:
     scans, true = walk_scans, walk.reference_poses
     one, other = (assess_trajectory(scans, true + offset) for offset in (0.0, np.array([500.0, -300.0, 0.0])))

@@ -107,11 +107,6 @@ def test_comparison_is_mutual(walk, walk_scans: PlanarScans) -> None:
         np.testing.assert_allclose(a, b, atol=1.5)
 
 
-def test_no_pair_is_no_comparison(walk_scans: PlanarScans) -> None:
-    none = np.zeros(0, np.int64)
-    assert compare_pairs(walk_scans, none, none, np.zeros((0, 3))).matched.shape == (0,)
-
-
 def test_right_pose_contradicts_nothing_and_wrong_pose_does(walk, walk_scans: PlanarScans) -> None:
     right = se2.relative(walk.reference_poses[0], walk.reference_poses[8])
     poses = np.stack([right, right + np.array([0.0, 60.0, 0.5])])

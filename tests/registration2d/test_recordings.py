@@ -72,12 +72,6 @@ def test_chosen_scans_keep_their_poses_and_others_lie_between() -> None:
     assert np.abs(steps - wheels).max() < 0.15
 
 
-@pytest.mark.parametrize("chosen", [[1, 59], [0, 58], [0, 30, 30, 59]])
-def test_rows_that_do_not_span_the_recording_are_refused(chosen: list[int]) -> None:
-    with pytest.raises(ValueError, match="increasing rows from 0 to 59"):
-        fill_between(np.array(chosen), np.zeros((len(chosen), 3)), drive())
-
-
 @pytest.mark.slow
 def test_scans_between_are_aligned_with_the_chosen_ones() -> None:
     """A dense walk whose odometry wanders between the chosen scans, which are right."""

@@ -8,7 +8,7 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.io import ScanSequence
 from dpmjax.pose_graph.graph import Edges
-from dpmjax.registration2d import LoopConfig, RefinementConfig, correct_by_loops, planar_scans, refine
+from dpmjax.registration2d import correct_by_loops, loop_closure, planar_scans, refine, refinement
 from dpmjax.registration2d.joint_alignment import choose_pairs
 from dpmjax.registration2d.loop_closure import count_support, find_candidates
 from dpmjax.registration2d.steps import StepPrior
@@ -16,7 +16,10 @@ from dpmjax.simulation import simulate_sequence
 from dpmjax.types import ScanSet
 from tests.registration2d.conftest import ate
 
-WITHOUT_LOOPS = RefinementConfig(loops=None)
+
+@pytest.fixture
+def without_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refinement, "_is_sound", lambda *_: True)
 
 
 def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
@@ -25,10 +28,10 @@ def shaken(poses: np.ndarray, px: float, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_refinement_is_exact_without_noise(walk, walk_scans) -> None:
+def test_refinement_is_exact_without_noise(walk, walk_scans, without_loops) -> None:
     # In the world of the start, wherever it is.
     start = se2.compose(np.array([1000.0, -500.0, 2.0]), shaken(walk.reference_poses, 10.0))
-    refined = refine(walk_scans, start, WITHOUT_LOOPS)
+    refined = refine(walk_scans, start)
     assert ate(start, walk.reference_poses) > 8.0
     assert ate(refined.poses, walk.reference_poses) < 0.01
     np.testing.assert_allclose(refined.poses[0], start[0], atol=1e-4)
@@ -41,14 +44,14 @@ def test_refinement_is_bounded_under_noise(noisy_walk, noisy_walk_scans) -> None
 
 
 @pytest.mark.slow
-def test_refinement_never_uses_masked_beams(walk) -> None:
+def test_refinement_never_uses_masked_beams(walk, without_loops) -> None:
     mask = walk.mask & (np.random.default_rng(2).uniform(size=walk.mask.shape) < 0.9)
     start = shaken(walk.reference_poses, 5.0)
     results = []
     some_or_nothing = np.where(np.arange(mask.shape[1]) % 2, 77.0, np.nan)[:, None]
     for filling in (0.0, some_or_nothing):
         points = np.where(mask[..., None], walk.points, filling).astype(np.float32)
-        results.append(refine(planar_scans(points, mask), start, WITHOUT_LOOPS).poses)
+        results.append(refine(planar_scans(points, mask), start).poses)
     np.testing.assert_array_equal(results[0], results[1])
     assert ate(results[0], walk.reference_poses) < 0.05
 
@@ -65,13 +68,13 @@ def test_two_scans_that_share_nothing_are_refined_without_pairs(walk) -> None:
 
 
 @pytest.mark.slow
-def test_scans_as_a_user_has_them_are_those_of_the_record(walk) -> None:
+def test_scans_as_a_user_has_them_are_those_of_the_record(walk, without_loops) -> None:
     few = walk.take(slice(0, 6))
     arrays = np.where(few.mask[..., None], few.points, np.nan)
     start = shaken(few.reference_poses, 3.0)
-    expected = refine(planar_scans(few.points, few.mask), start, WITHOUT_LOOPS)
+    expected = refine(planar_scans(few.points, few.mask), start)
     for scans, poses in ((arrays, start), (ScanSet(few.points, few.mask), se2.to_matrix(start))):
-        np.testing.assert_allclose(refine(scans, poses, WITHOUT_LOOPS).poses, expected.poses, atol=1e-6)
+        np.testing.assert_allclose(refine(scans, poses).poses, expected.poses, atol=1e-6)
     np.testing.assert_array_equal(expected.T_world_scan, se2.to_matrix(expected.poses))
 
 
@@ -108,15 +111,14 @@ def revisit() -> ScanSequence:
 
 @pytest.mark.slow
 def test_a_drifted_trajectory_is_closed(revisit, monkeypatch) -> None:
-    monkeypatch.setattr(
-        "dpmjax.registration2d.loop_closure._BATCH", 128
-    )  # a batch is filled up, and here are few candidates
+    # A batch is filled up, and here are few candidates.
+    for name, value in {"_BATCH": 128, "_DRIFT": 0.2, "_NUM_ROUNDS": 1}.items():
+        monkeypatch.setattr(loop_closure, name, value)
     scans = planar_scans(revisit.points, revisit.mask)
     true = revisit.reference_poses
     steps = se2.relative(true[:-1], true[1:])
     drifted = se2.chain(steps * [1.05, 1.05, 1.0] + [0.0, 0.0, np.radians(0.5)])
-    config = LoopConfig(drift=0.2, num_rounds=1)
-    closed, loops, weight = correct_by_loops(scans, drifted, config)
+    closed, loops, weight = correct_by_loops(scans, drifted)
     assert len(loops.source) == len(weight) > 10
     assert (loops.source > loops.target).all()
     kept = se2.relative(true[loops.target], true[loops.source])[weight > 0.5]
@@ -131,10 +133,11 @@ def test_a_trajectory_without_revisits_is_left_alone(walk_scans) -> None:
     assert len(loops.source) == len(weight) == 0
 
 
-def test_of_too_many_candidates_those_are_kept_that_are_near() -> None:
+def test_of_too_many_candidates_those_are_kept_that_are_near(monkeypatch) -> None:
+    monkeypatch.setattr(loop_closure, "_DRIFT", 0.0)
     angle = np.linspace(0.0, 4 * np.pi, 400)
     poses = np.stack([30 * np.cos(angle), 30 * np.sin(angle), angle], -1)
-    source, target = find_candidates(poses, LoopConfig(drift=0.0), typical_range=33.0)
+    source, target = find_candidates(poses, typical_range=33.0)
     later, earlier = np.tril_indices(400, k=-6)
     apart = np.hypot(*(poses[later] - poses[earlier])[:, :2].T)
     may = (apart < 9.9) & (se2.driven_lengths(poses)[later] - se2.driven_lengths(poses)[earlier] > 2.25 * 33.0)

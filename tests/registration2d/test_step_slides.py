@@ -8,7 +8,6 @@ import pytest
 from dpmjax.geometry import se2
 from dpmjax.registration2d import (
     PlanarScans,
-    RefinementConfig,
     assess_trajectory,
     incremental_icp,
     planar_scans,
@@ -151,12 +150,11 @@ def test_trust_depends_on_what_holds_the_corridor(scans, truth, odometry) -> Non
 
 
 def test_a_scan_that_was_torn_out_is_put_back(scans, truth) -> None:
-    radius = RefinementConfig().radius
     prior = StepPrior.of_poses(truth, scans.typical_range)
-    assert restore_torn(scans, steps_of(truth), truth, radius, prior) is None
+    assert restore_torn(scans, steps_of(truth), truth, prior) is None
     torn = truth.copy()
     torn[3] += [25.0, -20.0, 0.3]
-    found = restore_torn(scans, steps_of(truth), torn, radius, prior)
+    found = restore_torn(scans, steps_of(truth), torn, prior)
     assert found is not None
     off = se2.relative(found[[0]], found) - se2.relative(truth[[0]], truth)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 2.0
@@ -168,7 +166,7 @@ def test_a_lost_step_is_put_back_and_not_slid(scans, truth) -> None:
     torn[10, 2] += 0.025
     prior = StepPrior(steps, np.full((NUM_SCANS - 1, 3), [2.0, 2.0, 0.01]))
     poses = np.asarray(se2.compose(truth[0], se2.chain(torn)))
-    found = restore_torn(scans, steps, poses, RefinementConfig().radius, prior)
+    found = restore_torn(scans, steps, poses, prior)
     np.testing.assert_allclose(steps_of(found)[10], steps[10], atol=1e-3)
 
 

@@ -52,7 +52,7 @@ def scan(seed: int, num_elements: int = NUM_ELEMENTS) -> CompactScan:
 
 
 def make_map(num_keyframes: int = 4) -> KeyframeMap:
-    config = replace(SlamConfig(), loops=replace(SlamConfig().loops, num_similar=3))
+    config = replace(SlamConfig(), loops=replace(SlamConfig().loops, min_probability=0.6))
     slam_map = with_origin(KeyframeMap(), MapOrigin("0123456789abcdef", config, "dpm_small"))
     rng = np.random.default_rng(1)
     for row in range(num_keyframes):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dpmjax.geometry import se3
-from dpmjax.scans.align import LEVELS, AlignedMotion, AlignmentLevel, Prior, align, align_on_host
+from dpmjax.scans.align import LEVELS, AlignedMotion, AlignmentLevel, align, align_on_host
 from dpmjax.scans.pairs import nearest_planes
 from dpmjax.scans.surfaces import Surface, scan_surface, surface_of_elements
 from dpmjax.types import SurfaceElements
@@ -50,7 +50,6 @@ def test_two_views_of_one_surface_are_aligned() -> None:
     assert error_m < 0.02
     assert error_deg < 0.1
     assert found.rmse < 0.03
-    assert 100 < found.num_pairs <= 300
 
 
 @pytest.mark.slow
@@ -70,7 +69,6 @@ def test_trees_and_exhaustive_search_give_one_motion() -> None:
     ours, host = (function(SOURCE, TARGET, GUESS) for function in (align, on_host))
     np.testing.assert_allclose(ours.T_target_source, host.T_target_source, atol=2e-3)
     np.testing.assert_allclose(ours.rmse, host.rmse, rtol=5e-2)
-    assert abs(int(ours.num_pairs) - int(host.num_pairs)) <= 2
 
 
 @pytest.mark.slow
@@ -83,7 +81,6 @@ def test_masked_and_uneven_elements_count_for_nothing() -> None:
     for function in (align, on_host):
         expected, found = function(SOURCE, TARGET, GUESS), function(padded, TARGET, GUESS)
         np.testing.assert_allclose(found.T_target_source, expected.T_target_source, atol=1e-5)
-        assert found.num_pairs == expected.num_pairs
 
 
 @pytest.mark.slow
@@ -190,34 +187,8 @@ def test_planar_scans_are_aligned_on_the_host_and_on_a_device() -> None:
     )
     found = align_on_host(surface_of_elements(source), target, np.eye(3)[None], LEVELS)
     np.testing.assert_allclose(found.T_target_source[0], T, atol=2e-3)
-    assert found.information.shape == (1, 3, 3)
     on_device = align(source, elements_of(target), np.eye(3))
     np.testing.assert_allclose(on_device.T_target_source, T, atol=2e-3)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_prior_holds_what_no_plane_holds(dim: int) -> None:
-    """On one wall, the way along it is that of the prior, and the way across it that of the wall."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-10, 10, (500, dim))
-    points[:, 1] = 2.0
-    normals = np.zeros((500, dim))
-    normals[:, 1] = 1
-    wall = surface_of_elements(SurfaceElements(points, normals, np.ones(500), np.ones(500, bool)))
-    expected = np.eye(dim + 1)
-    expected[:2, dim] = 0.5, 0.4
-    prior = Prior(expected, 0.1 * np.eye(3 * (dim - 1)))
-    for start in (np.eye(dim + 1), expected):
-        found = align_on_host(wall, wall, start[None], LEVELS, prior).T_target_source[0]
-        np.testing.assert_allclose(found[0, dim], 0.5, atol=0.01)
-        np.testing.assert_allclose(found[1, dim], 0.0, atol=0.01)
-
-
-def test_other_radii_compile_nothing(assert_compiles_nothing) -> None:
-    schedule = np.full((3, 2), 1.0, np.float32)
-    align(SOURCE, TARGET, GUESS, schedule)
-    with assert_compiles_nothing():
-        align(SOURCE, TARGET, GUESS, 2 * schedule)
 
 
 def test_pairs_are_the_nearest_planes() -> None:

@@ -20,9 +20,7 @@ from dpmjax.slam import (
     run_agents,
     run_slam,
     slam_preset,
-    take_component,
 )
-from dpmjax.slam.agents import join_agents
 from tests.slam.truth import EMPTY, TruthGeometry, TruthMatcher, laps, number_of, scans_of
 
 CONFIG = SlamConfig()
@@ -110,7 +108,7 @@ def test_agents_that_never_meet_stay_apart() -> None:
     assert joint_error_m(result, parts, (0, 2), truth) < 1.0
     # The stranger has the frame of its own first scan, and the trajectory that it has found alone.
     np.testing.assert_allclose(result.T_world_scan[1], result.agents[1].T_world_scan, atol=1e-9)
-    assert len(take_component(result.joined, 1)) == len(result.agents[1].keyframes)
+    assert len(result.joined.maps[1]) == len(result.agents[1].keyframes)
 
 
 @pytest.mark.slow
@@ -141,22 +139,6 @@ def test_an_agent_without_scans_is_alone() -> None:
     result = run_agents(methods_of(TRUTH), scans)
     assert result.component == (0, 1, 2, 0)
     assert [len(T_world_scan) for T_world_scan in result.T_world_scan] == [30, 2, 0, 30]
-
-
-def test_an_agent_alone_finds_what_it_finds_alone() -> None:
-    methods = methods_of(TRUTH)
-    alone = dpmjax.run_slam(methods, scans_of(range(60)))
-    result = run_agents(methods, [scans_of(range(60))])
-    np.testing.assert_allclose(result.T_world_scan[0], alone.T_world_scan, atol=1e-9)
-    assert result.component == (0,)
-
-
-def test_bytes_are_counted(joined) -> None:
-    for part, traffic in zip(PARTS, joined.traffic, strict=True):
-        # A scan of the truth is one point.
-        assert traffic.scan_bytes == 12 * len(list(part))
-        assert 0 < traffic.keyframe_scan_bytes < traffic.scan_bytes
-        assert traffic.keyframe_bytes > 0
 
 
 @pytest.mark.slow
@@ -216,13 +198,11 @@ def test_bad_input_is_named(as_user) -> None:
     methods = methods_of(TRUTH)
     others = [methods_of(TRUTH, TruthMatcher(TRUTH, fingerprint=name)) for name in ("one", "other")]
     a, b = (run_slam(other, scans_of(range(10))).map for other in others)
-    extended = run_slam(methods, scans_of(range(3)), slam_map=run_slam(methods, scans_of(range(3))).map)
     for call, message in (
         (lambda: run_agents(methods, []), "sequences: expected"),
         (lambda: dpmjax.merge_maps(methods, a, b), "made with weights one, these are other"),
         (lambda: dpmjax.merge_maps(methods, a, a), "made with weights one, these are truth"),
         (lambda: dpmjax.merge_maps(methods, dpmjax.KeyframeMap()), "maps: expected at least two, got 1"),
-        (lambda: join_agents(methods, [extended]), "runs that began with an empty map"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -22,8 +22,7 @@ from dpmjax.slam.loop_closure import (
     nearest_pairs,
     search_again,
 )
-from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import Loop, LoopState, are_consistent, num_accepted, optimize_map
 from dpmjax.types import DescriptorCloud
 from tests.slam.truth import TruthGeometry, TruthMatcher, compact_of, laps, noise, number_of, pose
 
@@ -84,11 +83,11 @@ def test_candidates_are_old_and_near() -> None:
     truth = laps(2, side_m=40.0, step_m=2.0)
     slam_map = map_of(truth)
     row = len(truth) - 1
-    near = [loop.target for loop in find_loop_candidates(slam_map, row, CONFIG) if loop.found_by == "distance"]
+    near = [loop.target for loop in find_loop_candidates(slam_map, row) if loop.found_by == "distance"]
     assert row - len(truth) // 2 in near
     for candidate in near:
         assert slam_map.keyframes[row].path_m - slam_map.keyframes[candidate].path_m > 40.0
-    assert not find_loop_candidates(slam_map, 3, CONFIG)
+    assert not find_loop_candidates(slam_map, 3)
 
 
 def test_nearest_pairs_are_those_of_a_search_by_hand() -> None:

@@ -102,16 +102,6 @@ def test_scans_prepared_ahead_make_the_same_map(proposer) -> None:
     assert repr(result.reports) == repr(expected.reports)
 
 
-def test_a_step_leaves_the_state_before_as_it_was() -> None:
-    truth = laps(1, side_m=30.0)
-    methods = SlamMethods(TruthMatcher(truth), TruthGeometry(truth), CONFIG)
-    state = init_slam()
-    for scan in scans_of(range(40)):
-        state, _ = step_slam(methods, state, scan)
-    once, twice = (step_slam(methods, state, scans_of([40])[0])[0] for _ in range(2))
-    np.testing.assert_array_equal(once.slam_map.T_world_keyframe, twice.slam_map.T_world_keyframe)
-
-
 def test_every_scan_gets_a_pose_and_empty_ones_are_flagged() -> None:
     truth = laps(1, side_m=20.0)
     scans = scans_of(range(len(truth)))
@@ -237,18 +227,6 @@ def test_in_a_corridor_odometry_knows_the_way() -> None:
     np.testing.assert_allclose(ways_m, [24.0, 39.0], atol=0.5)
 
 
-def test_the_network_helps_where_geometry_fails() -> None:
-    # Of each ten scans nine are dropped for a while: the prediction is wrong by more than geometry can do.
-    truth = laps(1, side_m=60.0)
-    numbers = [*range(10), 20, *range(21, 50)]
-    exact = TruthMatcher(truth, gross_share=0.0)
-    result = run(truth, numbers, matcher=exact)
-    assert result.reports[10].status == "network"
-    assert result.reports[10].probability is not None
-    expected = truth[numbers][:, :3, 3]
-    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], expected) < 0.5
-
-
 def by_network(**changes) -> SlamConfig:
     return replace(CONFIG, odometry=replace(CONFIG.odometry, proposer="network", **changes))
 
@@ -295,14 +273,6 @@ def test_networks_run_for_the_first_scans_and_keyframes_alone_where_the_predicti
     result = run(truth, matcher=CountingMatcher(truth, gross_share=0.0), config=without_loops())
     assert CountingMatcher.proposed == [*range(1, 11)]
     assert CountingMatcher.encoded == sorted({*range(1, 11), *result.keyframes.tolist()})
-
-
-def test_a_scan_where_nothing_agrees_is_predicted() -> None:
-    truth = laps(1, side_m=60.0)
-    geometry = TruthGeometry(truth, failures=frozenset({15}))
-    result = run(truth, range(40), geometry=geometry)
-    assert [report.scan for report in result.reports if report.status == "predicted"] == [15]
-    assert absolute_trajectory_error(result.T_world_scan[:, :3, 3], truth[:40, :3, 3]) < 0.5
 
 
 class SparseGeometry(TruthGeometry):

@@ -116,7 +116,7 @@ def main(options: Map2dOptions, run: cli.Run) -> cli.Numbers:
 def register_sequence(
     sequence: ScanSequence, start: str | FloatArray, options: Map2dOptions, recorder: cli.FitRecorder, run: cli.Run
 ) -> registration2d.RegisteredScans:
-    """Registers the scans with the recorder as engine of the fit, and prints each stage and one bar."""
+    """Registers the scans with the recorder as engine of the fit, and prints each stage and its bar."""
     import jax
 
     fit = fit_settings(options, sequence)
@@ -133,6 +133,8 @@ def register_sequence(
     def show(stage: str, share: float) -> None:
         if share == 0.0:
             bar.write(f"{stage} ...")
+            bar.reset()
+        bar.update(share - bar.n)
 
     def engine(rows: np.ndarray) -> Callable[..., deepmapping.Fit]:
         if len(rows) < len(sequence):
@@ -141,10 +143,7 @@ def register_sequence(
         unit = fit.unit or geometry.typical_range(fitted.points, fitted.mask)
         return partial(recorder, measure=ate_of(fitted, unit))
 
-    def advance(share: float) -> None:
-        bar.update(share - bar.n)
-
-    hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine, advance)
+    hooks = registration2d.RegistrationHooks(show, lambda: run.is_stopped, engine)
     with bar:
         return registration2d.register_scans(
             scan_set_of(sequence),

@@ -63,7 +63,7 @@ def main(options: MergeOptions, run: cli.Run) -> cli.Numbers:
     files = ["map.npz"] if num_parts == 1 else [f"map_{part}.npz" for part in range(1, num_parts + 1)]
     for file, slam_map in zip(files, merged.maps, strict=True):
         saved_maps.save_map(run / file, slam_map)
-    io.write_g2o(run / "graph.g2o", slam.as_pose_graph(merged.joined.slam_map))
+    io.write_g2o(run / "graph.g2o", slam.as_pose_graph(merged.slam_map))
     ends = [
         {"map": row, "scan": keyframe.scan} for row, each in enumerate(maps, start=1) for keyframe in each.keyframes
     ]
@@ -98,7 +98,7 @@ def merge_numbers(names: Sequence[str], files: Sequence[str], merged: slam.Merge
         "num_parts": len(parts),
         "num_loops": len(ends),
         "num_candidates": len(merged.loops),
-        "num_keyframes": len(merged.joined.slam_map),
+        "num_keyframes": len(merged.slam_map),
         "parts": parts,
         "maps": names,
     }
@@ -106,7 +106,7 @@ def merge_numbers(names: Sequence[str], files: Sequence[str], merged: slam.Merge
 
 def panel_of(names: Sequence[str], merged: slam.MergedMaps, part: int) -> viz.Panel:
     """Returns the panel of a part: its maps, each with its surface and keyframes, and the loops between them."""
-    slam_map, map_of_keyframe = merged.joined.slam_map, merged.joined.map_of_keyframe
+    slam_map, map_of_keyframe = merged.slam_map, merged.map_of_keyframe
     members = [number for number, component in enumerate(merged.component) if component == part]
     layers: list[viz.Layer] = []
     for number in members:

@@ -117,8 +117,7 @@ def step_to_planes(
     normals: Float[AnyArray, "*b n d"],
     residuals: Float[AnyArray, "*b n"],
     weights: Float[AnyArray, "*b n"],
-    prior: tuple[Any, Any, Any] | None = None,
-) -> tuple[PlaneStep, Any]:
+) -> PlaneStep:
     """Solves the weighted normal equations of point-to-plane alignment (Chen and Medioni 1992), d = 2 or 3.
 
     The step is that of `T <- motion_about(step) T`. A direction that no plane constrains does not move.
@@ -128,11 +127,9 @@ def step_to_planes(
         normals: normals of the planes, same frame.
         residuals: signed distances of the moved side to the fixed one, along the normals.
         weights: weights of the pairs; all arrays must be finite, also where a weight is 0.
-        prior: present motion T (..., d+1, d+1), expected motion, and information (k, k) about the latter; None for
-            none.
 
     Returns:
-        The step, 0 where no pair counts; and the information (..., k, k) of the pairs about its centre.
+        The step, 0 where no pair counts.
     """
     xp = rigid.namespace_of(points)
     counted = (weights > 0).astype(points.dtype)
@@ -140,17 +137,15 @@ def step_to_planes(
     centre = rigid.matmul(counted[..., None, :], points)[..., 0, :] / count
     jacobian = xp.concatenate([xp.moveaxis(normals, -1, -2), _torques(points - centre[..., None, :], normals)], axis=-2)
     weighted = weights[..., None, :] * jacobian
-    information = rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2))
-    gradient, system = rigid.matmul(weighted, residuals[..., None]), information
+    system, gradient = (
+        rigid.matmul(weighted, xp.swapaxes(jacobian, -1, -2)),
+        rigid.matmul(weighted, residuals[..., None]),
+    )
     diagonal = xp.diagonal(system, axis1=-2, axis2=-1)
     floor = max(1e-9, float(np.finfo(points.dtype).eps)) * diagonal.sum(axis=-1, keepdims=True)
     damping = 1e-6 * diagonal + floor + np.finfo(points.dtype).tiny
-    if prior is not None:
-        T, T_prior, of_prior = prior
-        system = system + of_prior
-        gradient = gradient + rigid.matmul(of_prior, _offset_about(T, T_prior, centre)[..., None])
     tangent = -xp.linalg.solve(system + damping[..., None] * np.eye(system.shape[-1], dtype=points.dtype), gradient)
-    return PlaneStep(tangent[..., 0], centre), information
+    return PlaneStep(tangent[..., 0], centre)
 
 
 def _torques(levers: Any, forces: Any) -> Any:
@@ -158,16 +153,6 @@ def _torques(levers: Any, forces: Any) -> Any:
     xp, dim = rigid.namespace_of(levers, forces), levers.shape[-1]
     axes = [(0, 1)] if dim == 2 else [(1, 2), (2, 0), (0, 1)]
     return xp.stack([levers[..., i] * forces[..., j] - levers[..., j] * forces[..., i] for i, j in axes], axis=-2)
-
-
-def _offset_about(T: Any, T_prior: Any, centre: Any) -> Any:
-    """Returns the small motion (..., k) from a prior to `T`, to first order: shift of the centre, then the turn."""
-    xp, dim = rigid.namespace_of(T), T.shape[-1] - 1
-    T_here_prior = rigid.matmul(T, rigid.inverse(T_prior))
-    turn = T_here_prior[..., :dim, :dim]
-    shift = rigid.matmul(turn, centre[..., None])[..., 0] + T_here_prior[..., :dim, dim] - centre
-    rows, columns = ([1], [0]) if dim == 2 else ([2, 0, 1], [1, 2, 0])
-    return xp.concatenate([shift, (turn[..., rows, columns] - turn[..., columns, rows]) / 2], axis=-1)
 
 
 def motion_about(step: PlaneStep) -> Any:

@@ -213,7 +213,7 @@ def farthest_points_on_host(
 ) -> Int[np.ndarray, " s"]:
     """The first min(num_samples, number of valid points) of `farthest_point_sample`.
 
-    `preprocess_scan` puts the point farthest from the origin first. Then points are kept in buckets of a tree
+    `preprocess_scan_on_host` puts the point farthest from the origin first. Then points are kept in buckets of a tree
     (QuickFPS, Han et al. 2023): four times faster, with the same result.
 
     Args:

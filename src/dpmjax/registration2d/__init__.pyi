@@ -1,10 +1,8 @@
-from .global_registration import GlobalConfig as GlobalConfig
 from .global_registration import nearest_tour as nearest_tour
 from .global_registration import register_globally as register_globally
 from .icp import icp as icp
 from .incremental import incremental_icp as incremental_icp
 from .incremental import scan_odometry as scan_odometry
-from .loop_closure import LoopConfig as LoopConfig
 from .loop_closure import correct_by_loops as correct_by_loops
 from .pair_registration import register_planar as register_planar
 from .pipeline import DEEPMAPPING as DEEPMAPPING
@@ -28,5 +26,4 @@ from .recordings import choose_by_motion as choose_by_motion
 from .recordings import fill_between as fill_between
 from .recordings import find_originals as find_originals
 from .refinement import Refined as Refined
-from .refinement import RefinementConfig as RefinementConfig
 from .refinement import refine as refine

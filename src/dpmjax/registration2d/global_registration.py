@@ -8,7 +8,6 @@ keyframes. The remaining scans are then searched against similar keyframes and p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,6 @@ from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.map_assembly import PoseScorer, agreeing_edges, assemble, settle
 from dpmjax.registration2d.pair_search import (
-    Candidates,
     CorrelativeConfig,
     Hypotheses,
     chance_level,
@@ -40,8 +38,6 @@ _NUM_LIKELY_TURNS, _NUM_KEYFRAME_TURNS = 3, 6
 # A sequence is registered like a set where more than this share of its steps is weak, or where the range noise is more
 # than this in typical ranges: a chain of steps drifts then.
 _MAX_WEAK, _MAX_NOISE = 0.25, 0.0225
-# Without an order, keyframes are chosen among this number of evenly spread scans.
-_MAX_ELIGIBLE = 1024
 # A scan whose best neighbour matches less than this share of the usual beams is unregistered; scans are of one cluster
 # if they match more than this share.
 _MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
@@ -49,31 +45,8 @@ _MIN_SUPPORT, _MIN_LINK = 0.6, 0.3
 # searched against an equal number of further scans. A cluster of up to half of this number of scans, which matches no
 # scan outside it, is unregistered too.
 _MAX_UNREGISTERED = 12
-
-
-@dataclass(frozen=True)
-class GlobalConfig:
-    """Settings of the global registration. Lengths are in typical ranges of the scans.
-
-    Attributes:
-        max_keyframes: largest number of keyframes. All pairs of keyframes are searched.
-        search: settings of the search of pairs.
-    """
-
-    max_keyframes: int = 32
-    search: CorrelativeConfig = field(default_factory=CorrelativeConfig)
-
-
-class GlobalRegistration(NamedTuple):
-    """Result of `register_globally`.
-
-    Attributes:
-        poses: (n, 3) T_world_scan, the first one zero.
-        keyframes: rows of the keyframes; none if the sequence needed no search of all pairs.
-    """
-
-    poses: Floats
-    keyframes: Indices
+# Largest number of keyframes, of which all pairs are searched; and the search of pairs.
+_MAX_KEYFRAMES, _SEARCH = 32, CorrelativeConfig()
 
 
 class _Task(NamedTuple):
@@ -82,52 +55,52 @@ class _Task(NamedTuple):
     scans: PlanarScans
     walls: WallDirections
     keyframes: Indices
-    is_ordered: bool
-    config: GlobalConfig
 
     @property
     def others(self) -> Indices:
         """Rows of the scans that are no keyframes."""
         return np.setdiff1d(np.arange(len(self.scans)), self.keyframes)
 
-    def search(self, source: Indices, target: Indices, turns: Booleans | None = None) -> Candidates:
+    def search(self, source: Indices, target: Indices, turns: Booleans | None = None) -> Hypotheses:
         """Returns candidates of pairs."""
-        return search_pairs(self.scans, source, target, self.config.search, turns=turns)
+        return search_pairs(self.scans, source, target, _SEARCH, turns=turns)
 
     def likely_turns(self, source: Indices, target: Indices, num_peaks: int) -> Booleans:
         """Returns the headings of T_target_source at which the wall directions of both scans agree."""
-        return self.walls.likely_turns(source, target, self.config.search.num_turns, num_peaks)
+        return self.walls.likely_turns(source, target, _SEARCH.num_turns, num_peaks)
 
 
-def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) -> GlobalRegistration:
+def register_globally(scans: PlanarScans) -> Floats:
     """Registers all scans without initial poses.
 
     Args:
         scans: n scans. If they are ordered, neighbours in the array are neighbours in time. Otherwise no order is used,
             and up to 1,024 shuffled scans give the same map.
-        config: settings.
 
     Returns:
-        GlobalRegistration.
+        (n, 3) T_world_scan, the first one zero.
     """
-    config, everyone = config or GlobalConfig(), np.arange(len(scans))
+    everyone = np.arange(len(scans))
     if scans.is_ordered and scans.noise <= _MAX_NOISE * scans.typical_range:
         poses = incremental_icp(scans).poses
         # Few scans are searched all against all as soon as one step is weak.
-        allowed = _MAX_WEAK if len(scans) > config.max_keyframes else 0.0
+        allowed = _MAX_WEAK if len(scans) > _MAX_KEYFRAMES else 0.0
         if weak_steps(scans, poses, everyone).sum() <= allowed * len(scans):
-            return GlobalRegistration(poses, everyone[:0])
+            return poses
     walls = WallDirections(scans)
     if scans.is_ordered:
-        keyframes = spread_evenly(len(scans), config.max_keyframes)
+        keyframes = spread_evenly(len(scans), _MAX_KEYFRAMES)
     else:
-        eligible = spread_evenly(len(scans), _MAX_ELIGIBLE)
-        keyframes = eligible[most_typical(walls.best_similarity(everyone, eligible), config.max_keyframes)]
-    task = _Task(scans, walls, keyframes, scans.is_ordered, config)
+        # Without an order, keyframes are chosen among this number of evenly spread scans.
+        eligible = spread_evenly(len(scans), 1024)
+        keyframes = eligible[most_typical(walls.best_similarity(everyone, eligible), _MAX_KEYFRAMES)]
+    task = _Task(scans, walls, keyframes)
     first, second = np.tril_indices(len(keyframes), k=-1)
     pairs = keyframes[first], keyframes[second]
     found = task.search(*pairs, task.likely_turns(*pairs, _NUM_KEYFRAME_TURNS))
-    inside = found._replace(source=first, target=second)
+    inside = found._replace(
+        source=np.searchsorted(keyframes, found.source), target=np.searchsorted(keyframes, found.target)
+    )
     poses = np.zeros((len(scans), 3))
     poses[keyframes] = assemble(scans.take(keyframes), inside, is_ordered=scans.is_ordered)
     if len(keyframes) < len(scans):
@@ -135,7 +108,7 @@ def register_globally(scans: PlanarScans, config: GlobalConfig | None = None) ->
         poses, more = place_others(task, poses, found, task.search(*_similar_pairs(task)))
         edges = join_rows(key_edges, agreeing_edges(poses, more, scans))
         poses = optimize_pose_graph(PoseGraph.create(poses, edges), ROBUST).graph.poses
-    return GlobalRegistration(se2.relative(poses[0], poses), keyframes)
+    return np.asarray(se2.relative(poses[0], poses))
 
 
 def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
@@ -163,7 +136,7 @@ def most_typical(similarity: Float[np.ndarray, "n m"], count: int) -> Indices:
 def _similar_pairs(task: _Task) -> tuple[Indices, Indices, Booleans]:
     """Pairs each other scan with similar keyframes and with near scans, and chooses the turns to try for each pair."""
     others, keyframes = task.others, task.keyframes
-    if task.is_ordered:
+    if task.scans.is_ordered:
         after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
         near = np.stack([keyframes[after - 1], keyframes[after]], axis=1)
     else:  # Scans with the most similar views are likely to be near.
@@ -176,7 +149,7 @@ def _similar_pairs(task: _Task) -> tuple[Indices, Indices, Booleans]:
     return source, target, task.likely_turns(source, target, _NUM_LIKELY_TURNS)
 
 
-def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> tuple[Floats, Candidates]:
+def place_others(task: _Task, poses: Floats, found: Hypotheses, more: Hypotheses) -> tuple[Floats, Hypotheses]:
     """Places all scans, given the poses of the keyframes.
 
     Args:
@@ -203,11 +176,11 @@ def place_others(task: _Task, poses: Floats, found: Candidates, more: Candidates
     return poses, more
 
 
-def _place(task: _Task, poses: Floats, found: Candidates, more: Candidates) -> Floats:
+def _place(task: _Task, poses: Floats, found: Hypotheses, more: Hypotheses) -> Floats:
     """Places each other scan at its hypothesis with the best score against the keyframes, and revises all poses."""
     candidates = join_rows(found, more)
-    scorer = PoseScorer(task.scans, chance_level(found), noisy_share(task.scans, candidates), task.is_ordered)
-    hypotheses, keyframes = Hypotheses.of(candidates, 0.0).in_both_directions(), task.keyframes
+    scorer = PoseScorer(task.scans, chance_level(found), noisy_share(task.scans, candidates), task.scans.is_ordered)
+    hypotheses, keyframes = candidates.take(candidates.scores > 0.0).in_both_directions(), task.keyframes
     is_fresh = np.isin(hypotheses.target, keyframes) & ~np.isin(hypotheses.source, keyframes)
     fresh = hypotheses.take(np.flatnonzero(is_fresh))
     worlds = fresh.world_poses(poses)

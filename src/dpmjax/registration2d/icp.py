@@ -15,6 +15,7 @@ from dpmjax.geometry import rigid
 from dpmjax.geometry.alignment import weighted_svd
 from dpmjax.geometry.neighbours import k_nearest
 from dpmjax.geometry.normals import estimate_normals
+from dpmjax.geometry.planes import PlaneStep, motion_about, step_to_planes
 from dpmjax.geometry.rigid import safe_sqrt
 from dpmjax.geometry.traced import is_usable, solution_tangent, with_axes_of
 from dpmjax.types import AnyArray, with_short_repr
@@ -23,7 +24,6 @@ _NORMAL_NEIGHBOURS = 6
 """Points that a normal is fitted to, as in the published DeepMapping program."""
 
 _MAX_ITERATIONS = 100
-_MAX_ROTATION_ERROR = 1e-3
 _MAX_DISTANCE = 1e4
 """Largest coordinate as a multiple of the extent of a cloud, of which float32 then holds a thousandth."""
 _OPEN_SHARE = 1e-5
@@ -144,7 +144,7 @@ def _require_motion(T_init: np.ndarray) -> None:
         raise ValueError("T_init: expected finite numbers, got NaN or infinity")
     R = T_init[:-1, :-1]
     last_row = np.abs(T_init[-1] - np.eye(len(T_init))[-1]).max()
-    if max(np.abs(R @ R.T - np.eye(len(R))).max(), last_row) > _MAX_ROTATION_ERROR or np.linalg.det(R) < 0:
+    if max(np.abs(R @ R.T - np.eye(len(R))).max(), last_row) > 1e-3 or np.linalg.det(R) < 0:
         raise ValueError("T_init: expected a rigid motion, got a matrix that scales, shears or reflects")
 
 
@@ -169,13 +169,15 @@ def _icp(source: _Cloud, target: _Cloud, start: Array, *, metric: str) -> IcpRes
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(metric: str, source: _Cloud, target: _Cloud, normals: Array, start: Array) -> tuple[Array, Array]:
     """Returns the motion, and how far the last step moved a point."""
-    resolution, centre = _resolution(target), _mean(source)[None]
+    resolution = _resolution(target)
 
     def iterate(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         T, _, count = carry
         pairs = _find_pairs(source, target, normals, T)
         if metric == "plane":
-            T_new = rigid.matmul(_step_to_planes(pairs, rigid.transform_points(T, centre)[0]), T)
+            residuals = jnp.sum(pairs.apart * pairs.normals, axis=-1)
+            T_new = motion_about(step_to_planes(pairs.points, pairs.normals, residuals, pairs.weights))
+            T_new = rigid.matmul(T_new, T)
         else:
             T_new = jnp.where(pairs.weights.any(), weighted_svd(source.points, pairs.matched, pairs.weights), T)
         change = jnp.linalg.norm(rigid.transform_points(T_new, source.points) - pairs.points, axis=-1)
@@ -199,7 +201,7 @@ def _solve_jvp(metric: str, primals: Any, tangents: Any) -> tuple[tuple[Array, A
     scales = jnp.where(jnp.arange(dim * (dim + 1) // 2) < dim, 1.0, of_angles).astype(T.dtype)
 
     def moved(step: Array) -> Array:
-        return rigid.matmul(_about(scales * step, centre), T)
+        return rigid.matmul(motion_about(PlaneStep(scales * step, centre)), T)
 
     def balance(step: Array, source_points: Array, target_points: Array) -> Array:
         clouds = source._replace(points=source_points), target._replace(points=target_points)
@@ -236,30 +238,10 @@ def _find_pairs(source: _Cloud, target: _Cloud, normals: Float[Array, "m d"], T:
     return _Pairs(points, apart, target.points[nearest], normals, residuals, weights, mask)
 
 
-def _step_to_planes(pairs: _Pairs, centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
-    """Computes the damped Gauss-Newton motion of points onto the lines or planes of their partners, about `centre`."""
-    jacobian = jnp.concatenate([pairs.normals, _turning(pairs.points - centre, pairs.normals)], axis=-1)
-    residual = jnp.sum(pairs.apart * pairs.normals, -1)
-    weighted = pairs.weights[:, None] * jacobian
-    system = jnp.einsum("ni,nj->ij", weighted, jacobian, precision="highest")
-    diagonal = jnp.diagonal(system)
-    # Directions that no plane constrains stay unchanged.
-    damping = 1e-4 * diagonal + 1e-6 * diagonal.max() + jnp.finfo(residual.dtype).tiny
-    gradient = jnp.einsum("ni,n->i", weighted, residual, precision="highest")
-    return _about(jnp.linalg.solve(system + jnp.diag(damping), -gradient), centre)
-
-
 def _turning(lever: Float[Array, "n d"], vectors: Float[Array, "n d"]) -> Float[Array, "n r"]:
     """Computes torques, the cross products of levers and vectors; in the plane a torque is one number."""
     i, j = np.array([[0], [1]] if lever.shape[1] == 2 else [[1, 2, 0], [2, 0, 1]])
     return lever[:, i] * vectors[:, j] - lever[:, j] * vectors[:, i]
-
-
-def _about(step: Float[Array, " k"], centre: Float[Array, " d"]) -> Float[Array, "d1 d1"]:
-    """Returns the motion of a twist about a centre."""
-    dim = len(centre)
-    motion = rigid.exp(step)
-    return motion.at[:dim, dim].add(centre - jnp.matmul(motion[:dim, :dim], centre, precision="highest"))
 
 
 def _mean(cloud: _Cloud) -> Float[Array, " d"]:

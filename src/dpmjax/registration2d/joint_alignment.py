@@ -23,8 +23,6 @@ from dpmjax.registration2d.planar_scans import Floats, Indices, Pairs, PlanarSca
 from dpmjax.registration2d.range_profiles import WEAK_SCORE, pair_scores
 from dpmjax.registration2d.steps import Slides, StepPrior, held_steps, pose_steps, prior_steps, slide_steps
 
-# Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
-_ROUND_DISTANCES = 1.5e9
 # Gates and kernels of the rounds, and number of rounds after which the neighbours are chosen anew.
 _ROUNDS, _REFRESH = Schedule(gate=(0.09, 0.015), kernel=(0.06, 0.0015), num_iterations=14), 4
 # Gauss-Newton steps that restore unconstrained directions after the adjustment to lines, and torn steps.
@@ -32,22 +30,17 @@ _NUM_OPEN_ROUNDS, _NUM_TORN_ROUNDS = 3, 5
 # A step is torn by a refinement where its score has fallen by this much, from a score that was not weak. Least weight
 # of a step, whose score may be negative.
 _LOST_SCORE, _LEAST_WEIGHT = 0.25, 0.01
-# Largest difference of heading of two scans that are aligned, radians; number of nearest scans of each scan.
-_MAX_TURN, _NUM_NEAREST = 2.0, 8
-# A pair of scans more steps apart may cross a torn step.
-_FEW_STEPS = 3
-# Pairs up to this number of steps apart that cross a slid step have slid with it.
-_FAR_STEPS = 20
-_NO_EDGES = Edges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+# Two scans are aligned if they are at most this far apart, in typical ranges, and their headings differ by less than
+# this, radians: farther ones share few walls. Number of nearest scans of each scan.
+_RADIUS, _MAX_TURN, _NUM_NEAREST = 0.6, 2.0, 8
 
 
-def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> Floats:
+def align_all(scans: PlanarScans, poses: Floats, prior: StepPrior | None) -> Floats:
     """Aligns all scans from nearby poses, point to line.
 
     Args:
         scans: n scans.
         poses: (n, 3) initial poses T_world_scan; the first one is fixed.
-        radius: largest distance of neighbours in space, typical ranges.
         prior: of the steps of ordered scans; None: no prior.
 
     Returns:
@@ -59,7 +52,7 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
     trust = 1e-9 if prior is None else max(scans.noise, 0.00075 * scans.typical_range) ** 2
     for round_number, scale in enumerate(scales):
         if round_number % _REFRESH == 0:
-            pairs = _choose_aligned(scans, poses, radius, prior)
+            pairs = _choose_aligned(scans, poses, prior)
             steps = join_rows(expected, pairs.held)
             steps = steps._replace(information=trust * steps.information)
         edges, gradient = _linearise(scans, pairs, poses, scale)
@@ -68,20 +61,19 @@ def align_all(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior
     return poses
 
 
-def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: float, prior: StepPrior) -> Floats:
+def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, prior: StepPrior) -> Floats:
     """Restores relative poses along unconstrained directions after an adjustment that has changed them.
 
     Args:
         scans: n scans in time order.
         aligned: (n, 3) poses before the adjustment.
         adjusted: (n, 3) poses after it.
-        radius: largest distance of neighbours in space, typical ranges.
         prior: of the steps.
 
     Returns:
         (n, 3) adjusted poses; along the unconstrained directions the relative poses are those of `aligned`.
     """
-    pairs = _choose_aligned(scans, aligned, radius, prior)
+    pairs = _choose_aligned(scans, aligned, prior)
     if not len(pairs.held.source):
         return adjusted
     scale = _ROUNDS.gates_and_kernels(scans.typical_range, 1.25 * scans.noise)[-1]
@@ -93,14 +85,13 @@ def restore_open(scans: PlanarScans, aligned: Floats, adjusted: Floats, radius: 
     return _relax(edges, adjusted, _NUM_OPEN_ROUNDS)
 
 
-def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float, prior: StepPrior) -> Floats | None:
+def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, prior: StepPrior) -> Floats | None:
     """Restores torn steps and distributes the difference over the pairs that constrain the map.
 
     Args:
         scans: n scans in time order.
         steps: (n - 1, 3) T_scan_next before the refinement.
         poses: (n, 3) T_world_scan after the refinement.
-        radius: largest distance of neighbours in space, typical ranges.
         prior: prior of the steps. If a step is torn in `Slides` with this prior, it is shifted to its mode.
 
     Returns:
@@ -115,43 +106,42 @@ def restore_torn(scans: PlanarScans, steps: Floats, poses: Floats, radius: float
         return None
     weights = np.select([is_slid, is_lost], [slides.scores, before], np.maximum(after, _LEAST_WEIGHT))
     restored = np.select([is_slid[:, None], is_lost[:, None]], [slides.moved(kept), steps], kept)
-    edges = join_rows(_fitting_pairs(scans, poses, radius), Edges(later, later - 1, restored, weights))
-    scale = np.diag([1.0, 1.0, scans.typical_range**2])
-    edges = edges._replace(information=edges.information[:, None, None] * scale)
-    return _relax(edges, poses, _NUM_TORN_ROUNDS)
+    return _relax_steps(scans, poses, _fitting_pairs(scans, poses), restored, weights)
 
 
-def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides, radius: float) -> Floats:
+def restore_slid(scans: PlanarScans, poses: Floats, slides: Slides) -> Floats:
     """Puts slid steps back to their modes, and distributes the difference over the pairs that do not cross them.
 
     Args:
         scans: n scans in time order.
         poses: (n, 3) T_world_scan.
         slides: slides of their steps, from `slid_steps`.
-        radius: largest distance of neighbours in space, typical ranges.
 
     Returns:
         (n, 3) T_world_scan. Do not align them again, because the steps would slide again.
     """
-    later, steps = np.arange(1, len(poses)), np.asarray(se2.relative(poses[:-1], poses[1:]))
+    steps = np.asarray(se2.relative(poses[:-1], poses[1:]))
     is_moved = slides.is_torn & (slides.scores > WEAK_SCORE)
-    pairs = _fitting_pairs(scans, poses, radius)
+    pairs = _fitting_pairs(scans, poses)
     crossed = np.append(0, np.cumsum(is_moved))
+    # Pairs up to this number of steps apart that cross a slid step have slid with it.
     # Scans that have collapsed onto each other hold each other there.
-    is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > _FAR_STEPS)
+    is_kept = (crossed[pairs.source] == crossed[pairs.target]) | (np.abs(pairs.source - pairs.target) > 20)
     restored = np.where(is_moved[:, None], slides.moved(steps), steps)
-    edges = join_rows(
-        take_rows(pairs, np.flatnonzero(is_kept)),
-        Edges(later, later - 1, restored, np.maximum(slides.scores, _LEAST_WEIGHT)),
-    )
+    return _relax_steps(scans, poses, take_rows(pairs, is_kept), restored, np.maximum(slides.scores, _LEAST_WEIGHT))
+
+
+def _relax_steps(scans: PlanarScans, poses: Floats, pairs: Edges, steps: Floats, weights: Floats) -> Floats:
+    """Relaxes pairs and weighted steps together; the information of `pairs` is their weights, too."""
+    later = np.arange(1, len(poses))
+    edges = join_rows(pairs, Edges(later, later - 1, steps, weights))
     scale = np.diag([1.0, 1.0, scans.typical_range**2])
-    edges = edges._replace(information=edges.information[:, None, None] * scale)
-    return _relax(edges, poses, _NUM_TORN_ROUNDS)
+    return _relax(edges._replace(information=edges.information[:, None, None] * scale), poses, _NUM_TORN_ROUNDS)
 
 
-def _fitting_pairs(scans: PlanarScans, poses: Floats, radius: float) -> Edges:
+def _fitting_pairs(scans: PlanarScans, poses: Floats) -> Edges:
     """Returns edges of the pairs that fit, without steps; their information is the scores (e,)."""
-    source, target = choose_pairs(poses, radius * scans.typical_range)
+    source, target = choose_pairs(poses, _RADIUS * scans.typical_range)
     is_pair = source != target + 1
     source, target = source[is_pair], target[is_pair]
     relative = np.asarray(se2.relative(poses[target], poses[source]))
@@ -190,14 +180,16 @@ class _AlignedPairs(NamedTuple):
     held: Edges
 
 
-def _choose_aligned(scans: PlanarScans, poses: Floats, radius: float, prior: StepPrior | None) -> _AlignedPairs:
+def _choose_aligned(scans: PlanarScans, poses: Floats, prior: StepPrior | None) -> _AlignedPairs:
     """Chooses the pairs to align at these poses; instead of a torn step, `held` has its most probable shift."""
-    source, target = choose_pairs(poses, radius * scans.typical_range)
+    source, target = choose_pairs(poses, _RADIUS * scans.typical_range)
     if prior is None:
-        return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), _NO_EDGES)
+        none = take_rows(pose_steps(poses, scans.typical_range), np.zeros(0, np.int64))
+        return _AlignedPairs(source, target, np.broadcast_to(np.eye(3), (len(source), 3, 3)), none)
     slides = slide_steps(scans, se2.relative(poses[:-1], poses[1:]), prior)
     crossed = np.append(0, np.cumsum(slides.is_torn))
-    is_kept = (crossed[source] == crossed[target]) | (source - target > _FEW_STEPS)
+    # A pair of scans more steps apart may cross a torn step.
+    is_kept = (crossed[source] == crossed[target]) | (source - target > 3)
     source, target = source[is_kept], target[is_kept]
     relative = se2.relative(poses[target], poses[source])
     across = np.eye(3) - slide_steps(scans, relative, pairs=(source, target)).open_directions(relative)
@@ -246,6 +238,7 @@ def _linearise(scans: PlanarScans, pairs: _AlignedPairs, poses: Floats, scale: F
     """Linearises all pairs at these poses, gate and kernel."""
     source, target, across, _ = pairs
     relative = se2.relative(poses[target], poses[source])
-    stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / _ROUND_DISTANCES)))
+    # Beams of the sources are left out so that a round has fewer distances than this: about two seconds on two cores.
+    stride = max(1, int(np.ceil(len(source) * scans.mask.shape[1] ** 2 / 1.5e9)))
     information, gradient = linearise_pairs(scans, source, target, relative, scale, stride=stride)
     return Edges(source, target, relative, across @ information @ across), np.einsum("eij,ej->ei", across, gradient)

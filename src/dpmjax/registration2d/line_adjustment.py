@@ -26,12 +26,6 @@ _NUM_BESIDE = 2
 # In standard deviations of the range noise: half the length of line that a beam is compared with; largest distance of
 # a beam from its line; deviation of walls from a straight line, which bounds the weights of grazing beams.
 _WINDOW, _GATE, _ROUGHNESS = 6.0, 4.0, 0.2
-# Residuals above this number of standard deviations lose most of their weight.
-_OUTLIER = 3.0
-# A wall is bent if the mean square of its normalised residuals is above this.
-_MAX_CHI2 = 1.15
-# Points are a line if their variance along it is this many times the variance across it.
-_MIN_SLENDERNESS = 2.0
 # Number of neighbouring scans that share lines with a scan, spread evenly by nearness within the radius, typical
 # ranges.
 _NUM_NEIGHBOURS, _RADIUS = 48, 1.2
@@ -118,7 +112,8 @@ def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, 
         radius, angle = jnp.hypot(difference, xy), 0.5 * jnp.arctan2(xy, difference)
         fitted_x, fitted_y = -jnp.sin(angle), jnp.cos(angle)
         sign = jnp.where(fitted_x * normal_x + fitted_y * normal_y < 0, -1.0, 1.0)
-        is_slender = half_sum + radius > _MIN_SLENDERNESS * (half_sum - radius)
+        # Points are a line if their variance along it is this many times the variance across it.
+        is_slender = half_sum + radius > 2.0 * (half_sum - radius)
         normal_x = jnp.where(is_slender, sign * fitted_x, normal_x)
         normal_y = jnp.where(is_slender, sign * fitted_y, normal_y)
     stray = (weight * (_wide(normal_x) * x + _wide(normal_y) * y) ** 2).sum((1, 2))
@@ -127,7 +122,8 @@ def _fit_lines(beams: _Beams, normals: Float[Array, "b 2"], noise: Float[Array, 
     here = normal_y * mean_x - normal_x * mean_y
     length = jnp.maximum((weight * along**2).sum((1, 2)), 1e-12)
     shares = weight * (_wide(1.0 / total) + along * _wide(here / length))
-    is_line = is_slender & (chi2 < _MAX_CHI2) & (counts.sum((1, 2)) > 5)
+    # A wall is bent if the mean square of its normalised residuals is above this.
+    is_line = is_slender & (chi2 < 1.15) & (counts.sum((1, 2)) > 5)
     return _Fit(normal_x, normal_y, shares, 1.0 / total + here**2 / length, is_line)
 
 
@@ -148,7 +144,8 @@ def _linearise(
     slant = lines.x * own_x + lines.y * own_y
     squared_slant = slant**2 / jnp.maximum(own_x**2 + own_y**2, 1e-12)
     variance = noise**2 * (squared_slant + _ROUGHNESS**2) + lines.variance
-    robust = 1.0 / (1.0 + residual**2 / (_OUTLIER**2 * variance)) ** 2
+    # Residuals above this number of standard deviations lose most of their weight.
+    robust = 1.0 / (1.0 + residual**2 / (3.0**2 * variance)) ** 2
     weight = jnp.where(own.mask & lines.is_line, robust / variance, 0.0)
     cos, sin, share = jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2]), lines.shares.sum(2)
     turn = (lines.shares * (_wide(lines.y) * beams.along_x - _wide(lines.x) * beams.along_y)).sum(2)

@@ -7,7 +7,6 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +30,6 @@ _NEARBY = 0.15
 _MAX_RADIUS, _MIN_WAY = 2.25, 2.25
 # Largest number of candidates in a round.
 _MAX_CANDIDATES = 2000
-# A pair is matched again where its relative pose was corrected by more than `_NEARBY`, or by this turn.
-_MOVED_TURN = 0.15
 # Number of scans before and after the target that its submap holds.
 _SUBMAP_WIDTH = 2
 # Least robust share of matched beams, and largest share of beams that contradict their partner scan.
@@ -42,21 +39,9 @@ _MIN_EIGENVALUE = 0.03
 # Least number of agreeing loops; largest number of scans between them; and the limits of agreement: translation in
 # typical ranges, radians.
 _MIN_SUPPORT, _NEIGHBOURHOOD, _AGREEMENT = 2, 6, (0.045, 0.08)
-# Weight of a step relative to a loop: number of loops that must contradict a step before the graph rejects it.
-_STEP_TRUST = 30.0
-
-
-@dataclass(frozen=True)
-class LoopConfig:
-    """Settings of the loop search. Lengths are in typical ranges of the scans.
-
-    Attributes:
-        num_rounds: number of searches. Each search starts from the corrected poses of the previous one.
-        drift: error of a relative pose as a share of the travelled distance. It limits the search for loops.
-    """
-
-    num_rounds: int = 3
-    drift: float = 0.05
+# Number of searches, each from the corrected poses of the previous one. Error of a relative pose as a share of the
+# travelled distance: a larger one finds loops after more drift, among more candidates.
+_NUM_ROUNDS, _DRIFT = 3, 0.05
 
 
 class LoopResult(NamedTuple):
@@ -73,30 +58,27 @@ class LoopResult(NamedTuple):
     weights: Floats
 
 
-def correct_by_loops(
-    scans: PlanarScans, poses: Floats, config: LoopConfig | None = None, *, steps: Edges | None = None
-) -> LoopResult:
+def correct_by_loops(scans: PlanarScans, poses: Floats, steps: Edges | None = None) -> LoopResult:
     """Corrects the drift of a trajectory by loop closures.
 
     Args:
         scans: n scans in time order.
         poses: (n, 3) initial poses T_world_scan: locally correct, with drift.
-        config: settings.
         steps: edges between neighbours in time; None: those of `poses`.
 
     Returns:
         LoopResult; without a loop the poses are the initial ones.
     """
-    config = config or LoopConfig()
     steps = steps or pose_steps(poses, scans.typical_range)
     loops = take_rows(steps, np.zeros(0, np.int64))
     # The graph may reject a step with a weak score like a loop.
     is_weak = weak_steps(scans, poses, np.arange(len(poses)))
-    step_trust = np.where(is_weak, 1.0, _STEP_TRUST)
+    # Weight of a step relative to a loop: number of loops that must contradict a step before the graph rejects it.
+    step_trust = np.where(is_weak, 1.0, 30.0)
     found, weights, tried = loops, np.zeros(0), dict[tuple[int, int], Floats]()
-    for _ in range(config.num_rounds):
-        new = _untried(find_candidates(poses, config, scans.typical_range), poses, tried, scans.typical_range)
-        more = _find_loops(scans, poses, new, config)
+    for _ in range(_NUM_ROUNDS):
+        new = _untried(find_candidates(poses, scans.typical_range), poses, tried, scans.typical_range)
+        more = _find_loops(scans, poses, new)
         is_matched_again = np.isin(found.source * len(poses) + found.target, more.source * len(poses) + more.target)
         found = join_rows(take_rows(found, ~is_matched_again), more)
         loops = take_rows(found, count_support(found, poses, scans.typical_range) >= _MIN_SUPPORT)
@@ -115,18 +97,19 @@ def _untried(pairs: Pairs, poses: Floats, tried: dict[tuple[int, int], Floats], 
     names = list(zip(source.tolist(), target.tolist(), strict=True))
     before = np.array([tried.get(name, np.full(3, np.inf)) for name in names]).reshape(-1, 3)
     with np.errstate(invalid="ignore"):
-        is_new = ~se2.is_within(predicted - before, _NEARBY * typical_range, _MOVED_TURN)
+        # A pair is matched again where its relative pose was corrected by more than `_NEARBY`, or by this turn.
+        is_new = ~se2.is_within(predicted - before, _NEARBY * typical_range, 0.15)
     tried.update((name, pose) for name, pose, new in zip(names, predicted, is_new, strict=True) if new)
     return source[is_new], target[is_new]
 
 
-def _find_loops(scans: PlanarScans, poses: Floats, pairs: Pairs, config: LoopConfig) -> Edges:
+def _find_loops(scans: PlanarScans, poses: Floats, pairs: Pairs) -> Edges:
     """Matches pairs of scans of one trajectory and returns those that fit."""
     unit, (source, target) = scans.typical_range, pairs
     matches = PairMatches(np.zeros((len(source), 3)), np.zeros(len(source)), np.zeros((len(source), 3, 3)))
     for start in range(0, len(source), _BATCH):
         part = slice(start, start + _BATCH)
-        for kept, found in zip(matches, _match(scans, poses, source[part], target[part], config), strict=True):
+        for kept, found in zip(matches, _match(scans, poses, source[part], target[part]), strict=True):
             kept[part] = found
     fits = matches.fitness > _MIN_FITNESS
     fits &= matches.weakest_eigenvalue() > _MIN_EIGENVALUE * scans.num_on_line[source] * _REFINE.source_share(scans)
@@ -136,14 +119,14 @@ def _find_loops(scans: PlanarScans, poses: Floats, pairs: Pairs, config: LoopCon
     return Edges(source[fits], target[fits], matches.poses[fits], information)
 
 
-def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> Pairs:
+def find_candidates(poses: Floats, typical_range: float) -> Pairs:
     """Finds pairs of scans that may overlap: a later one (source) and an earlier one (target)."""
     way, nearby = se2.driven_lengths(poses), 2.0 * _NEARBY * typical_range
-    radius = min(_MAX_RADIUS * typical_range, nearby + config.drift * way[-1])
+    radius = min(_MAX_RADIUS * typical_range, nearby + _DRIFT * way[-1])
     first, second = scipy.spatial.cKDTree(poses[:, :2]).query_pairs(radius, output_type="ndarray").T
     apart = way[second] - way[first]
     distance = np.hypot(*(poses[second, :2] - poses[first, :2]).T)
-    keep = (apart > _MIN_WAY * typical_range) & (distance < nearby + config.drift * apart) & (second - first > 5)
+    keep = (apart > _MIN_WAY * typical_range) & (distance < nearby + _DRIFT * apart) & (second - first > 5)
     source, target = second[keep], first[keep]
     if len(source) > _MAX_CANDIDATES:
         # Nearer pairs overlap more often; random factors on their distances keep some far pairs among the candidates.
@@ -153,13 +136,13 @@ def find_candidates(poses: Floats, config: LoopConfig, typical_range: float) -> 
     return source.astype(np.int64), target.astype(np.int64)
 
 
-def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices, config: LoopConfig) -> PairMatches:
+def _match(scans: PlanarScans, poses: Floats, source: Indices, target: Indices) -> PairMatches:
     """Matches scans to submaps around their targets, one batch of candidates."""
     unit, way = scans.typical_range, se2.driven_lengths(poses)
     submaps, ones = _build_submaps(scans, poses, target), scans.take(source)
     predicted = se2.relative(poses[target], poses[source])
     # The prior has the standard deviation of the drift: it constrains the position along a corridor.
-    sigma = 0.045 * unit + 0.5 * config.drift * (way[source] - way[target])
+    sigma = 0.045 * unit + 0.5 * _DRIFT * (way[source] - way[target])
     belief = np.stack([sigma, sigma, np.full_like(sigma, np.inf)], axis=-1) ** -2.0
     prior = PairPrior(predicted, (0.015 * unit) ** 2 * belief)
     matches = match_pairs(ones, submaps, _guesses(predicted, unit), _SEARCH, prior)

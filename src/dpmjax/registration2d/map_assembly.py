@@ -21,7 +21,7 @@ import scipy.sparse.csgraph
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
-from dpmjax.registration2d.pair_search import Candidates, Hypotheses, chance_level, noisy_share
+from dpmjax.registration2d.pair_search import Hypotheses, chance_level, noisy_share
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import compare_pairs
 
@@ -32,16 +32,10 @@ _AGREEMENT = (0.06, 0.1)
 _MIN_SHARE, _SIGMA = 0.08, (0.0045, 0.01)
 # Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 4.0
-# Weight of the matched beams of neighbours in time, where there is an order.
-_NEXT_WEIGHT = 4.0
 # Largest distance of scans that score each other, in typical ranges, and largest number of nearest scans that do.
 _RADIUS, _NUM_SCORERS = 1.2, 32
 # Poses times placed scans that are compared at a time: 8 MB a table.
 _BLOCK = 1 << 20
-# Number of maps, each grown from a different pair; the best one is kept.
-_NUM_SEEDS = 6
-# Rounds in which scans may change their pose.
-_NUM_REVISIONS = 3
 # Weakest connections at which a block is cut off, and poses that are tried for a block.
 _NUM_CUTS, _NUM_BLOCK_POSES = 6, 48
 
@@ -93,7 +87,8 @@ class PoseScorer(NamedTuple):
         # Without this, chance matches would favour poses with more overlap, such as one room on top of another.
         is_next = self.is_ordered & (np.abs(source - target) == 1)
         matched = np.maximum(views.matched - np.where(is_next, 0.5, 1.0) * self.chance, 0.0)
-        matched *= np.where(is_next, _NEXT_WEIGHT, 1.0)
+        # Weight of the matched beams of neighbours in time, where there is an order.
+        matched *= np.where(is_next, 4.0, 1.0)
         contradicted = np.maximum(views.contradicted - self.noisy_share * views.visible, 0.0)
         return np.asarray(matched - _CONTRADICTION_WEIGHT * contradicted, np.float64)
 
@@ -128,7 +123,7 @@ def is_firmly_more(score: Floats | np.float64, reference: Floats | np.float64) -
     return np.asarray(score > reference + 0.02 * np.abs(reference))
 
 
-def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) -> Floats:
+def assemble(scans: PlanarScans, candidates: Hypotheses, *, is_ordered: bool) -> Floats:
     """Assembles one map of all scans from candidates of their pairs, without initial poses.
 
     Args:
@@ -140,7 +135,7 @@ def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) ->
         (n, 3) T_world_scan; the first pose is zero.
     """
     scorer = PoseScorer(scans, chance_level(candidates), noisy_share(scans, candidates), is_ordered)
-    hypotheses, everyone = Hypotheses.of(candidates, 0.0).in_both_directions(), np.arange(len(scans))
+    hypotheses, everyone = candidates.take(candidates.scores > 0.0).in_both_directions(), np.arange(len(scans))
     maps = [settle(_grow(hypotheses, scorer, seed), hypotheses, scorer) for seed in _choose_seeds(hypotheses)]
     scores = [scorer.score(everyone, poses, everyone, poses).sum() for poses in maps]
     poses = maps[int(np.argmax(scores))] if maps else np.zeros((len(scans), 3))
@@ -151,22 +146,21 @@ def assemble(scans: PlanarScans, candidates: Candidates, *, is_ordered: bool) ->
     return np.asarray(se2.relative(poses[0], poses))
 
 
-def agreeing_edges(poses: Floats, candidates: Candidates, scans: PlanarScans) -> Edges:
+def agreeing_edges(poses: Floats, candidates: Hypotheses, scans: PlanarScans) -> Edges:
     """Returns an edge for each pair with a candidate that agrees with the map: its nearest candidate."""
     typical_range, num_beams = scans.typical_range, scans.mask.sum(1)
-    beams = num_beams[candidates.source] + num_beams[candidates.target]
-    shares = candidates.scores / np.maximum(beams, 1.0)[:, None]
+    shares = candidates.scores / np.maximum(num_beams[candidates.source] + num_beams[candidates.target], 1.0)
     here = se2.relative(poses[candidates.target], poses[candidates.source])
-    off = se2.relative(here[:, None], candidates.poses)
-    distance = np.hypot(off[..., 0], off[..., 1]) / (_AGREEMENT[0] * typical_range)
-    turn = np.abs(se2.wrap_angle(off[..., 2])) / _AGREEMENT[1]
+    off = se2.relative(here, candidates.poses)
+    distance = np.hypot(off[:, 0], off[:, 1]) / (_AGREEMENT[0] * typical_range)
+    turn = np.abs(se2.wrap_angle(off[:, 2])) / _AGREEMENT[1]
     mismatch = np.where(shares > _MIN_SHARE, np.maximum(distance, turn), np.inf)
-    best = mismatch.argmin(axis=1)
-    row = np.arange(len(best))
-    keep = mismatch[row, best] < 1.0
+    order = np.lexsort((mismatch, candidates.pair))
+    best = order[np.unique(candidates.pair[order], return_index=True)[1]]
+    best = best[mismatch[best] < 1.0]
     sigma = np.array(_SIGMA)[[0, 0, 1]] * [typical_range, typical_range, 1.0]
-    information = shares[row, best][keep][:, None, None] * np.diag(1.0 / sigma**2)
-    return Edges(candidates.source[keep], candidates.target[keep], candidates.poses[row, best][keep], information)
+    information = shares[best][:, None, None] * np.diag(1.0 / sigma**2)
+    return Edges(candidates.source[best], candidates.target[best], candidates.poses[best], information)
 
 
 def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
@@ -175,7 +169,8 @@ def _choose_seeds(hypotheses: Hypotheses) -> list[int]:
     used: set[int] = set()
     for row in np.argsort(-hypotheses.scores, kind="stable"):
         pair = {int(hypotheses.source[row]), int(hypotheses.target[row])}
-        if len(chosen) < _NUM_SEEDS and not pair & used:
+        # Number of maps, each grown from a different pair; the best one is kept.
+        if len(chosen) < 6 and not pair & used:
             chosen.append(int(row))
             used |= pair
     return chosen
@@ -207,7 +202,8 @@ def _grow(hypotheses: Hypotheses, scorer: PoseScorer, seed: int) -> Floats:
 
 def settle(poses: Floats, hypotheses: Hypotheses, scorer: PoseScorer) -> Floats:
     """Moves scans to better pose hypotheses until no scan moves or the limit of rounds is reached."""
-    for _ in range(_NUM_REVISIONS):
+    # Rounds in which scans may change their pose.
+    for _ in range(3):
         poses, num_moved = _revise(poses, hypotheses, scorer)
         if not num_moved:
             break

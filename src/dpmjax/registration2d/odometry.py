@@ -20,8 +20,6 @@ from dpmjax.registration2d.steps import StepPrior, slide_steps
 
 # Score above which a step is clear.
 _CLEAR_SCORE = 0.45
-# Longer steps of the odometry are not used as guesses, typical ranges.
-_FARTHEST = 2.0
 # Least number of clear steps for a calibration, and for the detection of a fault.
 _LEAST_STEPS = 5
 # Least translation (typical ranges) and turn (radians) from which a scale or a sign is estimated.
@@ -125,7 +123,8 @@ def match_clear_steps(scans: PlanarScans, odometry: Floats) -> ClearSteps:
     source, target = scans.take(slice(1, None)), scans.take(slice(len(scans) - 1))
     ways = [odometry, *(change(odometry) for change in _FAULTS.values())]
     told = np.stack([se2.relative(poses[:-1], poses[1:]) for poses in ways], axis=1)
-    is_within = np.hypot(told[..., 0], told[..., 1]) < _FARTHEST * scans.typical_range
+    # Longer steps of the odometry are not used as guesses, typical ranges.
+    is_within = np.hypot(told[..., 0], told[..., 1]) < 2.0 * scans.typical_range
     rough = match_pairs(source, target, np.where(is_within[..., None], told, 0.0), COARSE).poses
     guesses = np.stack([match_near(source, target, "plane").poses, rough], axis=1)
     steps = match_pairs(source, target, guesses, FINE).poses

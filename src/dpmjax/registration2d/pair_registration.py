@@ -45,8 +45,7 @@ def register_planar(source: ArrayLike, target: ArrayLike) -> ScanRegistration:
     """
     scans = _stacked(source, target)
     first, second = np.zeros(1, np.int64), np.ones(1, np.int64)
-    found = search_pairs(scans, first, second, _SEARCH)
-    guesses = found.poses[0, np.isfinite(found.scores[0])]
+    guesses = search_pairs(scans, first, second, _SEARCH).poses
     rows = np.zeros(len(guesses), np.int64)
     matches = match_pairs(scans.take(rows), scans.take(rows + 1), guesses[:, None], FINE)
     agreement, visible = find_evidence(scans, rows, rows + 1, matches.poses)

@@ -7,7 +7,7 @@ shifts of one turn. The views of both scans then refine the best poses on ever f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,27 +24,25 @@ from dpmjax.scans.apart import apart
 # Pairs that are searched at a time, and images that are transformed at a time: their spectra take 250 MB, and fit into
 # the cache.
 _SEARCH_BATCH, _IMAGES = 512, 16
-# Weight of a cell of free space relative to a cell of surface.
-_FREE_WEIGHT = 0.6
 # Least difference of two candidates of a pair: typical ranges, and radians.
 APART = 0.12
 # Number of matched beams that outweigh a contradicting one.
 _CONTRADICTION_WEIGHT = 2.0
 
 
-@dataclass(frozen=True)
-class CorrelativeConfig:
+class CorrelativeConfig(NamedTuple):
     """Settings of the search. Lengths are in typical ranges of the scans.
 
     Attributes:
-        num_cells: number of cells along a side of the images; a scan fills the inner half, so that no shift wraps.
+        num_cells: number of cells along a side of the images, a multiple of 4 and of `block`. A scan fills the inner
+            half, so that no shift wraps.
         cell: side of a cell.
         num_turns: number of turns in a circle.
         num_peaks: number of shifts kept for each turn, from different blocks of cells.
         block: number of cells along a block.
         num_candidates: number of poses kept for each pair.
         num_levels: number of local grids. Each has half the spacing of the previous grid.
-        max_shift: largest shift; None: half the side of the images.
+        max_shift: largest shift, at most half the side of the images.
     """
 
     num_cells: int = 128
@@ -54,21 +52,17 @@ class CorrelativeConfig:
     block: int = 16
     num_candidates: int = 4
     num_levels: int = 4
-    max_shift: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.num_cells % self.block or self.num_cells % 4:
-            raise ValueError(f"num_cells: expected a multiple of 4 and of block {self.block}, got {self.num_cells}")
+    max_shift: float = np.inf
 
 
-class Candidates(NamedTuple):
-    """Relative poses of pairs of scans, k for each of p pairs, the best first.
+class Hypotheses(NamedTuple):
+    """Scored relative poses of pairs of scans. A pair may have several, side by side, the best first.
 
     Attributes:
-        source: (p,) rows.
-        target: (p,) rows.
-        poses: (p, k, 3) T_target_source.
-        scores: (p, k) matched less weighted contradicting beams; minus infinity for missing candidates.
+        source: (h,) rows.
+        target: (h,) rows.
+        poses: (h, 3) T_target_source.
+        scores: (h,) matched less weighted contradicting beams, or the score that the maker says.
     """
 
     source: Indices
@@ -76,36 +70,11 @@ class Candidates(NamedTuple):
     poses: Floats
     scores: Floats
 
-
-def chance_level(candidates: Candidates) -> float:
-    """Estimates the score of a wrong pose of a pair: the median of second candidates, which are mostly wrong."""
-    second = candidates.scores[:, 1]
-    second = second[np.isfinite(second)]
-    return max(0.0, float(np.median(second))) if len(second) else 0.0
-
-
-def noisy_share(scans: PlanarScans, candidates: Candidates) -> float:
-    """Computes a bound on the share of beams that range noise makes contradictory, from the best-scored pairs."""
-    best = np.argsort(-candidates.scores[:, 0])[: len(scans)]
-    views = compare_pairs(scans, candidates.source[best], candidates.target[best], candidates.poses[best, 0])
-    share = views.contradicted / np.maximum(views.visible, 1.0)
-    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
-
-
-class Hypotheses(NamedTuple):
-    """Scored relative poses of pairs: (h,) rows, (h, 3) T_target_source, (h,) scores; a pair may have several."""
-
-    source: Indices
-    target: Indices
-    poses: Floats
-    scores: Floats
-
-    @classmethod
-    def of(cls, candidates: Candidates, least_score: float = -np.inf) -> Hypotheses:
-        """Makes hypotheses of all candidates with a score above `least_score`."""
-        row, column = np.nonzero(candidates.scores > least_score)
-        poses, scores = candidates.poses[row, column], candidates.scores[row, column]
-        return cls(candidates.source[row], candidates.target[row], poses, scores)
+    @property
+    def pair(self) -> Indices:
+        """Number (h,) of the pair of each hypothesis, in order from 0."""
+        is_new = (np.diff(self.source) != 0) | (np.diff(self.target) != 0)
+        return np.cumsum(np.append(False, is_new))[: len(self.source)]
 
     def in_both_directions(self) -> Hypotheses:
         """Returns all hypotheses, then all of them with exchanged scans."""
@@ -118,6 +87,22 @@ class Hypotheses(NamedTuple):
     def world_poses(self, poses: Floats) -> Floats:
         """Computes the world pose (h, 3) of each source from the world pose of its target."""
         return np.asarray(se2.compose(poses[self.target], self.poses))
+
+
+def chance_level(found: Hypotheses) -> float:
+    """Estimates the score of a wrong pose of a pair: the median of second hypotheses, which are mostly wrong."""
+    first = np.unique(found.pair, return_index=True)[1]
+    second = found.scores[np.setdiff1d(first + 1, np.append(first, len(found.scores)))]
+    return max(0.0, float(np.median(second))) if len(second) else 0.0
+
+
+def noisy_share(scans: PlanarScans, found: Hypotheses) -> float:
+    """Computes a bound on the share of beams that range noise makes contradictory, from the best-scored pairs."""
+    first = found.take(np.unique(found.pair, return_index=True)[1])
+    best = first.take(np.argsort(-first.scores)[: len(scans)])
+    views = compare_pairs(scans, best.source, best.target, best.poses)
+    share = views.contradicted / np.maximum(views.visible, 1.0)
+    return 3.0 * float(np.percentile(share, 90)) if len(share) else 0.0
 
 
 def poses_apart(poses: Floats, scores: Floats, typical_range: float, count: int) -> Indices:
@@ -155,7 +140,8 @@ def _spectra(
         off = (distance - surface[rows].take(k, axis=1)) * slanted / np.float32(0.6 * cell)
         hit = np.exp(np.float32(-0.5) * off**2) * usable
         is_free = usable & (distance < near[rows].take(k, axis=1) - np.float32(cell) / slanted)
-        images = np.stack([hit, hit - np.float32(_FREE_WEIGHT) * is_free])
+        # Weight of a cell of free space relative to a cell of surface.
+        images = np.stack([hit, hit - np.float32(0.6) * is_free])
         spectra[:, rows] = scipy.fft.rfft2(images, s=(config.num_cells,) * 2)
     return spectra
 
@@ -176,7 +162,7 @@ def _best_shifts(
 
 def search_pairs(
     scans: PlanarScans, source: Indices, target: Indices, config: CorrelativeConfig, turns: Booleans | None = None
-) -> Candidates:
+) -> Hypotheses:
     """Finds the best-scored relative poses of pairs of scans, without initial poses.
 
     Args:
@@ -187,34 +173,36 @@ def search_pairs(
         turns: (p, num_turns) True for headings of T_target_source to try. Turn k is k 2 pi / num_turns. None: all.
 
     Returns:
-        Candidates.
+        Hypotheses, in the order of the pairs.
     """
     # Pairs with one source lie side by side, so that few scans are turned for a batch.
-    order, found = np.lexsort((target, source)), []
+    order, numbers, found = np.lexsort((target, source)), [], []
     for start in range(0, max(len(order), 1), _SEARCH_BATCH):
         rows = order[start : start + _SEARCH_BATCH]
         tried = None if turns is None else turns[rows]
-        found.append(_search_batch(scans, (source[rows], target[rows]), config, tried))
-    joined, back = join_rows(*found), np.argsort(order)
-    return Candidates(joined.source[back], joined.target[back], joined.poses[back], joined.scores[back])
+        number, some = _search_batch(scans, (source[rows], target[rows]), config, tried)
+        numbers.append(rows[number])
+        found.append(some)
+    return join_rows(*found).take(np.argsort(np.concatenate(numbers), kind="stable"))
 
 
-def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None) -> Candidates:
-    """Finds candidates of one batch of pairs."""
+def _search_batch(
+    scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, turns: Booleans | None
+) -> tuple[Indices, Hypotheses]:
+    """Finds hypotheses of one batch of pairs, and the number of the pair of each."""
     unit, (source, target) = scans.typical_range, pairs
     cell, size = config.cell * unit, config.num_cells
     seen = scans.views
     views = tuple(np.asarray(x) for x in (seen.surface, seen.near, seen.slant, seen.is_seen))
     distance = np.minimum(np.arange(size), size - np.arange(size)) * config.cell
-    limit = np.inf if config.max_shift is None else config.max_shift
-    outside = np.where(np.hypot(distance, distance[:, None]) > limit, -np.inf, 0.0).astype(np.float32)
+    outside = np.where(np.hypot(distance, distance[:, None]) > config.max_shift, -np.inf, 0.0).astype(np.float32)
     used, still = np.unique(target, return_inverse=True)
     targets = _spectra(tuple(x[used] for x in views), 0.0, cell, config)
     poses = np.zeros((len(source), config.num_turns, config.num_peaks, 3))
     scores = np.full(poses.shape[:-1], -np.inf)
-    for number in range(config.num_turns):
-        rows = np.arange(len(source)) if turns is None else np.flatnonzero(turns[:, number])
-        turn = 2 * np.pi * number / config.num_turns
+    for k in range(config.num_turns):
+        rows = np.arange(len(source)) if turns is None else np.flatnonzero(turns[:, k])
+        turn = 2 * np.pi * k / config.num_turns
         used, turned = np.unique(source[rows], return_inverse=True)
         sources = _spectra(tuple(x[used] for x in views), turn, cell, config).conj() if len(used) else targets
         for first in range(0, len(rows), _IMAGES):
@@ -222,37 +210,40 @@ def _search_batch(scans: PlanarScans, pairs: Pairs, config: CorrelativeConfig, t
             i, j = turned[some], still[rows[some]]
             product = sources[0, i] * targets[1, j] + sources[1, i] * targets[0, j]
             score, shift = _best_shifts(product, outside, config)
-            scores[rows[some], number], poses[rows[some], number, :, :2] = score, cell * shift
-        poses[:, number, :, 2] = se2.wrap_angle(turn)
-    found = Candidates(source, target, poses.reshape(len(source), -1, 3), scores.reshape(len(source), -1))
-    # Two candidates may converge to one pose in the refinement.
-    return _keep_apart(refine_candidates(scans, _keep_apart(found, config, unit), config), config, unit)
+            scores[rows[some], k], poses[rows[some], k, :, :2] = score, cell * shift
+        poses[:, k, :, 2] = se2.wrap_angle(turn)
+    all_pairs = np.repeat(np.arange(len(source)), config.num_turns * config.num_peaks)
+    everything = Hypotheses(source[all_pairs], target[all_pairs], poses.reshape(-1, 3), scores.ravel())
+    number, found = _keep_apart(all_pairs, everything, config, unit)
+    # Two hypotheses may converge to one pose in the refinement.
+    return _keep_apart(number, refine_candidates(scans, found, config), config, unit)
 
 
-def _keep_apart(found: Candidates, config: CorrelativeConfig, typical_range: float) -> Candidates:
-    """Selects the best poses of each pair that lie apart."""
-    shape = len(found.source), config.num_candidates
-    poses, scores = np.zeros((*shape, 3)), np.full(shape, -np.inf)
-    for row in range(len(found.source)):
-        kept = poses_apart(found.poses[row], found.scores[row], typical_range, config.num_candidates)
-        poses[row, : len(kept)], scores[row, : len(kept)] = found.poses[row, kept], found.scores[row, kept]
-    return found._replace(poses=poses, scores=scores)
+def _keep_apart(
+    number: Indices, found: Hypotheses, config: CorrelativeConfig, typical_range: float
+) -> tuple[Indices, Hypotheses]:
+    """Selects the best poses of each pair that lie apart; returns the numbers of their pairs, too."""
+    kept, ends = [np.zeros(0, np.int64)], np.searchsorted(number, np.arange(number.max(initial=-1) + 2))
+    for first, last in itertools.pairwise(ends):
+        own = slice(first, last)
+        kept.append(first + poses_apart(found.poses[own], found.scores[own], typical_range, config.num_candidates))
+    rows = np.concatenate(kept)
+    return number[rows], found.take(rows)
 
 
-def refine_candidates(scans: PlanarScans, found: Candidates, config: CorrelativeConfig) -> Candidates:
-    """Refines candidates on local grids of five steps along each axis, from a spacing of half a cell down.
+def refine_candidates(scans: PlanarScans, found: Hypotheses, config: CorrelativeConfig) -> Hypotheses:
+    """Refines hypotheses on local grids of five steps along each axis, from a spacing of half a cell down.
 
     Args:
         scans: n scans.
-        found: candidates of p pairs. Candidates without a finite score are not refined.
+        found: hypotheses.
         config: settings of the grids.
 
     Returns:
-        Candidates with the best poses near the given ones, in the given order.
+        Hypotheses with the best poses near the given ones, in the given order.
     """
     cell = config.cell * scans.typical_range
-    first, which = np.nonzero(np.isfinite(found.scores))
-    poses, scores = found.poses.copy(), np.full(found.scores.shape, -np.inf)
+    row, poses, scores = np.arange(len(found.scores)), found.poses, found.scores
     match, contradict, _ = scans.tolerances
     axis = np.arange(-2.0, 3.0)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -260,9 +251,9 @@ def refine_candidates(scans: PlanarScans, found: Candidates, config: Correlative
         share = 0.5 ** (level + 1)
         step = share * np.array([cell, cell, 2 * np.pi / config.num_turns])
         blurred = Tolerances.of(max(match, 0.7 * share * cell), max(contradict, 2.1 * share * cell))
-        places = poses[first, which][:, None] + grid * step
-        views = compare_pairs(scans, found.source[first], found.target[first], places, stride=4, tolerances=blurred)
-        score, row = views.matched - _CONTRADICTION_WEIGHT * views.contradicted, np.arange(len(first))
+        places = poses[:, None] + grid * step
+        views = compare_pairs(scans, found.source, found.target, places, stride=4, tolerances=blurred)
+        score = views.matched - _CONTRADICTION_WEIGHT * views.contradicted
         best = score.argmax(axis=1) if len(row) else row
-        poses[first, which], scores[first, which] = places[row, best], score[row, best]
+        poses, scores = places[row, best], np.asarray(score[row, best])
     return found._replace(poses=poses, scores=scores)

@@ -55,8 +55,6 @@ EngineOf = Callable[[Indices], Engine]
 
 # Up to this many scans without odometry are all registered.
 _MAX_WHOLE = 256
-# A fit is not refined if its map has a code length above this multiple of that of the refined initial poses.
-_LEAST_PROMISING = 1.15
 
 # Trajectories whose scans differ by less, in typical ranges and radians, have one refinement: it starts its search of
 # matching beams with three times this distance.
@@ -91,13 +89,6 @@ class RegistrationConfig:
         require_positive("min_turn", self.min_turn)
 
 
-# Usual shares of a registration that are done where a stage begins and ends; stages may be left out.
-_Stage = tuple[float, float]
-_MOTION, _CALIBRATION, _START = (0.0, 0.1), (0.1, 0.15), (0.15, 0.3)
-_FIT, _REFINED_START, _REFINED_FIT = (0.3, 0.45), (0.45, 0.65), (0.65, 0.8)
-_CHOICE, _RETRIAL, _BETWEEN = (0.8, 0.85), (0.85, 0.95), (0.95, 1.0)
-
-
 class RegistrationHooks(NamedTuple):
     """Functions that `register_scans` calls.
 
@@ -108,19 +99,11 @@ class RegistrationHooks(NamedTuple):
             ends, and the best of the candidates so far is kept.
         engine: called with the rows of the scans that are fitted, in the order of the fit; returns the `engine` of
             `fit_deepmapping`, which must report progress and handle stops. None: `deepmapping.fit`.
-        on_share: called with the finished share of the whole registration, which never falls.
     """
 
     on_progress: Callable[[str, float], None] = lambda _stage, _share: None
     stop: Callable[[], bool] = lambda: False
     engine: EngineOf | None = None
-    on_share: Callable[[float], None] = lambda _share: None
-
-    def report(self, stage: _Stage, name: str, share: float = 0.0) -> None:
-        """Reports the finished share of a stage, and of the registration."""
-        begins, ends = stage
-        self.on_progress(name, share)
-        self.on_share(begins + (ends - begins) * share)
 
 
 class Candidate(NamedTuple):
@@ -212,7 +195,7 @@ def register_scans(
     evidence = None
     # Initial poses from the scans alone, or zero, are no evidence.
     if given is not None and len(lines) > 1 and config.is_ordered:
-        hooks.report(_CALIBRATION, "calibration of the odometry")
+        hooks.on_progress("calibration of the odometry", 0.0)
         measured = given if odometry_poses is None else odometry_poses
         is_unknown = None if is_silent is None else np.logical_or.reduceat(is_silent, recording.chosen[:-1])
         evidence = calibrate_odometry(lines, measured[recording.chosen], is_silent=is_unknown)
@@ -224,19 +207,18 @@ def register_scans(
         found[DEEPMAPPING] = fitted.poses
     if config.refine and not hooks.stop():
         found |= _refined_candidates(run, found)
-    hooks.report(_CHOICE, "choice and assessment")
+    hooks.on_progress("choice and assessment", 0.0)
     kept, scores, assessment = _choose_mended(run, found)
     is_doubtful = evidence is not None and not evidence.is_mirrored and not assessment.is_trusted
     if is_doubtful and isinstance(start, str) and start == "auto" and config.refine and not hooks.stop():
-        report = partial(hooks.report, _RETRIAL, "the map from odometry cannot be trusted: registration without it")
-        report()
+        report = partial(hooks.on_progress, "the map from odometry cannot be trusted: registration without it")
+        report(0.0)
         poses = incremental_icp(lines).poses
         found[f"{START_NAMES['icp-plane']}, refined"] = refine(lines, poses, on_progress=report).poses
         kept, scores, assessment = _choose(run, found)
     if recording.motion is not None:
-        hooks.report(_BETWEEN, "poses between the registered scans")
+        hooks.on_progress("poses between the registered scans", 0.0)
     poses, lost = recording.aligned(found[kept])
-    hooks.on_share(1.0)
     candidates = {name: Candidate(found[name], score) for name, score in scores.items()}
     uncertain = np.union1d(recording.chosen[list(assessment.uncertain_scans)], lost).astype(int).tolist()
     is_trusted = assessment.is_trusted and not len(lost)
@@ -324,7 +306,7 @@ def _choose_scans(
     if config.min_distance is None:
         return choose_scans(scans, None, 1.0, 1.0)
     if motion is None and len(scans.points) > _MAX_WHOLE:
-        hooks.report(_MOTION, "odometry from the scans")
+        hooks.on_progress("odometry from the scans", 0.0)
         seen = np.flatnonzero(np.asarray(scans.mask).any(axis=1))
         motion = interpolate(len(scans.points), seen, scan_odometry(planar_scans(take_scans(scans, seen))))
     return choose_scans(scans, motion, config.min_distance, config.min_turn, is_silent)
@@ -335,10 +317,10 @@ def _start_poses(run: _Run, start: str, given: Floats | None) -> tuple[str, Floa
     if start == GIVEN_POSES and given is not None:
         return GIVEN_POSES, given[run.recording.chosen]
     name = START_NAMES[start]
-    run.hooks.report(_START, f"start: {name}")
+    run.hooks.on_progress(f"start: {name}", 0.0)
     match start:
         case "global":
-            return name, register_globally(run.lines).poses
+            return name, register_globally(run.lines)
         case "icp-plane" | "icp-point":
             return name, incremental_icp(run.lines, "plane" if start == "icp-plane" else "point").poses
     # Zero poses, and one scan alone, have no odometry.
@@ -379,10 +361,10 @@ def fit_in_order(
 def _fit(run: _Run, start: Floats | None, *, key: jax.Array) -> Fitted:
     """Fits the registered scans by the engine of the hooks, or by one that reports to them."""
     hooks, config, chosen = run.hooks, run.config, run.recording.chosen
-    hooks.report(_FIT, DEEPMAPPING)
+    hooks.on_progress(DEEPMAPPING, 0.0)
 
     def report(progress: Progress) -> None:
-        hooks.report(_FIT, DEEPMAPPING, progress.share)
+        hooks.on_progress(DEEPMAPPING, progress.share)
 
     def engine_of(order: Indices) -> Engine:
         if hooks.engine is not None:
@@ -409,8 +391,7 @@ def _refined_candidates(run: _Run, candidates: dict[str, Floats]) -> dict[str, F
     found: dict[str, Floats] = {}
 
     def add_refined(name: str, poses: Floats) -> None:
-        stage = _REFINED_START if name == start else _REFINED_FIT
-        report = partial(run.hooks.report, stage, f"{name}, refined")
+        report = partial(run.hooks.on_progress, f"{name}, refined")
         report(0.0)
         found[f"{name}, refined"] = refine(run.lines, poses, prior=run.prior, on_progress=report).poses
 
@@ -421,6 +402,7 @@ def _refined_candidates(run: _Run, candidates: dict[str, Floats]) -> dict[str, F
             continue  # its refinement would end at the same map
         scores = choose_trajectory(run.lines, {name: poses, **found}, prior=run.prior)[1]
         nats = [score.code_length for score in scores.values()]
-        if nats[0] <= _LEAST_PROMISING * nats[-1]:
+        # A fit is not refined if its map has a code length above this multiple of that of the refined initial poses.
+        if nats[0] <= 1.15 * nats[-1]:
             add_refined(name, poses)
     return found

@@ -102,17 +102,12 @@ def choose_trajectory(
 
     Args:
         scans: n scans.
-        candidates: (n, 3) poses by name.
+        candidates: (n, 3) poses by name; at least one.
         prior: prior of their steps; None without a prior.
 
     Returns:
         The name of the best, and the scores of all.
-
-    Raises:
-        ValueError: there is no candidate.
     """
-    if not candidates:
-        raise ValueError("candidates: expected at least one trajectory")
     scores = {
         name: Score(map_code_length(scans, poses), view_misfit(scans, poses), _surprise(poses, prior))
         for name, poses in candidates.items()

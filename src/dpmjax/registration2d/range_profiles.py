@@ -16,12 +16,9 @@ from jaxtyping import Array, Float, Int
 
 from dpmjax.geometry import se2
 from dpmjax.kept_programs import kept_jit
-from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, Tolerances, batches
-from dpmjax.registration2d.views import Views
+from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans, Tolerances, Views, batches
 from dpmjax.types import AnyArray
 
-# Largest sine by which a visible surface is turned away from the viewer.
-_MAX_AVERTED = 0.1
 # Odd minimax polynomial of the arctangent on [0, 1], the highest power first.
 _ARCTANGENT = (-0.01171913, 0.05264734, -0.11642647, 0.19354037, -0.33262283, 0.99997722)
 # Number of matched beams that outweigh a contradicting one; share of visible beams that noise makes contradictory.
@@ -79,8 +76,9 @@ def _look(
     is_jump = far - near > tolerances.jump
     off = jnp.where(is_jump, to_edge, jnp.abs(distance - views.surface[viewer, k])) * slant
     counts = views.mask[seen, beam] & views.is_seen[viewer, k]
+    # Largest sine by which a visible surface is turned away from the viewer.
     # A thin wall has two sides, and two rooms that share it must not match through it.
-    is_facing = x * normals[..., 0] + y * normals[..., 1] <= _MAX_AVERTED * distance
+    is_facing = x * normals[..., 0] + y * normals[..., 1] <= 0.1 * distance
     matched = jnp.where(counts & is_facing, jnp.exp(-0.5 * (off / tolerances.match) ** 2), 0.0)
     contradicted = counts & (distance < near - tolerances.contradict / slant)
     visible = counts & (distance < far + tolerances.contradict / slant)

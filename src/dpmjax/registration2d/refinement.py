@@ -6,7 +6,7 @@ If there is range noise, the scans are then adjusted to common lines (`line_adju
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from dpmjax.geometry import se2
 from dpmjax.registration2d.incremental import incremental_icp
 from dpmjax.registration2d.joint_alignment import align_all, restore_open, restore_slid, restore_torn
 from dpmjax.registration2d.line_adjustment import adjust_to_lines
-from dpmjax.registration2d.loop_closure import LoopConfig, correct_by_loops
+from dpmjax.registration2d.loop_closure import correct_by_loops
 from dpmjax.registration2d.pair_alignment import FINE, match_pairs
 from dpmjax.registration2d.planar_scans import Floats, PlanarScans, planar_scans
 from dpmjax.registration2d.quality import choose_trajectory, map_code_length
@@ -29,27 +29,10 @@ from dpmjax.types import ScanSet, with_short_repr
 # No loops are searched if all steps of the initial poses have a fitness above the first value and a weakest eigenvalue,
 # as a share of the beams, above the second one.
 _MIN_FITNESS, _MIN_EIGENVALUE = 0.35, 0.005
-# Largest number of repetitions of the alignment after torn steps are restored.
-_NUM_REPAIRS = 2
 # Slid steps are put back where the code length of the map falls by more than this share.
 _LEAST_GAIN = 0.005
-# Scans are adjusted to common lines above this range noise, in typical ranges.
-_MIN_NOISE = 1.5e-4
 # Shares of a refinement that are usually done after the steps, the loops and the joint alignment.
 _STEPS_SHARE, _LOOPS_SHARE, _ALIGNED_SHARE = 0.1, 0.4, 0.9
-
-
-@dataclass(frozen=True)
-class RefinementConfig:
-    """Settings of the refinement.
-
-    Attributes:
-        radius: largest distance of neighbours in space that are aligned, typical ranges.
-        loops: settings of the loop search of ordered scans; None: no search.
-    """
-
-    radius: float = 0.6
-    loops: LoopConfig | None = field(default_factory=LoopConfig)
 
 
 @with_short_repr
@@ -58,11 +41,9 @@ class Refined(NamedTuple):
 
     Attributes:
         poses: (n, 3) x, y, heading.
-        num_loops: number of loops in the kept trajectory.
     """
 
     poses: Floats
-    num_loops: int
 
     @property
     def T_world_scan(self) -> Floats:
@@ -74,7 +55,6 @@ class Refined(NamedTuple):
 def refine(
     scans: PlanarScans | ScanSet | ArrayLike,
     poses: ArrayLike,
-    config: RefinementConfig | None = None,
     *,
     prior: StepPrior | None = None,
     on_progress: Callable[[float], None] = lambda _share: None,
@@ -90,7 +70,6 @@ def refine(
             beams are left out. Or a ScanSet. Or PlanarScans: scans without an order are
             `planar_scans(scans, is_ordered=False)`.
         poses: initial poses, (n, 3) x, y, heading or (n, 3, 3) matrices, in the unit of the scans.
-        config: settings.
         prior: prior of the steps of ordered scans; None: the steps of the initial poses, with the usual deviations.
         on_progress: called with the finished share of the refinement.
 
@@ -100,73 +79,71 @@ def refine(
     Raises:
         ValueError: the scans or the poses have a wrong shape or are not finite.
     """
-    config = config or RefinementConfig()
     scans = scans if isinstance(scans, PlanarScans) else planar_scans(as_beams("scans", scans))
     start = se2.as_poses("poses", poses, len(scans))
-    candidates, num_loops = {"start": start}, {"start": 0}
+    candidates = {"start": start}
     fitting_steps = np.asarray(se2.relative(start[:-1], start[1:]))
     prior = (prior or StepPrior.of_poses(start, scans.typical_range)) if scans.is_ordered else None
-    if prior is not None and config.loops is not None and not _is_sound(scans, start):
+    if prior is not None and not _is_sound(scans, start):
         rows = distinct_rows(scans)
         if len(rows) < len(scans):
             some = replace(scans.take(rows), is_ordered=True)
-            fitting = refine(some, start[rows], config, prior=prior.through(rows), on_progress=on_progress)
+            fitting = refine(some, start[rows], prior=prior.through(rows), on_progress=on_progress)
             whole = interpolate(len(scans), rows, fitting.poses)
-            return fitting._replace(poses=_put_back(scans, fitting_steps, whole, config, prior))
+            return Refined(_put_back(scans, fitting_steps, whole, prior))
         # Steps re-aligned from the initial ones; the calibrated prior decides along unconstrained directions alone.
         steps = incremental_icp(scans, odometry=start, prior=prior.loosened(scans.typical_range)).steps
         on_progress(_STEPS_SHARE)
         settled, slides = settle_steps(scans, steps, prior)
         edges = matched_steps(settled, slides)
-        candidates["loops"], _, weights = correct_by_loops(scans, se2.chain(settled.poses), config.loops, steps=edges)
-        num_loops["loops"] = int((weights > 0.25).sum())
+        candidates["loops"] = correct_by_loops(scans, se2.chain(settled.poses), edges).poses
         fitting_steps = _better_steps(scans, fitting_steps, settled.poses)
     aligned: dict[str, Floats] = {}
     for name, candidate in candidates.items():
         on_progress(_LOOPS_SHARE + (_ALIGNED_SHARE - _LOOPS_SHARE) * len(aligned) / len(candidates))
-        aligned[name] = _align(scans, candidate, fitting_steps, config, prior)
+        aligned[name] = _align(scans, candidate, fitting_steps, prior)
     on_progress(_ALIGNED_SHARE)
     kept = "start" if len(aligned) == 1 else choose_trajectory(scans, aligned, prior=prior)[0]
     best = aligned[kept]
-    if scans.noise > _MIN_NOISE * scans.typical_range:
+    # Scans are adjusted to common lines above this range noise, in typical ranges.
+    if scans.noise > 1.5e-4 * scans.typical_range:
         adjusted = adjust_to_lines(scans, best)
-        best = adjusted if prior is None else restore_open(scans, best, adjusted, config.radius, prior)
-        best = best if prior is None else _put_back(scans, fitting_steps, best, config, prior)
-    return Refined(best, num_loops[kept])
+        best = adjusted if prior is None else restore_open(scans, best, adjusted, prior)
+        best = best if prior is None else _put_back(scans, fitting_steps, best, prior)
+    return Refined(best)
 
 
-def _align(
-    scans: PlanarScans, poses: Floats, steps: Floats, config: RefinementConfig, prior: StepPrior | None
-) -> Floats:
+def _align(scans: PlanarScans, poses: Floats, steps: Floats, prior: StepPrior | None) -> Floats:
     """Aligns all scans, restores torn steps and aligns again, as long as the code length does not grow."""
-    best = align_all(scans, poses, config.radius, prior)
+    best = align_all(scans, poses, prior)
     if prior is None:
         return best
-    for _ in range(_NUM_REPAIRS):
-        restored = restore_torn(scans, steps, best, config.radius, prior)
+    # Largest number of repetitions of the alignment after torn steps are restored.
+    for _ in range(2):
+        restored = restore_torn(scans, steps, best, prior)
         if restored is None:
             break
-        again = align_all(scans, restored, config.radius, prior)
+        again = align_all(scans, restored, prior)
         if map_code_length(scans, again) > map_code_length(scans, best):
             break
         best = again
     return best
 
 
-def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, config: RefinementConfig, prior: StepPrior) -> Floats:
+def _put_back(scans: PlanarScans, steps: Floats, poses: Floats, prior: StepPrior) -> Floats:
     """Restores torn steps, unless the code length of the map grows."""
-    restored = restore_torn(scans, steps, poses, config.radius, prior)
-    is_better = restored is not None and map_code_length(scans, restored) <= map_code_length(scans, poses)
-    return restored if restored is not None and is_better else poses
+    restored = restore_torn(scans, steps, poses, prior)
+    if restored is None or map_code_length(scans, restored) > map_code_length(scans, poses):
+        return poses
+    return restored
 
 
-def put_back_slid(scans: PlanarScans, poses: Floats, config: RefinementConfig | None = None) -> Floats | None:
+def put_back_slid(scans: PlanarScans, poses: Floats) -> Floats | None:
     """Moves steps back that have slid along passages, for scans without odometry.
 
     Args:
         scans: n scans in time order.
         poses: (n, 3) T_world_scan.
-        config: settings.
 
     Returns:
         (n, 3) poses; None if no step has slid, or if the map does not become clearly better.
@@ -174,7 +151,7 @@ def put_back_slid(scans: PlanarScans, poses: Floats, config: RefinementConfig | 
     slides = slid_steps(scans, poses)
     if not slides.is_torn.any():
         return None
-    restored = restore_slid(scans, poses, slides, (config or RefinementConfig()).radius)
+    restored = restore_slid(scans, poses, slides)
     is_better = map_code_length(scans, restored) < (1.0 - _LEAST_GAIN) * map_code_length(scans, poses)
     return restored if is_better else None
 

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dpmjax.geometry import se2
-from dpmjax.registration2d.motion_prior import MotionPrior
 from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, search_pairs
 from dpmjax.registration2d.planar_scans import Floats, Indices, PlanarScans, planar_scans, spread_evenly
 from dpmjax.registration2d.range_profiles import pair_scores, weak_steps
+from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.registration2d.wall_directions import WallDirections
 
 # Length of the submaps on either side of a weak step along the trajectory, typical ranges, so that both may see the end
@@ -25,8 +25,6 @@ from dpmjax.registration2d.wall_directions import WallDirections
 _SIDE_LENGTH, _MAX_TURN, _MAX_SHIFT, _NUM_CELLS, _NUM_CANDIDATES = 2.0, 2.2, 1.6, 256, 24
 # Weight of the motion prior beside the agreement of two submaps, and beside the votes of loops.
 _PRIOR_WEIGHT, _LOOP_PRIOR_WEIGHT = 0.1, 0.3
-# Submaps lie a typical range apart, or farther if they were more than this.
-_MAX_SUBMAPS = 80
 # The largest distance of pairs of submaps is the sum of a constant, a share of the path length between them, and a
 # length for each weak step between them. Least path length between two submaps on either side of one weak step. Lengths
 # are in typical ranges. Number of likely turns that are searched.
@@ -99,13 +97,13 @@ def _search_across(sequence: _Sequence, steps: Indices, config: CorrelativeConfi
         sides += [side[se2.driven_lengths(poses[side]) <= _SIDE_LENGTH * unit] for side in (before[::-1], after)]
     centres = np.array([side[0] for side in sides])
     submaps, target = _merge_scans(sequence, centres, sides), 2 * np.arange(len(steps))
-    config = replace(config, num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
+    config = config._replace(num_cells=_NUM_CELLS, max_shift=_MAX_SHIFT, num_candidates=_NUM_CANDIDATES)
     turns = np.abs(se2.wrap_angle(2 * np.pi * np.arange(config.num_turns) / config.num_turns)) < _MAX_TURN
     found = search_pairs(submaps, target + 1, target, config, turns=np.broadcast_to(turns, (len(target), len(turns))))
     for number, step in enumerate(steps):
         before, after = rows[step], rows[step + 1]
         gap, here = int(after - before), se2.relative(poses[before], poses[after])
-        candidates = found.poses[number][np.isfinite(found.scores[number])]
+        candidates = found.poses[found.target == 2 * number]
         ways = np.concatenate([[here, sequence.prior.expected(gap)], candidates])
         pairs = np.full(len(ways), 2 * number + 1), np.full(len(ways), 2 * number)
         score = pair_scores(submaps, *pairs, ways)
@@ -124,7 +122,8 @@ def _make_submaps(sequence: _Sequence, part: Indices) -> _Submaps:
     """Makes submaps about a typical range apart, none across a weak step."""
     poses, rows, unit = sequence.poses, sequence.rows, sequence.scans.typical_range
     way = se2.driven_lengths(poses[rows])
-    spacing = max(unit, way[-1] / _MAX_SUBMAPS)
+    # Submaps lie a typical range apart, or farther if they were more than this.
+    spacing = max(unit, way[-1] / 80)
     middles, members = [], []
     for number in range(part[-1] + 1):
         own = np.flatnonzero(part == number)
@@ -178,8 +177,7 @@ def _find_votes(sequence: _Sequence, submaps: _Submaps, config: CorrelativeConfi
     if not len(later):
         return Hypotheses(later, earlier, np.zeros((0, 3)), np.zeros(0))
     turns = WallDirections(submaps.scans).likely_turns(later, earlier, config.num_turns, _NUM_TURNS)
-    found = search_pairs(submaps.scans, later, earlier, replace(config, num_candidates=4), turns=turns)
-    votes = Hypotheses.of(found)
+    votes = search_pairs(submaps.scans, later, earlier, config._replace(num_candidates=4), turns=turns)
     votes = votes._replace(scores=pair_scores(submaps.scans, votes.source, votes.target, votes.poses))
     return votes.take(votes.scores > _LEAST_VOTE)
 

@@ -16,9 +16,8 @@ import numpy as np
 
 from dpmjax.geometry import se2
 from dpmjax.pose_graph.graph import join_rows
-from dpmjax.registration2d.motion_prior import MotionPrior
 from dpmjax.registration2d.pair_alignment import FINE, PairMatches, match_pairs
-from dpmjax.registration2d.pair_search import Candidates, CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
+from dpmjax.registration2d.pair_search import CorrelativeConfig, Hypotheses, refine_candidates, search_pairs
 from dpmjax.registration2d.planar_scans import Booleans, Floats, Indices, PlanarScans
 from dpmjax.registration2d.range_profiles import (
     LEAST_VISIBLE,
@@ -30,6 +29,7 @@ from dpmjax.registration2d.range_profiles import (
 )
 from dpmjax.registration2d.recordings import distinct_rows, interpolate
 from dpmjax.registration2d.sequence_joining import join_parts
+from dpmjax.registration2d.steps import MotionPrior
 from dpmjax.scans.apart import apart
 
 # Turns of a step that are searched, radians for each scan that it spans.
@@ -42,8 +42,6 @@ _CLEAR_SCORE, _CLEAR_FITNESS, _CLEAR_EIGENVALUE, _CLEAR_CONTRADICTION = 0.45, 0.
 _WEAK_SPAN, _BAD_SCORE, _BAD_SPAN = 3, 0.12, 5
 # Where neither step of a scan has a better score, the scans before and after it are searched against each other.
 _SURE_SCORE = 0.5
-# Largest number of scans between two weak steps for which these scans are left out.
-_NUM_ALONE = 2
 # Hypotheses of a scan within these tolerances are equal, typical ranges and radians.
 _SAME = (0.02, 0.02)
 # Two sequences are equal if this number of their last scans agrees within these tolerances, typical ranges and radians.
@@ -56,8 +54,6 @@ _NUM_SEQUENCES, _NUM_COMPARED = 6, 8
 _SEARCH = CorrelativeConfig(max_shift=0.9, block=8, num_peaks=6, num_candidates=8, num_levels=3)
 # Weight of the motion prior.
 _PRIOR_WEIGHT = 0.1
-# Number of hypotheses of a step that are kept of the alignments from arcs.
-_NUM_ARCS = 3
 
 
 def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
@@ -87,7 +83,8 @@ def search_sequence(scans: PlanarScans, steps: PairMatches) -> Floats:
 def _is_alone(is_weak: Booleans) -> Booleans:
     """Returns True (k,) for one or two scans between two weak steps."""
     part = np.append(0, np.cumsum(is_weak))
-    return np.asarray(np.bincount(part)[part] <= min(_NUM_ALONE, len(part) // 4))
+    # Largest number of scans between two weak steps for which these scans are left out.
+    return np.asarray(np.bincount(part)[part] <= min(2, len(part) // 4))
 
 
 def _find_hypotheses(scans: PlanarScans, steps: PairMatches) -> Hypotheses:
@@ -130,7 +127,7 @@ def _search(scans: PlanarScans, pairs: Indices) -> Hypotheses:
     source, target = pairs.T.copy()
     turn = se2.wrap_angle(2 * np.pi * np.arange(_SEARCH.num_turns) / _SEARCH.num_turns)
     turns = np.abs(turn) < _MAX_TURN * (source - target)[:, None] ** 0.5
-    source, target, poses, _ = Hypotheses.of(search_pairs(scans, source, target, _SEARCH, turns=turns))
+    source, target, poses, _ = search_pairs(scans, source, target, _SEARCH, turns=turns)
     aligned = match_pairs(scans.take(source), scans.take(target), poses[:, None], FINE).poses
     before, after = (pair_scores(scans, source, target, x) for x in (poses, aligned))
     is_better = after > before - 0.02
@@ -159,12 +156,12 @@ def align_arcs(scans: PlanarScans, later: Indices, usual: MotionPrior) -> Hypoth
     for first in range(0, len(source), len(arcs)):
         own = poses[first : first + len(arcs)]
         are_near = [se2.is_within(own - one, *limits) for one in own]
-        kept.append(first + apart(values[first : first + len(arcs)], are_near.__getitem__, _NUM_ARCS))
+        # Number of hypotheses of a step that are kept of the alignments from arcs.
+        kept.append(first + apart(values[first : first + len(arcs)], are_near.__getitem__, 3))
     found = Hypotheses(source, source - 1, poses, scores).take(np.concatenate(kept))
     # The fitness of an alignment ignores contradicting beams, so its pose may lie beside the best score. The best score
     # of two scans alone may lie beside the right pose, too: the last placed scans choose.
-    near = Candidates(found.source, found.target, found.poses[:, None], found.scores[:, None])
-    shifted = refine_candidates(scans, near, _SEARCH).poses[:, 0]
+    shifted = refine_candidates(scans, found, _SEARCH).poses
     after = pair_scores(scans, found.source, found.target, shifted)
     is_better = after > found.scores
     return join_rows(found, found._replace(poses=shifted, scores=after).take(is_better))

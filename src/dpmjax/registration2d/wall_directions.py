@@ -65,7 +65,7 @@ class WallDirections:
         return best
 
     def most_similar(self, rows: Indices, others: Indices, count: int) -> Indices:
-        """Finds the most similar scans of each scan. Blocks let memory grow with the rows, not with all pairs.
+        """Finds the most similar scans of each scan.
 
         Args:
             rows: (r,) rows.
@@ -76,12 +76,8 @@ class WallDirections:
             (r, k) rows of `others`, the most similar first; k is the lesser of `count` and the number of other scans.
         """
         num_kept = min(count, len(others) - int(np.isin(rows, others).any()))
-        chosen, height = np.empty((len(rows), num_kept), np.int64), max(1, _BLOCK // max(len(others), 1))
-        for start in range(0, len(rows), height):
-            block = rows[start : start + height]
-            similarity = np.where(block[:, None] == others, -np.inf, self.best_similarity(block, others))
-            chosen[start : start + height] = others[np.argsort(-similarity, axis=1, kind="stable")[:, :num_kept]]
-        return chosen
+        similarity = np.where(rows[:, None] == others, -np.inf, self.best_similarity(rows, others))
+        return others[np.argsort(-similarity, axis=1, kind="stable")[:, :num_kept]]
 
     def likely_turns(self, source: Indices, target: Indices, num_turns: int, num_peaks: int) -> Bool[np.ndarray, "p t"]:
         """Chooses the headings of a pair near the peaks of the similarity.

@@ -27,15 +27,11 @@ from dpmjax.registration_rgbd.projective_consistency import UNSEEN_SHARE, agreem
 
 # Points of one sample. Fewer make noisy scores, more make the search of motions slow.
 NUM_POINTS = 100
-# Samples of an image at least; an image with fewer valid points repeats some.
-_LEAST_SAMPLES = 3
 # Pairs that are linearised by one call of the program.
 _NUM_PAIRS = 128
 # Damping as a share of the mean information: first value, least value, divisor after an accepted step, and factor
 # after a rejected step.
 _DAMPING, _LEAST_DAMPING, _BETTER, _WORSE = 1e-3, 1e-5, 4.0, 8.0
-# Longest step, in tolerances: of the typical range, and radians.
-_LONGEST_STEP = 4.0
 
 Floats = np.ndarray
 Poses = Float[np.ndarray, "_ 4 4"]
@@ -89,7 +85,8 @@ def depth_view(scans: DepthScans, image: int, camera: DepthCamera, rng: np.rando
     """
     points, mask = np.asarray(scans.points[image]), np.asarray(scans.mask[image])
     valid = rng.permutation(points[mask])
-    num_samples = max(_LEAST_SAMPLES, len(valid) // NUM_POINTS)
+    # Samples of an image at least; an image with fewer valid points repeats some.
+    num_samples = max(3, len(valid) // NUM_POINTS)
     samples = np.resize(valid, (num_samples, NUM_POINTS, 3))
     axes = [0, 2] if camera.motion == "planar" else [0, 1, 2]
     normals = image_normals(points, mask)[0][..., axes].reshape(-1, len(axes))
@@ -302,7 +299,8 @@ def _damped_step(matrix: Floats, gradient: Floats, group: Floats, damping: Float
     values = np.linalg.solve(matrix + np.diag(extra), -gradient[free].reshape(-1)).reshape(len(group), freedom)
     largest = np.zeros(len(damping))
     np.maximum.at(largest, group, np.abs(values).max(axis=1))
-    return values * np.minimum(1.0, _LONGEST_STEP / np.maximum(largest, 1e-6))[group, None]
+    # Longest step, in tolerances: of the typical range, and radians.
+    return values * np.minimum(1.0, 4.0 / np.maximum(largest, 1e-6))[group, None]
 
 
 def step_poses(T_world_camera: Poses, step: Float[np.ndarray, "n 6"]) -> Poses:

@@ -14,9 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from dpmjax.checks import as_mask
 from dpmjax.geometry import rigid
 
-# Largest relative difference of the inverse depths of four pixels on one surface.
-_EDGE = 0.15
-
 
 class Pinhole(NamedTuple):
     """A camera: column = fx x/z + cx, row = fy y/z + cy, in pixels."""
@@ -129,7 +126,8 @@ def image_surface(depth: Any) -> Any:
     corners = xp.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
     low, high = corners.min(axis=0), corners.max(axis=0)
     a, b, c, d = corners
-    return xp.where((low > 0.0) & (high - low < _EDGE * high), xp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
+    # Largest relative difference of the inverse depths of four pixels on one surface.
+    return xp.where((low > 0.0) & (high - low < 0.15 * high), xp.stack([a, b - a, c - a, a - b - c + d]), 0.0)
 
 
 def fit_pinhole(points: NDArray[np.floating], mask: NDArray[np.bool_]) -> Pinhole:

@@ -53,8 +53,6 @@ _NUM_REFERENCES, NUM_CHECKED = 4, 8
 _DIFFERENT, _SLID_APART = (0.35, 0.1), (0.12, 0.06)
 # Largest shift, and longest motion after a shift, in largest translations.
 _SLIDE, _LONGEST = 1.4, 1.5
-# Width of the first variations as a share of the limits; halved from round to round.
-_FIRST_SPREAD = 0.25
 # Number of tolerances of an adjustment, and of steps at each.
 _NUM_TOLERANCES, _NUM_ITERATIONS = 4, 2
 # Motions that are scored by one call of the program.
@@ -135,7 +133,8 @@ def propose_motions(
         best = T[np.argsort(-search.scores(T, config.tolerances[step], _NUM_REFERENCES))[:_NUM_KEPT]]
         noise = rng.standard_normal((config.num_varied, len(best), 6))
         noise[0] = 0.0  # The kept motions themselves are candidates of the next round.
-        moves = _motions((_FIRST_SPREAD * 0.5**step * widths * noise).reshape(-1, 6))
+        # Width of the first variations as a share of the limits; halved from round to round.
+        moves = _motions((0.25 * 0.5**step * widths * noise).reshape(-1, 6))
         T = (best @ moves.reshape(config.num_varied, len(best), 4, 4)).reshape(-1, 4, 4)
     scores = search.scores(T, config.tolerances[_NUM_ROUNDS - 1], _NUM_REFERENCES)
     T = _slid(motions_apart(T, scores, _NUM_SLID, _DIFFERENT), view.directions)

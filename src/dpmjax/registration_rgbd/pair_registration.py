@@ -21,14 +21,13 @@ DEPTH = PairModel(weights=(8.30, 12.20, -5.89, -0.839), bias=-7.41)
 
 
 @runs_on_host("call deepmapping.solve there")
-def register_images(source: ArrayLike, target: ArrayLike, *, key: jax.Array | None = None) -> ScanRegistration:
+def register_images(source: ArrayLike, target: ArrayLike) -> ScanRegistration:
     """Registers two depth images of one camera, up to 0.7 m and 75 degrees apart.
 
     Args:
         source: (h, w, 3) points in the frame of the camera (x right, y down, z forward), metres; pixels that are not
             finite or all zero are invalid.
         target: the same, of the same size.
-        key: of the search; None: key 0.
 
     Returns:
         The motion, its lead over the best other motion, and the probability that it is right within a tenth of a metre
@@ -43,7 +42,7 @@ def register_images(source: ArrayLike, target: ArrayLike, *, key: jax.Array | No
             f"source, target: expected two images (h, w, 3) of one size, got {images[1].shape} and {images[0].shape}"
         )
     scans = as_depth_scans(np.stack(images))
-    placed = initialize_depth(scans, "full", key=jax.random.key(0) if key is None else key)
+    placed = initialize_depth(scans, "full", key=jax.random.key(0))
     T = placed.T_world_camera
     camera = DepthCamera(scans.pinhole, float(typical_range(scans.points, scans.mask)), "full")
     rng = np.random.default_rng(0)

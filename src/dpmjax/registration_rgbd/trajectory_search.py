@@ -325,23 +325,21 @@ def _near_pairs(T_world_camera: Poses, unit: float) -> ImagePairs:
     return np.argwhere((is_near | is_near.T) & ~np.eye(count, dtype=bool))
 
 
-class _Evidence(NamedTuple):
-    # The best match and the largest contradiction of each point of n images, (n, q).
-    match: np.ndarray
-    contradiction: np.ndarray
+def _evidence(systems: PairSystems, image: np.ndarray, count: int) -> np.ndarray:
+    """Returns the best match and the largest contradiction (2, n, q) of each point of n images over all pairs.
 
-
-def _evidence(systems: PairSystems, image: np.ndarray, count: int) -> _Evidence:
-    """Returns the evidence over all pairs; each point counts once, so views by many images are not favoured."""
-    best = _Evidence(*(np.zeros((count, systems.match.shape[1])) for _ in range(2)))
+    Each point counts once, so views by many images are not favoured.
+    """
+    best = np.zeros((2, count, systems.match.shape[1]))
     for kept, found in zip(best, (systems.match, systems.contradiction), strict=True):
         np.maximum.at(kept, image, found)
     return best
 
 
-def _shares(evidence: _Evidence) -> np.ndarray:
+def _shares(evidence: np.ndarray) -> np.ndarray:
     """Returns the share of the points of each image that others explain, less the cost of contradicted points."""
-    return np.asarray((evidence.match - _CONTRADICTED_POINT * evidence.contradiction).mean(axis=1))
+    match, contradiction = evidence
+    return np.asarray((match - _CONTRADICTED_POINT * contradiction).mean(axis=-1))
 
 
 def explained_shares(
@@ -364,17 +362,14 @@ def explained_shares(
     candidates = images._replace(views=[*images.views[:-1], *[images.views[-1]] * num_last])
     nodes, T = np.arange(num_last) + count, np.concatenate([T_world_camera, T_world_last])
     new, old = (x.ravel() for x in np.meshgrid(nodes, np.arange(count), indexing="ij"))
-    there = linearise_images(candidates, T, np.stack([new, old], axis=1), tolerance)
-    back = linearise_images(candidates, T, np.stack([old, new], axis=1), tolerance)
-    num_points = there.match.shape[1]
-    base = _evidence(before, pairs[:, 0], count) if len(pairs) else _Evidence(*np.zeros((2, count, num_points)))
-    shares = []
-    for k in range(num_last):
-        rows = slice(k * count, (k + 1) * count)
-        own = (x[rows].max(axis=0, keepdims=True) for x in (there.match, there.contradiction))
-        others = (np.maximum(a, b[rows]) for a, b in zip(base, (back.match, back.contradiction), strict=True))
-        shares.append(_shares(_Evidence(*(np.concatenate(x) for x in zip(others, own, strict=True)))).mean())
-    return np.array(shares)
+    there, back = (
+        linearise_images(candidates, T, np.stack(ends, axis=1), tolerance) for ends in ((new, old), (old, new))
+    )
+    own, others = (
+        np.stack([found.match, found.contradiction]).reshape(2, num_last, count, -1) for found in (there, back)
+    )
+    others = np.maximum(others, _evidence(before, pairs[:, 0], count)[:, None])
+    return _shares(np.concatenate([others, own.max(axis=2, keepdims=True)], axis=2)).mean(axis=1)
 
 
 def _mean_cost(T_world_camera: Float[np.ndarray, "h n 4 4"], motion: Motion) -> Float[np.ndarray, " h"]:

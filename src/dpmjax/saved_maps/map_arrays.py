@@ -24,12 +24,6 @@ MAX_ROTATION_ERROR = 1e-4
 # Numbers of a keyframe, and their types in the file.
 NUMBERS = {"scan": np.int64, "segment": np.int32, "path_m": np.float64, "extent_m": np.float64}
 
-# Largest number of principal components.
-MAX_RANK = 16
-
-# Step of the coefficients, as a share of the standard deviation of a channel.
-STEP_SHARE = 0.7
-
 # Number of surface elements of a keyframe, or of its descriptors if it has more: localisation gains more from further
 # keyframes than from further elements.
 NUM_ELEMENTS = 256
@@ -165,10 +159,12 @@ def _encode_features(features: Float[np.ndarray, "d c"]) -> Arrays:
     mean = features.mean(axis=0, dtype=np.float64) if len(features) else np.zeros(features.shape[1])
     centred = features - mean
     variances, axes = np.linalg.eigh(centred.T @ centred / max(len(features), 1))
-    basis = axes[:, ::-1][:, :MAX_RANK].T
+    # Largest number of principal components.
+    basis = axes[:, ::-1][:, :16].T
     coefficients = basis @ centred.T
     largest = float(np.abs(coefficients).max(initial=0))
-    step = max(STEP_SHARE * float(np.sqrt(max(variances.mean(), 0))), largest / MAX_CODE, 1e-12)
+    # Step of the coefficients, as a share of the standard deviation of a channel.
+    step = max(0.7 * float(np.sqrt(max(variances.mean(), 0))), largest / MAX_CODE, 1e-12)
     codes = np.rint(coefficients / step).astype(np.int8)
     is_used = codes.any(axis=1)
     return {

@@ -30,8 +30,6 @@ from dpmjax.slam.system import SlamState
 from dpmjax.weights.config_json import config_from_json
 
 FORMAT, VERSION = "dpmjax map", 3
-# Smaller than the spacing of consecutive keyframes, so that only keyframes of other laps are left out.
-SPACING_SHARE = 0.2
 
 ADVICE, RESUME_ADVICE = "save it again with dpmjax.save_map", "start the run again without --resume"
 
@@ -79,7 +77,8 @@ def map_bytes(slam_map: KeyframeMap, precision: Precision = "float32") -> bytes:
     """
     require_one_of("precision", precision, get_args(Precision))
     if precision == "int8":
-        slam_map = thin_map(slam_map, spacing_share=SPACING_SHARE)
+        # Smaller than the spacing of consecutive keyframes, so that only keyframes of other laps are left out.
+        slam_map = thin_map(slam_map, spacing_share=0.2)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, array in map_arrays(slam_map, precision).items():

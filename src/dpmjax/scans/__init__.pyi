@@ -1,8 +1,6 @@
 from .align import AlignedMotion as AlignedMotion
 from .align import AlignmentLevel as AlignmentLevel
-from .align import Prior as Prior
 from .align import align_on_host as align_on_host
-from .align import schedule_of as schedule_of
 from .augment import AugmentConfig as AugmentConfig
 from .augment import augment_scan as augment_scan
 from .corrections import deskew as deskew
@@ -15,7 +13,6 @@ from .lidar import measure_scan as measure_scan
 from .lidar import measured_elements as measured_elements
 from .pair_registration import PairEvidence as PairEvidence
 from .preprocess import PreprocessConfig as PreprocessConfig
-from .preprocess import preprocess_scan as preprocess_scan
 from .preprocess import preprocess_scan_on_host as preprocess_scan_on_host
 from .surfaces import Surface as Surface
 from .surfaces import SurfaceConfig as SurfaceConfig

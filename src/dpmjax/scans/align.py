@@ -29,19 +29,12 @@ from dpmjax.types import AnyArray, SurfaceElements
 # A level ends after a step that turns less, radians, and is shorter, metres.
 CONVERGED_RAD, CONVERGED_M = 1e-4, 2e-3
 
-# Pairs are searched again once the points have moved farther, in the mean: a larger distance keeps wrong pairs, a
-# smaller one searches in vain.
-SEARCHED_AGAIN_M = 0.02
-
 # Largest ratio of two steps by which the next is lengthened: a larger one overshoots where pairs change. Metres that
 # count as much as a radian of a step.
 MAX_RATIO, LEVER_M = 0.67, 10.0
 
 # Least width of the kernel, and its width as a share of the radius.
 MIN_KERNEL_M, KERNEL_SHARE = 0.05, 1 / 6
-
-# Smallest cosine between the normals of a pair; the part of the cosine above it is a factor of the weight of the pair.
-PAIR_COSINE = 0.3
 
 # Fewer pairs do not constrain a motion.
 MIN_PAIRS = 20
@@ -79,19 +72,6 @@ LEVELS = (
 )
 
 
-class Prior(NamedTuple):
-    """Expected motion, which holds the directions that no plane holds.
-
-    Attributes:
-        T_target_source: (d+1, d+1).
-        information: (k, k) inverse covariance of the shift, then of the turn about the centre of the pairs. It is in
-            the frame of the target; its unit is the weight of one pair per squared unit of length.
-    """
-
-    T_target_source: Any
-    information: Any
-
-
 class AlignedMotion(NamedTuple):
     """The aligned motion; failure is data. Arrays of NumPy from the host, with one row a start; else of JAX.
 
@@ -99,45 +79,27 @@ class AlignedMotion(NamedTuple):
         T_target_source: motion from source to target; that of the step before where there are too few pairs.
         rmse: weighted root mean square distance of the pairs to their planes before the last step; infinite where
             there are too few.
-        num_pairs: number of pairs of the last step.
-        information: (k, k) sum of the weighted squares of the derivatives about the centre of the pairs, shift first.
     """
 
     T_target_source: Any
     rmse: Any
-    num_pairs: Any
-    information: Any
 
 
-class _Solved(NamedTuple):
-    # The Gauss-Newton step, 0 where there are too few pairs; then as in `AlignedMotion`.
-    step: PlaneStep
-    rmse: Any
-    num_pairs: Any
-    information: Any
-
-
-def _solve(pairs: Pairs, T_target_source: Any, kernel: Any, prior: Prior | None) -> _Solved:
-    """Computes one Gauss-Newton step from motions (..., d+1, d+1)."""
-    xp = rigid.namespace_of(T_target_source)
-    weights = pairs.is_paired * pairs.flatness * xp.maximum(pairs.cosines - PAIR_COSINE, 0)
-    num_pairs = (weights > 0).sum(axis=-1)
+def _solve(pairs: Pairs, kernel: Any) -> tuple[PlaneStep, Any]:
+    """Computes a Gauss-Newton step, 0 where there are too few pairs, and the error before it."""
+    xp = rigid.namespace_of(pairs.residuals)
+    # Smallest cosine between the normals of a pair; the part of the cosine above it is a factor of the weight of the
+    # pair.
+    weights = pairs.is_paired * pairs.flatness * xp.maximum(pairs.cosines - 0.3, 0)
+    is_enough = (weights > 0).sum(axis=-1) >= MIN_PAIRS
     weights = weights * geman_mcclure(pairs.residuals, kernel)
     if xp is jnp:
         weights = lax.stop_gradient(weights)
-    about = None if prior is None else (T_target_source, *prior)
-    step, information = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights, about)
-    is_enough = num_pairs >= MIN_PAIRS
-    step = PlaneStep(xp.where(is_enough[..., None], step.tangent, 0), step.centre)
+    step = step_to_planes(pairs.points, pairs.normals, pairs.residuals, weights)
+    step = step._replace(tangent=xp.where(is_enough[..., None], step.tangent, 0))
     total = xp.maximum(weights.sum(axis=-1), np.finfo(weights.dtype).tiny)
     rmse = rigid.safe_sqrt((weights * pairs.residuals**2).sum(axis=-1) / total)
-    return _Solved(step, xp.where(is_enough, rmse, np.inf), num_pairs, information)
-
-
-def schedule_of(levels: tuple[AlignmentLevel, ...]) -> Float[np.ndarray, "k 2"]:
-    """Returns the radius and the width of the kernel of each step of all levels, for `align`."""
-    rows = [[level.radius_m, level.kernel_width_m] for level in levels for _ in range(level.num_iterations)]
-    return np.array(rows, np.float32)
+    return step, xp.where(is_enough, rmse, np.inf)
 
 
 @jax.jit
@@ -145,8 +107,6 @@ def align(
     source: SurfaceElements,
     target: SurfaceElements,
     T_target_source: Float[AnyArray, "d1 d1"],
-    schedule: Float[AnyArray, "k 2"] | None = None,
-    prior: Prior | None = None,
 ) -> AlignedMotion:
     """Aligns two sets of surface elements from a first guess, by exhaustive search on any device.
 
@@ -157,16 +117,14 @@ def align(
         source: elements in the source frame; masked ones may hold anything.
         target: the same in the target frame.
         T_target_source: first guess, within the first radius and about 10 degrees.
-        schedule: largest distance of a pair, and width of the kernel, of each step; other numbers compile nothing.
-            None takes that of `LEVELS`.
-        prior: expected motion, for directions that no plane holds.
 
     Returns:
         The motion.
     """
-    schedule = schedule_of(LEVELS) if schedule is None else schedule
     source, target = (_flat(jax.tree.map(jnp.asarray, side)) for side in (source, target))
-    T, schedule = jnp.asarray(T_target_source, source.positions.dtype), jnp.asarray(schedule, source.positions.dtype)
+    T = jnp.asarray(T_target_source, source.positions.dtype)
+    steps = [(level.radius_m, level.kernel_width_m) for level in LEVELS for _ in range(level.num_iterations)]
+    schedule = jnp.array(steps, T.dtype)
 
     def step_from(source: SurfaceElements, target: SurfaceElements, T: Any, scale: Any) -> AlignedMotion:
         moved = move_elements((source.positions, source.normals), T)
@@ -174,8 +132,8 @@ def align(
         is_there, row = near.mask[:, 0] & source.mask, near.indices[:, 0]
         distances = jnp.where(is_there, jnp.sqrt(jnp.where(is_there, near.squared_distances[:, 0], 1)), jnp.inf)
         planes = Planes(target.positions[row], target.normals[row], target.planarity[row], distances)
-        solved = _solve(pair_planes(moved, planes, scale[0]), T, scale[1], prior)
-        return AlignedMotion(rigid.matmul(motion_about(solved.step), T), *solved[1:])
+        step, rmse = _solve(pair_planes(moved, planes, scale[0]), scale[1])
+        return AlignedMotion(rigid.matmul(motion_about(step), T), rmse)
 
     still = lax.stop_gradient((source, target))
     T = lax.stop_gradient(T)
@@ -195,7 +153,6 @@ def align_on_host(
     target: Surface,
     T_target_source: Float[AnyArray, "s d1 d1"],
     levels: tuple[AlignmentLevel, ...],
-    prior: Prior | None = None,
 ) -> AlignedMotion:
     """Aligns two surfaces in float64 from several first guesses, which proceed in step: one search serves all.
 
@@ -204,16 +161,13 @@ def align_on_host(
         target: the second surface.
         T_target_source: first guesses (s, d+1, d+1), within about the first radius and 10 degrees.
         levels: coarse to fine.
-        prior: expected motion, for directions that no plane holds.
 
     Returns:
         The motion from each first guess.
     """
-    T, size = np.array(T_target_source, np.float64), len(T_target_source)
-    num_free = 3 * (T.shape[-1] - 2)
-    found = AlignedMotion(T, np.full(size, np.inf), np.zeros(size, int), np.zeros((size, num_free, num_free)))
+    T, rmse = np.array(T_target_source, np.float64), np.full(len(T_target_source), np.inf)
     target = in_columns(target)
-    has_pairs = np.full(size, len(target.points) > 0 and len(source.samples) >= MIN_PAIRS)
+    has_pairs = np.full(len(T), len(target.points) > 0 and len(source.samples) >= MIN_PAIRS)
     for level in levels:
         own, active = _first_elements(source, level.num_points), _Active(np.flatnonzero(has_pairs))
         for _ in range(level.num_iterations):
@@ -222,17 +176,15 @@ def align_on_host(
                 break
             moved = move_elements(own, T[rows])
             at, planes = _nearest_again(target, moved[0], active)
-            solved = _solve(pair_planes(moved, planes, level.radius_m), T[rows], level.kernel_width_m, prior)
-            longer, factor = _lengthened(solved.step, active)
+            step, rmse[rows] = _solve(pair_planes(moved, planes, level.radius_m), level.kernel_width_m)
+            longer, factor = _lengthened(step, active)
             T[rows] = rigid.matmul(motion_about(longer), T[rows])
-            for values, new in zip(found[1:], solved[1:], strict=True):
-                values[rows] = new
-            has_pairs[rows] = np.isfinite(solved.rmse)
-            goes_on = has_pairs[rows] & ~_is_converged(solved.step)
-            active = _Active(rows, at, planes, solved.step.tangent, factor)
+            has_pairs[rows] = np.isfinite(rmse[rows])
+            goes_on = has_pairs[rows] & ~_is_converged(step)
+            active = _Active(rows, at, planes, step.tangent, factor)
             if not goes_on.all():
                 active = jax.tree.map(operator.itemgetter(goes_on), active)
-    return found
+    return AlignedMotion(T, rmse)
 
 
 def _first_elements(source: Surface, num_points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -256,7 +208,9 @@ def _nearest_again(target: Surface, points: np.ndarray, active: _Active) -> tupl
     at, planes = active.at, active.planes
     if planes is None:
         return points, find_planes(target, points)
-    has_moved = np.abs(points - at).mean(axis=(1, 2)) > SEARCHED_AGAIN_M
+    # Pairs are searched again once the points have moved farther, in the mean: a larger distance keeps wrong pairs, a
+    # smaller one searches in vain.
+    has_moved = np.abs(points - at).mean(axis=(1, 2)) > 0.02
     if has_moved.all():
         return points, find_planes(target, points)
     if has_moved.any():

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from dpmjax.checks import require_fields
 from dpmjax.geometry import rigid
 from dpmjax.geometry.bearing import to_ray_frame
 from dpmjax.geometry.rigid import namespace_of
@@ -88,16 +87,6 @@ class AugmentConfig:
     tilt_power: float = 1.0
     translation_sigma_m: float = 3.0
     jitter_sigma_m: float = 0.005
-
-    def __post_init__(self) -> None:
-        require_fields(self, "max_drop_ratio", "sector_probability", "box_probability", low=0, high=1)
-        require_fields(self, "sparse_probability", low=0, high=1)
-        require_fields(self, "tilt_power", low=1)
-        if self.sector_probability + self.box_probability > 1:
-            both = f"{self.sector_probability} and {self.box_probability}"
-            raise ValueError(f"sector_probability, box_probability: expected a sum of at most 1, got {both}")
-        require_fields(self, "max_yaw_rad", "max_tilt_rad", "translation_sigma_m", low=0)
-        require_fields(self, "jitter_sigma_m", low=0)
 
 
 class AugmentedScan(NamedTuple):

@@ -11,7 +11,6 @@ from dpmjax.types import AnyArray
 # Elevation of the beams of KITTI's HDL-64E above that of its points (KISS-ICP corrects it by the same angle).
 KITTI_ELEVATION_DEG = 0.205
 
-_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 # Shortest and longest turn of a lidar.
 _TURN_S = (0.02, 0.5)
 _MIN_TIMES = 4
@@ -88,7 +87,7 @@ def offsets_by_times(times: Float[AnyArray, " n"], interval_s: float | None = No
     if not np.isfinite(times).all() or len(np.unique(times)) < _MIN_TIMES:
         return None
     first, last = times.min(), times.max()
-    unit = next((unit for unit in _UNITS_S if _TURN_S[0] <= unit * (last - first) <= _TURN_S[1]), None)
+    unit = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if _TURN_S[0] <= unit * (last - first) <= _TURN_S[1]), None)
     if unit is None:
         return None
     return (times - (first + last) / 2) * (unit / interval_s if interval_s else 1 / (last - first))

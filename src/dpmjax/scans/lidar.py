@@ -45,10 +45,6 @@ FINE_VOXEL_M, FINE_FLATNESS = 0.08, 0.5
 # One element of each voxel of this size is chosen first, because ground near the lidar is dense.
 SPREAD_M = 1.5
 
-# A shell of points without an echo is no wider (`geometry.shells`): if the farthest point is this many times as far as
-# the largest range, the range filter leaves out the whole shell.
-SHELL_SHARE = 1.04
-
 
 class Scan(NamedTuple):
     """A scan that is ready for any number of registrations.
@@ -100,7 +96,9 @@ def lidar_scan(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Sc
 
 def _echoes(points: Float[np.ndarray, "n 3"], config: PreprocessConfig) -> Float[np.ndarray, "m 3"]:
     """Leaves out points that are no echoes, unless the range filter does."""
-    is_beyond = np.square(points, dtype=np.float64).sum(axis=1).max(initial=0) > (SHELL_SHARE * config.max_range_m) ** 2
+    # A shell of points without an echo is no wider (`geometry.shells`): if the farthest point is this many times as far
+    # as the largest range, the range filter leaves out the whole shell.
+    is_beyond = np.square(points, dtype=np.float64).sum(axis=1).max(initial=0) > (1.04 * config.max_range_m) ** 2
     return points if is_beyond else without_shell(points)
 
 

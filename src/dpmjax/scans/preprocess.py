@@ -1,26 +1,23 @@
 """Preprocessing turns a raw scan into a masked cloud: it filters by range, by voxel and by outlier distance.
 
-Training and inference share it. `preprocess_scan` runs under jit and vmap on any device; `preprocess_scan_on_host`
-returns the same in NumPy and is faster on a CPU.
+Training and inference share it. An outlier is a point whose neighbours are far, compared with those of others. The
+limit rests on all points, but neighbours are searched only for lonely points and for a sample. This takes a fifth of
+the time; the result is the same up to a percent of the limit.
 """
 
 from __future__ import annotations
 
-import functools
 import warnings
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from dpmjax.checks import as_host_points, as_mask, as_points, require_count, require_fields, require_positive_fields
-from dpmjax.geometry.neighbours import HostTree, k_nearest
-from dpmjax.geometry.sampling import voxel_sample
-from dpmjax.scans.outliers import OUTLIER_SIGMAS, OUTLIER_SLACK, evenly_spaced, find_inliers
-from dpmjax.types import AnyArray, PointCloud
+from dpmjax.checks import as_host_points, as_mask, require_count, require_fields, require_positive_fields
+from dpmjax.geometry.neighbours import HostTree
+from dpmjax.types import PointCloud
 
 MAX_CAPACITY = 1 << 15
 MAX_VOXELS = 1 << 20
@@ -29,6 +26,14 @@ MAX_VOXELS = 1 << 20
 HASH_FACTOR, TABLE_BITS = np.uint64(0x9E3779B97F4A7C15), 18
 
 MIN_COUNT_TO_WARN, MIN_SHARE_IN_RANGE = 20, 0.01
+
+# A point is an outlier if its mean distance to its neighbours exceeds the mean over all points by more than this number
+# of standard deviations.
+OUTLIER_SIGMAS = 3.0
+
+# Number of points whose neighbours are searched first, to estimate the limit: all points of a smaller scan. With fewer,
+# more points must be searched again.
+NUM_SPACED = 1024
 
 
 @dataclass(frozen=True)
@@ -60,39 +65,6 @@ class PreprocessConfig:
             raise ValueError(f"voxel_size_m: expected fewer than {MAX_VOXELS} voxels in max_range_m")
 
 
-def preprocess_scan(
-    points: Float[AnyArray, "n 3"], mask: Bool[AnyArray, " n"] | None, config: PreprocessConfig
-) -> PointCloud:
-    """Applies the range, voxel and outlier filters, in this order (DeepPointMap, supplement).
-
-    Points that are not finite are dropped. The kept points stand in front, in their order, except that the point
-    farthest from the sensor is exchanged with the first. Farthest-point sampling then starts at the rim for any order
-    of the scan. A `ValueError` names an argument of a wrong shape.
-
-    Args:
-        points: (n, 3), metres, in the frame of the lidar.
-        mask: False for points that are not there; None if all are.
-        config: settings of the filters; a second call with the same settings and shapes compiles nothing.
-
-    Returns:
-        A cloud (capacity, 3), metres, same frame; 0 where the mask is False.
-    """
-    points = as_points("points", points, dimensions=(3,))
-    return _preprocess_scan(points, as_mask("mask", mask, points.shape[:1]), config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _preprocess_scan(points: jax.Array, mask: jax.Array, *, config: PreprocessConfig) -> PointCloud:
-    squared_range = jnp.sum(lax.stop_gradient(points) ** 2, axis=1)
-    is_within = (squared_range >= config.min_range_m**2) & (squared_range <= config.max_range_m**2)
-    mask = mask & is_within  # False for what is not finite
-    points = jnp.where(mask[:, None], points, 0)
-    points, mask = _gather(points, voxel_sample(points, config.voxel_size_m, mask), config.capacity)
-    if config.num_outlier_neighbours > 0:
-        points, mask = _gather(points, _is_inlier(points, mask, config), config.capacity)
-    return farthest_first(PointCloud(points, mask))
-
-
 def farthest_first(cloud: PointCloud) -> PointCloud:
     """Exchanges the first row with the valid point farthest from the origin.
 
@@ -109,31 +81,6 @@ def farthest_first(cloud: PointCloud) -> PointCloud:
     return PointCloud(points[rows], mask[rows])
 
 
-def _gather(points: Float[Array, "n 3"], is_kept: Bool[Array, " n"], capacity: int) -> tuple[Array, Array]:
-    """Returns the kept points in front, in their order, and a mask; evenly spaced points if too many are kept."""
-    num_kept = jnp.sum(is_kept)
-    rows = jnp.nonzero(is_kept, size=len(points), fill_value=0)[0]
-    slots = jnp.arange(capacity)
-    # floor(slot * num_kept / capacity) in two parts, so that no product overflows
-    spaced = slots * (num_kept // capacity) + slots * (num_kept % capacity) // capacity
-    ranks = jnp.where(num_kept > capacity, spaced, slots)
-    mask = slots < num_kept
-    chosen = rows[jnp.where(mask, ranks, 0)] if len(points) > 0 else jnp.zeros(capacity, int)
-    gathered = points[chosen] if len(points) > 0 else jnp.zeros((capacity, 3), points.dtype)
-    return jnp.where(mask[:, None], gathered, 0), mask
-
-
-def _is_inlier(points: Float[Array, "n 3"], mask: Bool[Array, " n"], config: PreprocessConfig) -> Bool[Array, " n"]:
-    points = lax.stop_gradient(points)
-    # One more neighbour, because each point is its own nearest one.
-    near = k_nearest(points, points, config.num_outlier_neighbours + 1, mask)
-    others = near.mask[:, 1:]
-    distances = jnp.sqrt(jnp.where(others, near.squared_distances[:, 1:], 0))
-    spread = jnp.sum(distances, axis=1) / jnp.maximum(jnp.sum(others, axis=1), 1)
-    limit = jnp.mean(spread, where=mask) + OUTLIER_SIGMAS * jnp.std(spread, where=mask)
-    return mask & (spread <= limit * OUTLIER_SLACK)
-
-
 def preprocess_scan_on_host(
     points: Float[np.ndarray, "n 3"],
     mask: Bool[np.ndarray, " n"] | None,
@@ -141,9 +88,11 @@ def preprocess_scan_on_host(
     *,
     num_threads: int = 2,
 ) -> PointCloud:
-    """Returns what `preprocess_scan` returns, as NumPy arrays, up to a percent of the limit of outliers.
+    """Applies the range, voxel and outlier filters, in this order (DeepPointMap, supplement).
 
-    Warns where hardly any point is in range: the points are then probably not in metres.
+    Points that are not finite are dropped. The kept points stand in front, in their order, except that the point
+    farthest from the sensor is exchanged with the first. Farthest-point sampling then starts at the rim for any order
+    of the scan. Warns where hardly any point is in range: the points are then probably not in metres.
 
     Args:
         points: (n, 3), metres, in the frame of the lidar, float32.
@@ -152,7 +101,7 @@ def preprocess_scan_on_host(
         num_threads: threads of the neighbour search, at least 1.
 
     Returns:
-        A cloud (capacity, 3), metres, same frame; 0 where the mask is False.
+        A cloud (capacity, 3) of NumPy arrays, metres, same frame; 0 where the mask is False.
 
     Raises:
         ValueError: if the shapes do not match.
@@ -167,7 +116,7 @@ def thin_points(
     *,
     num_threads: int = 2,
 ) -> HostTree:
-    """Applies the range and voxel filters of `preprocess_scan` on the host.
+    """Applies the range and voxel filters of `preprocess_scan_on_host`.
 
     Args:
         points: see `preprocess_scan_on_host`.
@@ -192,7 +141,7 @@ def thin_points(
 
 
 def cloud_without_outliers(tree: HostTree, config: PreprocessConfig) -> PointCloud:
-    """Applies the outlier filter of `preprocess_scan` on the host.
+    """Applies the outlier filter of `preprocess_scan_on_host`.
 
     Args:
         tree: points from `thin_points`.
@@ -262,3 +211,79 @@ def _numbered_voxels(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int
     x, y, z = (np.floor(column / np.float32(voxel_size)).astype(np.int64) for column in points.T)
     x, y, z = x - x.min(), y - y.min(), z - z.min()
     return (x * (y.max() + 1) + y) * (z.max() + 1) + z  # below 2^63, because MAX_VOXELS bounds each factor
+
+
+def evenly_spaced(num_kept: int, capacity: int) -> Int[np.ndarray, " r"]:
+    """Returns rows of up to `capacity` of this many points.
+
+    Args:
+        num_kept: number of points.
+        capacity: largest number of rows.
+
+    Returns:
+        The rows, in order.
+    """
+    slots = np.arange(min(num_kept, capacity))
+    return slots * num_kept // capacity if num_kept > capacity else slots
+
+
+def find_inliers(tree: HostTree, num_neighbours: int) -> Bool[np.ndarray, " k"]:
+    """Finds the points whose mean distance to their neighbours is not above the limit.
+
+    Args:
+        tree: the points, two or more.
+        num_neighbours: number of neighbours.
+
+    Returns:
+        True for inliers.
+    """
+    points, rows = tree.points, evenly_spaced(len(tree.points), NUM_SPACED)
+    # One more neighbour, because each point is its own nearest one.
+    num_nearest = min(num_neighbours + 1, len(points))
+
+    def measure(rows: Int[np.ndarray, " r"]) -> None:
+        spread[rows] = tree.nearest(points.take(rows, axis=0), num_nearest)[1][:, 1:].mean(axis=1)
+
+    spread, weights = np.zeros(len(points)), np.zeros(len(points))
+    measure(rows)
+    weights[rows] = 1
+    if len(rows) < len(points):
+        is_lonely = _is_lonely(points, (spread[rows].mean() + OUTLIER_SIGMAS * spread[rows].std()) / 2, num_neighbours)
+        measure(np.flatnonzero(is_lonely & (weights == 0)))
+        # The points that are not lonely are counted as often as there are such: no spread of theirs is large.
+        weights = np.where(is_lonely, 1, weights * (~is_lonely).sum() / max(weights[~is_lonely].sum(), 1))
+    return spread <= largest_spread(spread, weights)
+
+
+def largest_spread(spread: Float[np.ndarray, " k"], weights: Float[np.ndarray, " k"]) -> float:
+    """Computes the largest mean distance of an inlier to its neighbours.
+
+    Args:
+        spread: mean distances of some points to their neighbours.
+        weights: number of points of the scan that each of them stands for.
+
+    Returns:
+        The limit, in the unit of the distances.
+    """
+    mean = np.average(spread, weights=weights)
+    # Relative tolerance: rounding must not drop points that are all equally far from their neighbours.
+    return float(mean + OUTLIER_SIGMAS * np.sqrt(np.average((spread - mean) ** 2, weights=weights))) * (1 + 1e-5)
+
+
+def _is_lonely(points: Float[np.ndarray, "n 3"], cell_m: float, num_neighbours: int) -> Bool[np.ndarray, " n"]:
+    """Returns True for points with at most this many others in the 27 cells around; all, where there are many cells."""
+    columns = np.ascontiguousarray(points.T)
+    columns -= columns.min(axis=1, keepdims=True)
+    columns /= max(cell_m, 1e-9)
+    shape = columns.max(axis=1) + 3
+    # Cells of half the limit; where more would be needed, the neighbours of all points are searched.
+    if shape.prod() > (1 << 22):
+        return np.ones(len(points), bool)
+    x, y, z = columns.astype(np.int64) + 1  # the border is empty
+    across = int(shape[1]), int(shape[2])
+    rows = (x * across[0] + y) * across[1] + z
+    counts = np.bincount(rows, minlength=int(shape[0]) * across[0] * across[1])
+    occupied, near = np.flatnonzero(counts), (-1, 0, 1)
+    steps = [(i * across[0] + j) * across[1] + k for i in near for j in near for k in near]
+    counts[occupied] = sum(counts.take(occupied + step) for step in steps)
+    return counts.take(rows) <= num_neighbours

@@ -16,15 +16,11 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from dpmjax.checks import as_host_points, require_count, require_positive_fields
 from dpmjax.geometry.neighbours import HostTree
 from dpmjax.geometry.planes import fit_planes
-from dpmjax.scans.outliers import largest_spread
-from dpmjax.scans.preprocess import first_of_each_voxel
+from dpmjax.scans.preprocess import first_of_each_voxel, largest_spread
 from dpmjax.types import SurfaceElements
 
 # A normal needs this many neighbours, the point itself among them.
 MIN_NEIGHBOURS = 4
-
-# Number of points whose neighbours measure the density of a scan.
-NUM_PROBED = 200
 
 # Least flatness of a point of a surface; foliage, wires and edges are less flat.
 MIN_FLATNESS = 0.1
@@ -123,7 +119,7 @@ def surface_at(
         tree: the points, metres, in the frame of the lidar.
         rows: rows of the chosen points; those in the order of the scan are searched faster.
         config: neighbourhoods; range and density are those of the points.
-        weights: number of points that each chosen one stands for, to leave out outliers (`scans.outliers`) by the same
+        weights: number of points that each chosen one stands for, to leave out outliers (`largest_spread`) by the same
             neighbours; None to keep them.
 
     Returns:
@@ -195,7 +191,8 @@ def _normals(
     rows, distances = found
     if rows.shape[1] < MIN_NEIGHBOURS:
         return np.zeros((len(points), 3)), np.zeros(len(points))
-    farthest_m = np.median(distances[:: max(1, len(points) // NUM_PROBED), -1]) if len(points) else 0.0
+    # Number of points whose neighbours measure the density of a scan.
+    farthest_m = np.median(distances[:: max(1, len(points) // 200), -1]) if len(points) else 0.0
     is_near = distances < max(config.neighbour_radius_m, config.sparse_radius_share * farthest_m)
     columns, own = (np.ascontiguousarray(values.T, np.float32) for values in (searched, points))
     # Neighbour by neighbour in memory: sums over them are several times faster.

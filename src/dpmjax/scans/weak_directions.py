@@ -19,9 +19,6 @@ from dpmjax.scans.surfaces import MIN_FLATNESS, Surface
 from dpmjax.scans.view_correlation import STEEP_COSINE, T_level_lidar, planar_motion
 from dpmjax.types import Information, Pose, Poses
 
-# Number of independent pairs with the information of all pairs, because residuals are correlated.
-NUM_INDEPENDENT = 200
-
 MIN_SIGMA_M = 0.01
 
 # Residuals are independent between cubes of this size, not within one.
@@ -38,9 +35,6 @@ VOXEL_M = 1.0
 # Walls are parallel to an axis if the cosine between their normal and the horizontal direction across it is larger.
 # Elements face the axis if the cosine between their normal and the axis is larger.
 PARALLEL_COSINE, FACING_COSINE = 0.9, 0.6
-
-# In a corridor, the axis of the walls has a smaller share of the information of their normals.
-CORRIDOR_SHARE = 0.1
 
 # Least flatness of an element in a corridor. Beams graze its far walls and floor, and meet them in slices across the
 # corridor. The corners of a slice seem to face the axis, and they move with the lidar.
@@ -127,7 +121,8 @@ def plane_information(pairs: Pairs, T_target_source: Pose) -> Information:
         Inverse covariance in the tangent of the source, translation first.
     """
     jacobian = _plane_system(pairs, T_target_source).jacobian
-    independent_share = min(NUM_INDEPENDENT / max(len(jacobian), 1), 1.0)
+    # Number of independent pairs with the information of all pairs, because residuals are correlated.
+    independent_share = min(200 / max(len(jacobian), 1), 1.0)
     return np.asarray(independent_share * jacobian.T @ jacobian + UNKNOWN)
 
 
@@ -328,7 +323,8 @@ def corridor_axis(surface: Surface) -> Float[np.ndarray, "3"] | None:
     """
     T, _, normals = _walls(surface, FIRM_FLATNESS)
     information, axes = np.linalg.eigh(normals.T @ normals)
-    if not len(normals) or information[0] >= CORRIDOR_SHARE * information.sum():
+    # In a corridor, the axis of the walls has a smaller share of the information of their normals.
+    if not len(normals) or information[0] >= 0.1 * information.sum():
         return None
     return np.append(axes[:, 0], 0.0) @ T[:3, :3]
 

@@ -1,11 +1,7 @@
 from .agents import AgentsResult as AgentsResult
-from .agents import JoinedMaps as JoinedMaps
 from .agents import MergedMaps as MergedMaps
-from .agents import SentBytes as SentBytes
-from .agents import join_agents as join_agents
 from .agents import merge_maps as merge_maps
 from .agents import run_agents as run_agents
-from .agents import take_component as take_component
 from .config import DescriptorConfig as DescriptorConfig
 from .config import FrontEndConfig as FrontEndConfig
 from .config import LoopClosureConfig as LoopClosureConfig
@@ -40,7 +36,6 @@ from .loops import DESCRIPTOR_INFORMATION as DESCRIPTOR_INFORMATION
 from .loops import Loop as Loop
 from .model_methods import NetworkMatcher as NetworkMatcher
 from .model_methods import make_methods as make_methods
-from .odometry_prior import with_guess as with_guess
 from .surface_geometry import SurfaceGeometry as SurfaceGeometry
 from .system import SlamResult as SlamResult
 from .system import SlamState as SlamState
@@ -52,5 +47,6 @@ from .system import place_scans as place_scans
 from .system import prepare_ahead as prepare_ahead
 from .system import run_slam as run_slam
 from .system import step_slam as step_slam
+from .system import with_guess as with_guess
 from .unposed import RegisteredClouds as RegisteredClouds
 from .unposed import register_unposed as register_unposed

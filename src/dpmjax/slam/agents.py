@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -30,56 +29,39 @@ from dpmjax.slam.keyframe_map import (
     take_keyframes,
     with_origin,
 )
-from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, optimize_map
 from dpmjax.slam.model_methods import as_methods, methods_for
-from dpmjax.slam.procedure import procedure_of
-from dpmjax.slam.system import SlamResult, place_scans, run_slam
+from dpmjax.slam.system import SlamResult, place_scans, procedure_of, run_slam
 from dpmjax.types import Pose, Poses, with_short_repr
-
-# Three float32 numbers.
-BYTES_A_POINT = 12
 
 # Callback for progress: number of compared keyframes, and number of all keyframes to compare.
 OnKeyframe = Callable[[int, int], None]
 
 
-def _ignore(_: int, __: int) -> None:
-    """Shows no progress."""
-
-
 @with_short_repr
-class JoinedMaps(NamedTuple):
-    """Several maps in one record; maps that meet have one frame.
+class MergedMaps(NamedTuple):
+    """Merged maps, and the maps that have met.
 
     Attributes:
-        slam_map: the keyframes of all maps, map by map; the scan numbers of each map continue those of the map before.
-        map_of_keyframe: (k,) number of the map that each keyframe comes from.
-        component_of_map: number of the component of each map, from 0; joined maps share one. Each component has its own
-            frame. Poses of different components or of different `measured_parts` cannot be compared.
+        maps: one map for each component, in the frame of its first map; a map that met no other is unchanged. Poses of
+            different maps or of different `measured_parts` cannot be compared.
+        component: row of `maps` that each given map is part of; maps with equal numbers have met.
         loops: candidates between maps and their outcome; rows are those of `slam_map`.
+        slam_map: the keyframes of all maps in one record, map by map; the scan numbers of each map continue those of
+            the map before.
+        map_of_keyframe: (k,) number of the given map that each keyframe comes from.
     """
 
+    maps: tuple[KeyframeMap, ...]
+    component: tuple[int, ...]
+    loops: tuple[Loop, ...]
     slam_map: KeyframeMap
     map_of_keyframe: Int[np.ndarray, " k"]
-    component_of_map: tuple[int, ...]
-    loops: tuple[Loop, ...]
 
-
-class SentBytes(NamedTuple):
-    """Numbers of bytes: messages of an agent, and its raw points for comparison.
-
-    Attributes:
-        keyframe_bytes: keyframes: descriptors, surface elements, range images, poses, retrieval vectors.
-        descriptor_bytes: features of the descriptors, a part of `keyframe_bytes`.
-        keyframe_scan_bytes: the raw points of the same keyframes, three float32 numbers each.
-        scan_bytes: the raw points of all scans.
-    """
-
-    keyframe_bytes: int
-    descriptor_bytes: int
-    keyframe_scan_bytes: int
-    scan_bytes: int
+    @property
+    def is_joined(self) -> bool:
+        """True if all maps have become one, and measured motions join all its keyframes."""
+        return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
 @with_short_repr
@@ -91,44 +73,14 @@ class AgentsResult(NamedTuple):
             its first agent.
         component: number of the component of each agent. Agents of one component have met. Only their poses can be
             compared, within `measured_parts`.
-        joined: all keyframes in one record, and the loops between agents.
+        joined: their merged maps, and the loops between agents.
         agents: result of each agent alone.
-        traffic: bytes that each agent sends.
     """
 
     T_world_scan: tuple[Poses, ...]
     component: tuple[int, ...]
-    joined: JoinedMaps
+    joined: MergedMaps
     agents: tuple[SlamResult, ...]
-    traffic: tuple[SentBytes, ...]
-
-
-@with_short_repr
-class MergedMaps(NamedTuple):
-    """Merged maps, and the maps that have met.
-
-    Attributes:
-        maps: one map for each component, in the frame of its first map; a map that met no other is unchanged.
-        joined: the keyframes of all maps in one record, and the loops between maps.
-    """
-
-    maps: tuple[KeyframeMap, ...]
-    joined: JoinedMaps
-
-    @property
-    def component(self) -> tuple[int, ...]:
-        """Row of `maps` that each given map is part of; maps with equal numbers have met."""
-        return self.joined.component_of_map
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """Candidates between maps and their outcome; rows count all keyframes, map by map."""
-        return self.joined.loops
-
-    @property
-    def is_joined(self) -> bool:
-        """True if all maps have become one, and measured motions join all its keyframes."""
-        return len(self.maps) == 1 and not measured_parts(self.maps[0]).any()
 
 
 @runs_on_host("call it outside, and pass its result in")
@@ -146,7 +98,7 @@ def run_agents(
         config: settings; None takes the defaults. Methods of your own carry theirs.
 
     Returns:
-        Trajectories, who has met whom, the joined graph, bytes sent.
+        Trajectories, who has met whom, the joined graph.
 
     Raises:
         ValueError: if there is no sequence, if a scan is not (n, 3), or if methods come with another configuration.
@@ -154,35 +106,14 @@ def run_agents(
     if not sequences:
         raise ValueError("sequences: expected the scans of at least one agent, got none")
     methods = as_methods(model, config)
-    return join_agents(methods, [run_slam(methods, scans) for scans in sequences])
-
-
-def join_agents(
-    methods: SlamMethods, agents: Sequence[SlamResult], *, on_keyframe: OnKeyframe = _ignore
-) -> AgentsResult:
-    """Joins the maps of agents; this is the second half of `run_agents`.
-
-    Args:
-        methods: methods of all agents.
-        agents: at least one.
-        on_keyframe: callback for progress, while keyframes are compared.
-
-    Returns:
-        Trajectories, who has met whom, the joined graph, bytes sent.
-
-    Raises:
-        ValueError: if an agent extended an earlier map, or if a map was made by another matcher.
-    """
-    if any(agent.reports and agent.reports[0].scan != 0 for agent in agents):
-        raise ValueError("agents: expected runs that began with an empty map, got one that extended a map")
-    joined = join_maps(methods, [agent.map for agent in agents], on_keyframe=on_keyframe)
-    trajectories, traffic = _trajectories(joined, agents), tuple(map(_traffic, agents))
-    return AgentsResult(trajectories, joined.component_of_map, joined, tuple(agents), traffic)
+    agents = tuple(run_slam(methods, scans) for scans in sequences)
+    joined = join_maps(methods, [agent.map for agent in agents])
+    return AgentsResult(_trajectories(joined, agents), joined.component, joined, agents)
 
 
 @runs_on_host("call it outside, and pass its result in")
 def merge_maps(
-    model: Model | SlamMethods, *maps: KeyframeMap | str | Path, on_keyframe: OnKeyframe = _ignore
+    model: Model | SlamMethods, *maps: KeyframeMap | str | Path, on_keyframe: OnKeyframe = lambda _num, _all: None
 ) -> MergedMaps:
     """Joins maps of different days or of different robots at the places that they share.
 
@@ -202,16 +133,12 @@ def merge_maps(
     loaded: list[KeyframeMap] = [read_path(slam_map, "saved_maps.load_map") for slam_map in maps]
     for slam_map in loaded:
         require_type("maps", slam_map, KeyframeMap, "load_map")
-    joined = join_maps(methods_for(model, loaded[0]), loaded, on_keyframe=on_keyframe)
-    numbers = joined.component_of_map
-    merged = [
-        take_component(joined, component) if numbers.count(component) > 1 else loaded[numbers.index(component)]
-        for component in range(max(numbers) + 1)
-    ]
-    return MergedMaps(tuple(merged), joined)
+    return join_maps(methods_for(model, loaded[0]), loaded, on_keyframe=on_keyframe)
 
 
-def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = _ignore) -> JoinedMaps:
+def join_maps(
+    methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe: OnKeyframe = lambda _num, _all: None
+) -> MergedMaps:
     """Finds loops between maps, and optimises each group of joined maps as one graph.
 
     The order of the maps changes only the order of the rows and the frames: a component has the frame of its first map.
@@ -222,7 +149,7 @@ def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe:
         on_keyframe: callback for progress.
 
     Returns:
-        All keyframes, and the components of the joined maps.
+        The merged maps.
 
     Raises:
         ValueError: if a map was made by another matcher.
@@ -247,21 +174,12 @@ def join_maps(methods: SlamMethods, maps: Sequence[KeyframeMap], *, on_keyframe:
     # Scipy numbers the parts in the order of their first nodes.
     components = tuple(connected_parts(len(maps), between).tolist())
     joined = replace(joined, T_world_keyframe=_in_own_frames(joined, map_of_row, components, maps))
-    return JoinedMaps(joined, map_of_row, components, loops)
-
-
-def take_component(joined: JoinedMaps, component: int) -> KeyframeMap:
-    """Extracts the map of one component.
-
-    Args:
-        joined: maps from `join_maps`.
-        component: its number.
-
-    Returns:
-        The map of the keyframes and edges of that component, with rows of its own.
-    """
-    is_taken = np.array(joined.component_of_map)[joined.map_of_keyframe] == component
-    return take_keyframes(joined.slam_map, np.flatnonzero(is_taken).tolist())
+    component_of_row, merged = np.array(components)[map_of_row], []
+    for number in range(max(components) + 1):
+        alone = maps[components.index(number)]
+        rows = np.flatnonzero(component_of_row == number).tolist()
+        merged.append(take_keyframes(joined, rows) if components.count(number) > 1 else alone)
+    return MergedMaps(tuple(merged), components, loops, joined, map_of_row)
 
 
 def _side_by_side(maps: Sequence[KeyframeMap]) -> KeyframeMap:
@@ -288,22 +206,7 @@ def _in_own_frames(
     return np.reshape(T_new_old, (-1, 4, 4))[component] @ T_old
 
 
-def _traffic(agent: SlamResult) -> SentBytes:
-    scans = [keyframe.compact for keyframe in agent.map.keyframes]
-    scan_bytes = [BYTES_A_POINT * report.num_points for report in agent.reports]
-    return SentBytes(
-        keyframe_bytes=_num_bytes((scans, agent.map.vectors, agent.map.T_world_keyframe)),
-        descriptor_bytes=_num_bytes([(scan.features, scan.feature_steps, scan.directions) for scan in scans]),
-        keyframe_scan_bytes=sum(scan_bytes[keyframe.scan] for keyframe in agent.map.keyframes),
-        scan_bytes=sum(scan_bytes),
-    )
-
-
-def _num_bytes(record: object) -> int:
-    return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(record))
-
-
-def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:
+def _trajectories(joined: MergedMaps, agents: Sequence[SlamResult]) -> tuple[Poses, ...]:
     """Computes the poses of all scans; the first scan of a component's first agent is its origin."""
     found: list[Poses] = []
     origins: dict[int, Pose] = {}
@@ -314,7 +217,7 @@ def _trajectories(joined: JoinedMaps, agents: Sequence[SlamResult]) -> tuple[Pos
             # `place_scans` has the first scan as its origin.
             first = agent.reports[0]
             T_world_agent = T_world_keyframe[first.keyframe] @ first.T_keyframe_scan
-            T_origin_world = origins.setdefault(joined.component_of_map[number], rigid.inverse(T_world_agent))
+            T_origin_world = origins.setdefault(joined.component[number], rigid.inverse(T_world_agent))
             T_agent_scan = T_origin_world @ T_world_agent @ T_agent_scan
         found.append(T_agent_scan)
     return tuple(found)

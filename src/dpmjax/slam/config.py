@@ -40,23 +40,18 @@ class FrontEndConfig:
 
     Attributes:
         min_probability: smallest P(correct) of a decoder's motion that confirms a pose of too low a score.
-        num_submap: largest number of keyframes that are merged for a registration.
-        num_lost: after this number of scans without an accepted pose, a new segment begins. Loops may join it later.
         keyframe_share: distance of keyframes, as a share of the extent.
         max_keyframe_m: upper bound of the distance of keyframes (DeepPointMap: 3 to 10 m).
         min_keyframe_m: lower bound of the distance of keyframes.
     """
 
     min_probability: float = 0.5
-    num_submap: int = 4
-    num_lost: int = 6
     keyframe_share: float = 0.3
     max_keyframe_m: float = 5.0
     min_keyframe_m: float = 0.5
 
     def __post_init__(self) -> None:
         require_fields(self, "min_probability", low=0, high=1)
-        require_fields(self, "num_submap", "num_lost", low=1)
         require_positive_fields(self, "keyframe_share")
         require_fields(self, "min_keyframe_m", low=1e-3, high=self.max_keyframe_m)
 
@@ -67,22 +62,14 @@ class LoopClosureConfig:
 
     Attributes:
         is_on: False searches no loops: the map is that of odometry.
-        num_similar: largest number of candidates by retrieval.
-        min_overlap: smallest overlap probability of a candidate that is registered.
         min_probability: smallest P(correct) of an accepted registration.
-        min_support: a loop becomes an edge with this number of consistent registrations, its own included.
     """
 
     is_on: bool = True
-    num_similar: int = 6
-    min_overlap: float = 0.3
     min_probability: float = 0.5
-    min_support: int = 2
 
     def __post_init__(self) -> None:
-        require_fields(self, "min_overlap", "min_probability", low=0, high=1)
-        require_fields(self, "min_support", low=1)
-        require_fields(self, "num_similar", low=0)
+        require_fields(self, "min_probability", low=0, high=1)
 
 
 @dataclass(frozen=True)

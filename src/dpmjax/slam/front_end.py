@@ -22,17 +22,11 @@ from dpmjax.slam.local_map import LocalMap, PlacedElements, joined_surface, loca
 from dpmjax.slam.surface_geometry import SAME_M, SAME_RAD
 from dpmjax.types import Information, Pose
 
-# Turn between keyframes at a smaller distance.
-KEYFRAME_RAD = 0.6
-
 # Smallest accepted score.
 MIN_SCORE = 0.2
 
 # Smallest accepted share of the usual score.
 MIN_SCORE_SHARE = 0.4
-
-# Number of motions that the decoder proposes.
-NUM_HYPOTHESES = 3
 
 # Share of the usual score above which no other start is tried.
 GOOD_SHARE = 0.85
@@ -254,7 +248,8 @@ class _Search(NamedTuple):
         status: ScanStatus = "tracked" if best is tried.tracked else "network"
         if best.score < wanted and not _is_confirmed(tried, config.min_probability):
             T = self._guess(tried)
-            status = "restarted" if len(state.lost) + 1 >= config.num_lost else "predicted"
+            # After six scans without an accepted pose, a new segment begins. Loops may join it later.
+            status = "restarted" if len(state.lost) + 1 >= 6 else "predicted"
             information = diagonal_information(GUESS_M, GUESS_RAD)
         elif self.scan.weak_axis is not None:
             sigma_m = sigma_along(information, self.scan.weak_axis)
@@ -295,7 +290,8 @@ class _Search(NamedTuple):
                 return _Attempt(tracked, tracked)
         compact = matcher.encode(scan) if compact is None else compact
         row = local_map.nearest(predicted[:3, 3])
-        proposal = matcher.propose(compact, local_map.compact[row], NUM_HYPOTHESES)
+        # Number of motions that the decoder proposes.
+        proposal = matcher.propose(compact, local_map.compact[row], 3)
         starts = orthonormal(local_map.keyframes[row].T_map_scan @ proposal.T_target_source)
         best = matched = geometry.search(local_map, scan, starts)
         if tracked is None and (is_predicted or matched.score < good_score):
@@ -345,7 +341,8 @@ def _is_confirmed(tried: _Attempt, min_probability: float) -> bool:
 def _is_keyframe(methods: SlamMethods, report: ScanReport, scan: Scan) -> bool:
     config, T = methods.config.front_end, report.T_keyframe_scan
     spacing_m = np.clip(config.keyframe_share * scan.extent_m, config.min_keyframe_m, config.max_keyframe_m)
-    is_away = bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > KEYFRAME_RAD
+    # Turn between keyframes at a smaller distance.
+    is_away = bool(np.linalg.norm(T[:3, 3]) > spacing_m) or turn_rad(T) > 0.6
     return is_away and report.status != "predicted"
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from dpmjax.checks import require_positive
 from dpmjax.deeppointmap.compact_scans import CompactScan, expand_elements
-from dpmjax.geometry import rigid
+from dpmjax.geometry import rigid, se3
 from dpmjax.pose_graph.graph import Edges, PoseGraph, label_parts
 from dpmjax.slam.config import SlamConfig
 from dpmjax.types import Information, Pose, Poses
@@ -365,7 +365,7 @@ def _covering(slam_map: KeyframeMap, spacing_share: float) -> tuple[list[int], I
     """Returns the rows that stay, and the nearest one of these for each row."""
     extents_m = slam_map.column("extent_m")
     # Parts of a map that no loop has joined have no known distance.
-    part = connected_parts(len(slam_map), slam_map.edges_of("odometry", "loop"))
+    part = measured_parts(slam_map)
 
     def apart_m(row: int) -> Float[np.ndarray, " n"]:
         distances = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])[kept]
@@ -386,14 +386,6 @@ def _contracted(slam_map: KeyframeMap, edge: MapEdge, cover: Int[np.ndarray, " k
     T_start_source = rigid.inverse(T_world[edge.source]) @ T_world[source]
     T = T_target_end @ edge.T_target_source @ T_start_source
     num_steps = 1 + (source != edge.source) + (target != edge.target)
-    information = _moved_information(edge.information, T_start_source) / num_steps
-    return MapEdge(source, target, T, information, edge.kind)
-
-
-def _moved_information(information: Information, T_old_new: Pose) -> np.ndarray:
-    """Moves an information matrix from the tangent of the old frame to that of the new one."""
-    R, t = T_old_new[:3, :3], T_old_new[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    adjoint = np.block([[R, cross @ R], [np.zeros((3, 3)), R]])
-    moved = adjoint.T @ information @ adjoint
-    return (moved + moved.T) / 2
+    adjoint = se3.adjoint(T_start_source)
+    information = adjoint.T @ edge.information @ adjoint / num_steps
+    return MapEdge(source, target, T, (information + information.T) / 2, edge.kind)

@@ -27,9 +27,6 @@ RECENT_SHARE = 0.08
 # Largest number of the last scans. More make a denser surface, which odometry searches more slowly.
 NUM_RECENT = 8
 
-# Turn above which a scan joins the local map at a smaller distance.
-RECENT_RAD = 0.17
-
 
 class PlacedElements(NamedTuple):
     """Flat surface elements of a scan and its pose.
@@ -117,7 +114,8 @@ def with_scan(
     """
     if recent:
         T_last_scan = rigid.inverse(recent[-1].T_map_scan) @ placed.T_map_scan
-        if np.linalg.norm(T_last_scan[:3, 3]) < RECENT_SHARE * extent_m and turn_rad(T_last_scan) < RECENT_RAD:
+        # Turn above which a scan joins the local map at a smaller distance.
+        if np.linalg.norm(T_last_scan[:3, 3]) < RECENT_SHARE * extent_m and turn_rad(T_last_scan) < 0.17:
             return recent
     return (*recent, placed)[-NUM_RECENT:]
 

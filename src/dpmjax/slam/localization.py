@@ -26,23 +26,21 @@ from dpmjax.slam.model_methods import methods_for
 from dpmjax.slam.system import corrected_points
 from dpmjax.types import AnyArray, Pose, with_short_repr
 
-# Largest sum of probabilities of a second place, as a share of the sum of the best place.
-MAX_RIVAL_SHARE = 0.5
-
 # Largest turn between registrations that agree.
 SAME_PLACE_RAD = 0.06
 
 # Largest distance between registrations that agree.
 SAME_PLACE_M = 1.5
 
+# Numbers of keyframes by retrieval whose overlap is estimated, and of those that are registered: more find more scans,
+# slower. Number of registrations that must end at the same place; one suffices if no other keyframe is near.
+NUM_SIMILAR, NUM_REGISTERED, MIN_SUPPORT = 16, 8, 2
+
 # Number of registrations at a time; further ones follow only while the place is not clear.
 NUM_AT_ONCE = 2
 
 # Number of further keyframes near the best place that are registered.
 NUM_NEIGHBOURS = 2
-
-# A registration supports a place from this P(correct) on, if the scans agree.
-MIN_PROBABILITY = 0.2
 
 # Scans agree up to this share of points in free space.
 MAX_CONTRADICTED_SHARE = 0.1
@@ -55,24 +53,16 @@ LocalizationStatus = Literal["found", "not in this map", "empty"]
 
 @dataclass(frozen=True)
 class LocalizationConfig:
-    """Number of registrations, and limits of acceptance.
+    """Limit of acceptance.
 
     Attributes:
-        num_similar: number of keyframes by retrieval whose overlap is estimated.
-        num_registered: largest number of these keyframes that are registered, in order of their overlap.
-        min_support: number of registrations that must end at the same place. The scans of at least one registration
-            must agree. One registration suffices if no other keyframe is near.
         min_best: smallest P(correct) of the best registration of a place. Streets look alike, so several registrations
             may agree on a wrong place. A high limit rejects such places.
     """
 
-    num_similar: int = 16
-    num_registered: int = 8
-    min_support: int = 2
     min_best: float = 0.98
 
     def __post_init__(self) -> None:
-        require_fields(self, "num_similar", "num_registered", "min_support", low=1)
         require_fields(self, "min_best", low=0, high=1)
 
 
@@ -195,7 +185,7 @@ class _Search(NamedTuple):
         for start in range(0, len(rows), NUM_AT_ONCE):
             tried += self._registered(rows[start : start + NUM_AT_ONCE], compact, tried)
             places = self._places(tried)
-            if places and not self._is_supported(places[0], self.config.min_support):
+            if places and not self._is_supported(places[0], MIN_SUPPORT):
                 apart_m = self._distances(places[0][0].T_world_scan, places[0][0].keyframe)
                 done = [one.keyframe for one in tried]
                 nearest = [row for row in np.argsort(apart_m, kind="stable").tolist() if apart_m[row] <= extent_m]
@@ -208,12 +198,12 @@ class _Search(NamedTuple):
 
     def _candidates(self, compact: CompactScan) -> list[int]:
         """Returns the keyframes to register, the most probable overlap first."""
-        matcher, config = self.methods.matcher, self.config
+        matcher = self.methods.matcher
         vector = matcher.vector(compact)
         vector = vector / max(float(np.linalg.norm(vector)), 1e-12)
-        rows, _ = most_similar(self.slam_map.vectors, vector, config.num_similar)
+        rows, _ = most_similar(self.slam_map.vectors, vector, NUM_SIMILAR)
         overlaps = matcher.overlaps(compact, [self.slam_map.keyframes[row].compact for row in rows])
-        return rows[np.argsort(-overlaps, kind="stable")[: config.num_registered]].tolist()
+        return rows[np.argsort(-overlaps, kind="stable")[:NUM_REGISTERED]].tolist()
 
     def _registered(self, rows: list[int], compact: CompactScan, tried: list[KeyframeMatch]) -> list[KeyframeMatch]:
         """Registers the scan with the keyframes that were not tried before."""
@@ -230,7 +220,8 @@ class _Search(NamedTuple):
         """Groups registrations around the most probable ones whose scans agree; the most probable place first."""
         # Few points meet planes of a distant keyframe, so its registration only needs to end at the same place.
         left = sorted(tried, key=lambda one: -one.match.probability)
-        left = [one for one in left if one.match.probability >= MIN_PROBABILITY]
+        # A registration supports a place from this P(correct) on, if the scans agree.
+        left = [one for one in left if one.match.probability >= 0.2]
         places = []
         while first := next((one for one in left if one.do_scans_agree), None):
             others = [one for one in left if one is not first and self._agree(first, one)]
@@ -260,8 +251,9 @@ class _Search(NamedTuple):
         # Measured from the keyframe: a wrong pose beside the map would have no keyframe near it, either.
         around_m = self._distances(self.slam_map.T_world_keyframe[first.keyframe], first.keyframe)
         is_alone = int((around_m <= extent_m).sum()) <= 1
-        is_supported = self._is_supported(best, 1 if is_alone else self.config.min_support)
-        if not is_supported or rival > MAX_RIVAL_SHARE * total:
+        is_supported = self._is_supported(best, 1 if is_alone else MIN_SUPPORT)
+        # Largest sum of probabilities of a second place, as a share of the sum of the best place.
+        if not is_supported or rival > 0.5 * total:
             return Localization("not in this map", None, 0.0, None, numbers, evidence)
         part = int(self.parts[first.keyframe])
         return Localization("found", first.T_world_scan, probability, first.keyframe, numbers, evidence, part)

@@ -13,11 +13,19 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dpmjax.slam.config import LoopClosureConfig
+from dpmjax.scans.apart import apart
 from dpmjax.slam.interfaces import SlamMethods
 from dpmjax.slam.keyframe_map import KeyframeMap, submap_around
-from dpmjax.slam.loops import Loop, LoopState, LoopStatus, accept_consistent, has_new_loops, with_match
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import (
+    Loop,
+    LoopState,
+    LoopStatus,
+    accept_consistent,
+    has_new_loops,
+    optimize_map,
+    path_since_loop_m,
+    with_match,
+)
 
 # Upper bound of the radius (DeepPointMap: 100 m).
 MAX_RADIUS_M = 100.0
@@ -31,26 +39,14 @@ RADIUS_SHARE = 1.5
 # Share of the path since a candidate that is added to the radius.
 DRIFT_SHARE = 0.03
 
-# Smallest similarity of a candidate by retrieval.
-MIN_COSINE = 0.8
+# Smallest similarity of a candidate by retrieval, and largest number of them: more find more loops, slower.
+MIN_COSINE, NUM_SIMILAR = 0.8, 6
 
-# The mean of fewer vectors is too noisy to subtract.
-MIN_NUM_CENTRED = 20
-
-# Overlap probability above which no further candidate is examined.
-SURE_OVERLAP = 0.9
-
-# Length of path after an accepted loop without a search for another one, in extents.
-REST_SHARE = 0.3
-
-# Smallest number of keyframes between two optimisations.
-EVERY_KEYFRAMES = 8
+# Smallest overlap probability of a registered candidate, and largest number of keyframes of one of its submaps.
+MIN_OVERLAP, NUM_SUBMAP = 0.3, 4
 
 # Share of all keyframes between two optimisations, so that the cost of a scan does not grow with the map.
 EVERY_SHARE = 0.05
-
-# Largest number of candidates by distance: more find loops after a longer drift, at the cost of their overlap.
-NUM_NEAR = 6
 
 # Number of candidates whose overlap is predicted at a time, alternately by distance and by retrieval: one that surely
 # overlaps ends the search after fewer of them.
@@ -74,12 +70,13 @@ def close_loops(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) -
     Returns:
         The map and the candidates after.
     """
-    config, row = methods.config.loops, len(slam_map) - 1
-    if not config.is_on or row < 1 or is_resting(slam_map, state.loops, row):
+    row = len(slam_map) - 1
+    if not methods.config.loops.is_on or row < 1 or is_resting(slam_map, state.loops, row):
         return slam_map, state
-    candidates = find_loop_candidates(slam_map, row, config)
+    candidates = find_loop_candidates(slam_map, row)
     state = state._replace(loops=examine_candidates(methods, slam_map, state.loops, candidates))
-    wait = max(EVERY_KEYFRAMES, int(EVERY_SHARE * len(slam_map)))
+    # Smallest number of keyframes between two optimisations.
+    wait = max(8, int(EVERY_SHARE * len(slam_map)))
     if len(slam_map) - state.num_optimized >= wait and has_new_loops(slam_map, state.loops):
         slam_map, state = optimize_map(slam_map, state)
         return slam_map, search_again(methods, slam_map, state)
@@ -103,7 +100,7 @@ def join_keyframe(
     """
     if is_resting(slam_map, loops, row):
         return slam_map, loops
-    candidates = similar_keyframes(slam_map, row, is_allowed, methods.config.loops)
+    candidates = similar_keyframes(slam_map, row, is_allowed)
     return slam_map, examine_candidates(methods, slam_map, loops, candidates)
 
 
@@ -130,7 +127,7 @@ def search_again(methods: SlamMethods, slam_map: KeyframeMap, state: LoopState) 
     for candidate in new[:MAX_AGAIN]:
         first = bisect_right(loops, candidate.source, key=lambda loop: loop.source)
         loops = (*loops[:first], *_register_candidates(methods, slam_map, [candidate]), *loops[first:])
-        loops = accept_consistent(slam_map, loops, first, methods.config.loops)
+        loops = accept_consistent(slam_map, loops, first)
     return state._replace(loops=loops)
 
 
@@ -145,11 +142,7 @@ def is_resting(slam_map: KeyframeMap, loops: Sequence[Loop], row: int) -> bool:
     Returns:
         True if the last accepted loop is near along the path.
     """
-    last = next((slam_map.keyframes[loop.source] for loop in reversed(loops) if loop.status == "accepted"), None)
-    if last is None:
-        return False
-    keyframe = slam_map.keyframes[row]
-    return keyframe.segment == last.segment and keyframe.path_m - last.path_m < REST_SHARE * keyframe.extent_m
+    return path_since_loop_m(slam_map, loops, row) < 0.3 * slam_map.keyframes[row].extent_m
 
 
 def examine_candidates(
@@ -169,21 +162,20 @@ def examine_candidates(
     num_before = len(loops)
     loops = (*loops, *_register_candidates(methods, slam_map, candidates))
     for number in range(num_before, len(loops)):
-        loops = accept_consistent(slam_map, loops, number, methods.config.loops)
+        loops = accept_consistent(slam_map, loops, number)
     return loops
 
 
 def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates: list[Loop]) -> list[Loop]:
     """Registers the candidates that most probably overlap, one by one, until one is accepted."""
-    config, num_submap = methods.config.loops, methods.config.front_end.num_submap
     loops = _with_overlaps(methods, slam_map, candidates)
     overlapping = [number for number, loop in enumerate(loops) if loop.status == "not registered"]
     overlapping.sort(key=lambda number: -(loops[number].overlap or 0.0))
     for number in overlapping[:NUM_REGISTERED]:
         loop = loops[number]
-        source, target = (submap_around(slam_map, row, num_submap) for row in loop[:2])
+        source, target = (submap_around(slam_map, row, NUM_SUBMAP) for row in loop[:2])
         (match,) = methods.matcher.register([(source, target)])
-        loops[number] = with_match(slam_map, loop, match, config)
+        loops[number] = with_match(slam_map, loop, match, methods.config.loops.min_probability)
         if loops[number].status == "waits for support":
             break
     return loops
@@ -191,20 +183,21 @@ def _register_candidates(methods: SlamMethods, slam_map: KeyframeMap, candidates
 
 def _with_overlaps(methods: SlamMethods, slam_map: KeyframeMap, candidates: list[Loop]) -> list[Loop]:
     """Predicts the overlap, some candidates at a time, until one surely overlaps; the remaining ones do not change."""
-    config, loops = methods.config.loops, list(candidates)
+    loops = list(candidates)
     for start in range(0, len(candidates), NUM_ASKED):
         some = candidates[start : start + NUM_ASKED]
         scans = [slam_map.keyframes[loop.target].compact for loop in some]
         overlaps = methods.matcher.overlaps(slam_map.keyframes[some[0].source].compact, scans).tolist()
         for number, overlap in enumerate(overlaps, start):
-            status: LoopStatus = "no overlap" if overlap < config.min_overlap else "not registered"
+            status: LoopStatus = "no overlap" if overlap < MIN_OVERLAP else "not registered"
             loops[number] = loops[number]._replace(status=status, overlap=overlap)
-        if max(overlaps) >= SURE_OVERLAP:
+        # Overlap probability above which no further candidate is examined.
+        if max(overlaps) >= 0.9:
             break
     return loops
 
 
-def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureConfig) -> list[Loop]:
+def find_loop_candidates(slam_map: KeyframeMap, row: int) -> list[Loop]:
     """Finds older keyframes that may show the place of a keyframe.
 
     Candidates by distance lie within a radius. It grows with the length of the path between the two, because odometry
@@ -214,7 +207,6 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
     Args:
         slam_map: the map.
         row: row of the new keyframe.
-        config: largest number of candidates by retrieval.
 
     Returns:
         Candidates by distance (nearest first) and by retrieval (most similar first), in turn; each row once.
@@ -224,9 +216,10 @@ def find_loop_candidates(slam_map: KeyframeMap, row: int, config: LoopClosureCon
     apart_m = slam_map.distances_to(slam_map.T_world_keyframe[row, :3, 3])
     is_near = is_old & (apart_m <= np.minimum(RADIUS_SHARE * extent_m + DRIFT_SHARE * since_m, MAX_RADIUS_M))
     near = np.argsort(np.where(is_near, apart_m, np.inf), kind="stable")[: int(is_near.sum())]
-    near = _spread(near, slam_map, extent_m / 2, NUM_NEAR)
+    # Largest number of candidates by distance: more find loops after a longer drift, at the cost of their overlap.
+    near = _spread(near, slam_map, extent_m / 2, 6)
     by_distance = [Loop(row, int(other), "distance") for other in near]
-    by_retrieval = [loop for loop in similar_keyframes(slam_map, row, is_old, config) if loop.target not in near]
+    by_retrieval = [loop for loop in similar_keyframes(slam_map, row, is_old) if loop.target not in near]
     in_turn = itertools.chain.from_iterable(itertools.zip_longest(by_distance, by_retrieval))
     return [candidate for candidate in in_turn if candidate is not None]
 
@@ -251,23 +244,20 @@ def nearest_pairs(slam_map: KeyframeMap) -> list[tuple[float, int, int]]:
     return sorted(pairs)
 
 
-def similar_keyframes(
-    slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"], config: LoopClosureConfig
-) -> list[Loop]:
+def similar_keyframes(slam_map: KeyframeMap, row: int, is_allowed: Bool[np.ndarray, " k"]) -> list[Loop]:
     """Finds keyframes that may show the place of a keyframe, by retrieval alone, without positions.
 
     Args:
         slam_map: the map; or several maps in one record.
         row: row of the keyframe.
         is_allowed: False for keyframes that are no candidates.
-        config: largest number of candidates.
 
     Returns:
         Candidates, most similar first.
     """
-    rows, cosines = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * config.num_similar, is_allowed=is_allowed)
+    rows, cosines = most_similar(slam_map.vectors, slam_map.vectors[row], 5 * NUM_SIMILAR, is_allowed=is_allowed)
     spacing_m = slam_map.keyframes[row].extent_m / 2
-    similar = _spread(rows[cosines >= MIN_COSINE], slam_map, spacing_m, config.num_similar)
+    similar = _spread(rows[cosines >= MIN_COSINE], slam_map, spacing_m, NUM_SIMILAR)
     return [Loop(row, int(other), "retrieval") for other in similar]
 
 
@@ -293,7 +283,8 @@ def most_similar(
     """
     if len(vectors) == 0 or count == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.float32)
-    mean = vectors.mean(axis=0) if len(vectors) >= MIN_NUM_CENTRED else np.zeros_like(query)
+    # The mean of fewer vectors is too noisy to subtract.
+    mean = vectors.mean(axis=0) if len(vectors) >= 20 else np.zeros_like(query)
     centred = query - mean
     # |v - m|^2 = 1 - 2 v.m + m.m for unit vectors: no centred copy of the whole map.
     lengths = np.sqrt(np.maximum(1 - 2 * (vectors @ mean) + mean @ mean, 1e-12)) * max(np.linalg.norm(centred), 1e-6)
@@ -325,11 +316,8 @@ def _spread(rows: Int[np.ndarray, " n"], slam_map: KeyframeMap, spacing_m: float
     """Returns the first rows without those within `spacing_m` of an earlier row of the same segment."""
     positions = slam_map.T_world_keyframe[rows, :3, 3]
     segments = np.array([slam_map.keyframes[row].segment for row in rows])
-    is_free: Bool[np.ndarray, " n"] = np.ones(len(rows), bool)
-    taken: list[int] = []
-    for number in range(len(rows)):
-        if is_free[number] and len(taken) < count:
-            taken.append(number)
-            distance: Float[np.ndarray, " n"] = np.linalg.norm(positions - positions[number], axis=1)
-            is_free &= (distance > spacing_m) | (segments != segments[number])
-    return rows[taken]
+
+    def is_near(one: int) -> Bool[np.ndarray, " n"]:
+        return (np.linalg.norm(positions - positions[one], axis=1) <= spacing_m) & (segments == segments[one])
+
+    return rows[apart(np.arange(len(rows), 0.0, -1.0), is_near, count)]

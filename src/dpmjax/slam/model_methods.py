@@ -42,9 +42,6 @@ log = logging.getLogger(__name__)
 # Matching as published: the best pairs of both softmaxes, without a consensus.
 PUBLISHED = MatchConfig()
 
-# Points nearer than this under a motion are pairs of its information (published configuration).
-MEETING_M = 1.0
-
 # Information of a motion without any pair.
 UNKNOWN = diagonal_information(1000.0, np.pi)
 
@@ -222,8 +219,9 @@ def point_information(
         (6, 6) in the tangent of the source, translation first; nearly zero where no points meet.
     """
     moved = (target - T_target_source[:3, 3]) @ T_target_source[:3, :3]
+    # Points nearer than this under a motion are pairs of its information (published configuration).
     # Points beyond the radius have the number of points as their row.
-    rows = np.asarray(cKDTree(moved).query(source, distance_upper_bound=MEETING_M)[1])
+    rows = np.asarray(cKDTree(moved).query(source, distance_upper_bound=1.0)[1])
     q = moved[rows[rows < len(moved)]]
     jacobian = np.zeros((len(q), 3, 6))
     jacobian[:, :, :3] = np.eye(3)

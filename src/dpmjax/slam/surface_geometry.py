@@ -5,21 +5,18 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from dpmjax.deeppointmap.model_config import ModelConfig
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import orthonormal
 from dpmjax.scans.align import ALL, AlignmentLevel, align_on_host
+from dpmjax.scans.apart import apart
 from dpmjax.scans.lidar import Scan, lidar_scan
 from dpmjax.scans.pairs import Pairs, nearest_planes
 from dpmjax.scans.surfaces import Surface, view_points
-from dpmjax.scans.weak_directions import (
-    plane_information,
-    with_least_covariance,
-    without_noise_along,
-)
+from dpmjax.scans.weak_directions import plane_information, with_least_covariance, without_noise_along
 from dpmjax.sequences import homogeneous
 from dpmjax.slam.interfaces import Alignment
 from dpmjax.slam.local_map import LocalMap
@@ -52,9 +49,6 @@ FLOOR_M = 0.01
 # Lower bound of the standard deviation of a rotation.
 FLOOR_RAD = 0.001
 
-# Number of elements of the local map that are compared with the free space of a scan.
-MAX_VIEWED = 4000
-
 # Largest number of coarse poses of a search that are aligned finely, and largest distance and turn between two of them
 # that are one: with a larger one, a start in another valley may be lost.
 NUM_FINE, SAME_M, SAME_RAD = 3, 0.1, 0.02
@@ -62,9 +56,6 @@ NUM_FINE, SAME_M, SAME_RAD = 3, 0.1, 0.02
 # Alignment from a first guess that is nearly right, and from other starts.
 NARROW = (AlignmentLevel(1.0, 1000, 10), AlignmentLevel(1.0, 4000, 12, kernel_m=0.1))
 WIDE = (AlignmentLevel(3.0, 300, 10),)
-
-# Largest distance between an element and the element of the map whose plane it meets.
-PLANE_RADIUS_M = 1.5
 
 
 class SurfaceGeometry:
@@ -154,21 +145,20 @@ def _aligned(local_map: LocalMap, scan: Scan, starts: Poses) -> list[Alignment]:
 
 
 def _planes(local_map: LocalMap, scan: Scan, T_map_scan: Poses, num_samples: int) -> Pairs:
-    return nearest_planes(scan.surface, local_map.surface, T_map_scan, PLANE_RADIUS_M, num_samples)
+    # Largest distance between an element and the element of the map whose plane it meets.
+    return nearest_planes(scan.surface, local_map.surface, T_map_scan, 1.5, num_samples)
 
 
 def _distinct(poses: Poses) -> Poses:
     """Returns the first poses that are apart from one another: starts of one valley end coarsely at one pose."""
-    kept = poses[:1]
-    for pose in poses[1:]:
-        if len(kept) == NUM_FINE:
-            break
-        apart_m = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
+
+    def is_near(one: int) -> Bool[np.ndarray, " s"]:
+        apart_m = np.linalg.norm(poses[:, :3, 3] - poses[one, :3, 3], axis=1)
         # The Frobenius norm of the difference of two rotations is the root of 2 times a small angle between them.
-        apart_rad = np.linalg.norm(kept[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(2)
-        if ((apart_m > SAME_M) | (apart_rad > SAME_RAD)).all():
-            kept = np.concatenate([kept, pose[None]])
-    return kept
+        apart_rad = np.linalg.norm(poses[:, :3, :3] - poses[one, :3, :3], axis=(1, 2)) / np.sqrt(2)
+        return (apart_m <= SAME_M) & (apart_rad <= SAME_RAD)
+
+    return poses[apart(np.arange(len(poses), 0.0, -1.0), is_near, NUM_FINE)]
 
 
 def _information(scan: Scan, planes: Pairs, T_map_scan: Pose) -> Information:
@@ -195,7 +185,8 @@ def _matched_shares(surface: Surface, planes: Pairs) -> Float[np.ndarray, " s"]:
 def _contradicted_shares(local_map: LocalMap, scan: Scan, T_map_scan: Poses) -> Float[np.ndarray, " s"]:
     """Returns the share of visible elements of the map that lie in the free space of the scan."""
     surface = local_map.surface
-    points = surface.points.take(surface.samples[:MAX_VIEWED], axis=0).astype(np.float32)
+    # Number of elements of the local map that are compared with the free space of a scan.
+    points = surface.points.take(surface.samples[:4000], axis=0).astype(np.float32)
     T_scan_map = rigid.inverse(T_map_scan).astype(np.float32)
     moved = np.matmul(T_scan_map[:, :3, :3], points.T) + T_scan_map[:, :3, 3:]
     is_visible, is_contradicted = view_points(scan.image, moved.swapaxes(1, 2))

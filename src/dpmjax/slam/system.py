@@ -22,22 +22,38 @@ from dpmjax.pose_graph.graph import PoseGraph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
 from dpmjax.scans.corrections import deskew
+from dpmjax.slam import descriptors, front_end, loop_closure
 from dpmjax.slam.config import SlamConfig
 from dpmjax.slam.front_end import FrontEndState, ScanReport
 from dpmjax.slam.interfaces import AnyScan, PreparedInput, SlamMethods, TimedScan
 from dpmjax.slam.keyframe_map import KeyframeMap, as_pose_graph
-from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted
-from dpmjax.slam.map_optimization import optimize_map
+from dpmjax.slam.loops import Loop, LoopState, has_new_loops, loops_of_map, num_accepted, optimize_map
 from dpmjax.slam.model_methods import as_methods
-from dpmjax.slam.odometry_prior import with_guess
-from dpmjax.slam.procedure import procedure_of
 from dpmjax.types import Pose, Poses, with_short_repr
-
-# Number of times that the first two scans are deskewed: the motion between them changes little after the first.
-NUM_BEGINNINGS = 2
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+class SlamProcedure(NamedTuple):
+    """The steps of a method of SLAM.
+
+    Attributes:
+        place_scan: estimates the pose of a scan, and makes some scans keyframes.
+        close_loops: looks for loops of the newest keyframe of a drive.
+        join_keyframe: looks for loops of a keyframe to allowed keyframes of other maps in the same record.
+    """
+
+    place_scan: Callable[..., tuple[FrontEndState, KeyframeMap, ScanReport]]
+    close_loops: Callable[[SlamMethods, KeyframeMap, LoopState], tuple[KeyframeMap, LoopState]]
+    join_keyframe: Callable[..., tuple[KeyframeMap, tuple[Loop, ...]]]
+
+
+def procedure_of(config: SlamConfig) -> SlamProcedure:
+    """Returns the steps of the configured method; no other function chooses between the methods."""
+    if config.method == "descriptors":
+        return SlamProcedure(descriptors.place_scan, descriptors.close_loops, descriptors.join_keyframe)
+    return SlamProcedure(front_end.place_scan, loop_closure.close_loops, loop_closure.join_keyframe)
 
 
 @with_short_repr
@@ -143,7 +159,8 @@ def step_slam(methods: SlamMethods, state: SlamState, scan: AnyScan | PreparedIn
         return after, report
     # The first two scans are deskewed by the motion between them, and placed again.
     before, first = state.begun
-    for _ in range(NUM_BEGINNINGS):
+    # Number of times that the first two scans are deskewed: the motion between them changes little after the first.
+    for _ in range(2):
         T_turn = after.front_end.T_before_last
         after, _ = _step(methods, before, prepare_input(methods, first, T_turn))
         after = after._replace(front_end=after.front_end._replace(T_before_last=T_turn))
@@ -245,6 +262,25 @@ def run_slam(
             state, report = step_slam(methods, state._replace(front_end=guessed), scan)
             reports.append(report)
     return finish_slam(state, reports, methods.config)
+
+
+def with_guess(state: FrontEndState, odometry: Poses | None, index: int) -> FrontEndState:
+    """Replaces the predicted motion to a scan by the motion of odometry, if there is one.
+
+    Args:
+        state: state of the front end before the scan.
+        odometry: (n, 4, 4) poses of the lidar, NaN where there is none; None for no odometry.
+        index: row of the scan.
+
+    Returns:
+        The state.
+    """
+    if odometry is None or not 0 < index < len(odometry):
+        return state
+    T_last_scan: Pose = rigid.inverse(odometry[index - 1]) @ odometry[index]
+    if not np.isfinite(T_last_scan).all():
+        return state
+    return state._replace(T_before_last=T_last_scan)
 
 
 def prepare_input(methods: SlamMethods, scan: AnyScan, T_turn: Pose | None = None) -> PreparedInput:

@@ -1,8 +1,11 @@
 """Registration of a set of 3-D scans without any poses or order.
 
 Pairs that may overlap are registered. Motions join the scans to parts, the most probable motions first. Less probable
-motions join two parts if several of them agree. Each part is refined jointly. Parts that no motion joins have frames of
-their own.
+motions join two parts if several of them agree. Parts that no motion joins have frames of their own.
+
+Each part is refined jointly (Borrmann et al. 2008: globally consistent scans). Near scans are aligned pair by pair from
+their present poses, and all these motions make a pose graph. So all scans with a common surface constrain a pose. In a
+chain of alignments, a single scan would constrain it.
 """
 
 from __future__ import annotations
@@ -21,31 +24,39 @@ from dpmjax.deeppointmap.overlap_prediction import overlap_pairs
 from dpmjax.deeppointmap.registration import register_each
 from dpmjax.geometry import rigid
 from dpmjax.geometry.se3 import are_near
+from dpmjax.pose_graph.graph import Edges, PoseGraph
+from dpmjax.pose_graph.optimize import ROBUST, optimize_pose_graph
 from dpmjax.progress import progress_bar
 from dpmjax.reading import read_path
+from dpmjax.scans.align import AlignmentLevel, align_on_host
 from dpmjax.scans.lidar import Scan
-from dpmjax.slam.joint import refine_jointly, scans_in_reach
-from dpmjax.types import Pose, Poses, RawScan
+from dpmjax.scans.pairs import nearest_planes
+from dpmjax.scans.surfaces import Surface
+from dpmjax.scans.weak_directions import scattered_information, with_least_covariance
+from dpmjax.types import Information, Pose, Poses, RawScan
 
 # Number of scans with the most similar vectors whose overlap with a scan is predicted, and number of the most probable
 # ones that are registered: fewer leave scans alone, more take longer.
 NUM_SIMILAR, NUM_REGISTERED = 16, 6
 
-# Least probability of overlap of a registered pair.
-MIN_OVERLAP = 0.1
-
 # Parts are joined where the probabilities of agreeing motions add up to this, and those of agreeing contradicting
 # ones to at most this share of it.
 SURE, MAX_RIVAL = 0.9, 0.5
-
-# Less probable motions support nothing.
-LEAST_CONFIDENCE = 0.05
 
 # Number of pairs that are registered between two counts of the bar.
 _BATCH = 8
 
 # Two motions agree if they put a scan to the same place.
 AGREE_M, AGREE_RAD = 2.0, math.radians(5.0)
+
+# Alignment of a pair from nearly right poses. A larger radius joins different surfaces.
+NEAR = (AlignmentLevel(1.0, 3000, 8), AlignmentLevel(0.4, 6000, 10))
+
+# Least standard deviation of an aligned pair: systematic errors of the lidar.
+FLOOR_M, FLOOR_RAD = 0.01, math.radians(0.05)
+
+# Elements of the pairs whose residuals give the information, and their largest distance.
+NUM_SAMPLES, RADIUS_M = 3000, 0.5
 
 
 class PairMotion(NamedTuple):
@@ -56,14 +67,12 @@ class PairMotion(NamedTuple):
         target: row of the second scan.
         T_target_source: its motion.
         confidence: probability that the motion is right.
-        is_used: True if the poses agree with it.
     """
 
     source: int
     target: int
     T_target_source: Pose
     confidence: float
-    is_used: bool = False
 
 
 class RegisteredClouds(NamedTuple):
@@ -121,9 +130,8 @@ def register_unposed(model: Model, scans: Sequence[RawScan] | Path, *, progress:
         rows = np.flatnonzero(part == number)
         surfaces = [prepared[row].surface for row in rows]
         T_world[rows] = refine_jointly(surfaces, T_world[rows], scans_in_reach(surfaces, T_world[rows]))
-    used = [motion._replace(is_used=_agrees(motion, T_world, part)) for motion in motions]
     first = np.array([np.flatnonzero(part == number)[0] for number in part])
-    return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(used))
+    return RegisteredClouds(rigid.inverse(T_world[first]) @ T_world, part, tuple(motions))
 
 
 def _probable_pairs(model: Model, scans: Sequence[Scan]) -> list[tuple[int, int]]:
@@ -141,7 +149,8 @@ def _probable_pairs(model: Model, scans: Sequence[Scan]) -> list[tuple[int, int]
     for row in range(len(scans)):
         own = np.flatnonzero((pairs == row).any(axis=1))
         best = own[np.argsort(-overlaps[own], kind="stable")[:NUM_REGISTERED]]
-        is_taken[best[overlaps[best] >= MIN_OVERLAP]] = True
+        # Least probability of overlap of a registered pair.
+        is_taken[best[overlaps[best] >= 0.1]] = True
     return [(int(a), int(b)) for a, b in pairs[is_taken]]
 
 
@@ -170,7 +179,8 @@ def _best_supported(motions: Sequence[PairMotion], T_world: Poses, part: np.ndar
     between: dict[tuple[int, ...], list[_Joint]] = {}
     for motion in motions:
         ends = part[motion.source], part[motion.target]
-        if ends[0] != ends[1] and motion.confidence >= LEAST_CONFIDENCE:
+        # Less probable motions support nothing.
+        if ends[0] != ends[1] and motion.confidence >= 0.05:
             T = T_world[motion.target] @ motion.T_target_source @ rigid.inverse(T_world[motion.source])
             at = T_world[motion.source if ends[0] < ends[1] else motion.target]
             joint = _Joint(motion, T if ends[0] < ends[1] else rigid.inverse(T), at)
@@ -199,6 +209,70 @@ class _Joint(NamedTuple):
         return are_near(self.T_second_first @ T_first_scan, other.T_second_first @ T_first_scan, AGREE_M, AGREE_RAD)
 
 
-def _agrees(motion: PairMotion, T_world: Poses, part: np.ndarray) -> bool:
-    T = rigid.inverse(T_world[motion.target]) @ T_world[motion.source]
-    return bool(part[motion.source] == part[motion.target]) and are_near(T, motion.T_target_source, AGREE_M, AGREE_RAD)
+def refine_jointly(surfaces: Sequence[Surface], T_world_scan: Poses, pairs: Int[np.ndarray, "p 2"]) -> Poses:
+    """Refines the poses of scans by the alignments of pairs that see the same surfaces.
+
+    Args:
+        surfaces: surface of each of n scans.
+        T_world_scan: (n, 4, 4) poses, right within about a metre and 5 degrees relative to each other.
+        pairs: rows of scans that overlap; each pair once.
+
+    Returns:
+        The poses. The first scan keeps its pose, and so do scans without a pair.
+    """
+    T_world = np.array(T_world_scan, np.float64)
+    # Rounds of alignment and optimisation: after the second the poses move by millimetres.
+    for _ in range(2):
+        found = [(pair, align_pair(surfaces, T_world, pair)) for pair in pairs.tolist()]
+        kept = [(pair, *edge) for pair, edge in found if edge is not None]
+        if not kept:
+            break
+        ends, T, information = zip(*kept, strict=True)
+        source, target = np.array(ends).T
+        edges = Edges(source, target, np.stack(T), np.stack(information))
+        T_before = T_world[0]
+        T_world = optimize_pose_graph(PoseGraph.create(T_world, edges), ROBUST).graph.poses
+        T_world = T_before @ rigid.inverse(T_world[0]) @ T_world
+    return T_world
+
+
+def scans_in_reach(surfaces: Sequence[Surface], T_world_scan: Poses) -> Int[np.ndarray, "p 2"]:
+    """Finds scans that are nearer to each other than the median range of both.
+
+    Args:
+        surfaces: surface of each of n scans.
+        T_world_scan: (n, 4, 4) their poses.
+
+    Returns:
+        Rows of each pair, the later scan first.
+    """
+    extents = np.array([np.median(np.linalg.norm(surface.points, axis=1)) for surface in surfaces])
+    apart = np.linalg.norm(T_world_scan[:, None, :3, 3] - T_world_scan[:, :3, 3], axis=-1)
+    # Scans are near where their distance is less than this share of their median ranges. A smaller share joins fewer
+    # scans.
+    return np.argwhere(np.tril(apart < 1.0 * np.minimum.outer(extents, extents), k=-1))
+
+
+def align_pair(
+    surfaces: Sequence[Surface], T_world_scan: Poses, pair: Sequence[int]
+) -> tuple[Pose, Information] | None:
+    """Aligns two scans from their present poses.
+
+    Args:
+        surfaces: surface of each scan.
+        T_world_scan: present poses.
+        pair: rows of the source and the target.
+
+    Returns:
+        T_target_source and its information; None if the result is far from the present poses.
+    """
+    source, target = (surfaces[row] for row in pair)
+    T_start = rigid.inverse(T_world_scan[pair[1]]) @ T_world_scan[pair[0]]
+    found = align_on_host(source, target, T_start[None], NEAR)
+    T = found.T_target_source[0]
+    # An alignment that moves farther from the present poses than this has found other surfaces.
+    if not np.isfinite(found.rmse[0]) or not are_near(T_start, T, *(1.0, math.radians(5.0))):
+        return None
+    planes = nearest_planes(source, target, T[None], RADIUS_M, NUM_SAMPLES).take(0)
+    information = scattered_information(planes.take(planes.is_paired), T)
+    return T, with_least_covariance(information, FLOOR_M, FLOOR_RAD)
