@@ -1,4 +1,4 @@
-"""A wrong argument of a kernel of geometry or of a loss is named in the first words of its error."""
+"""A wrong argument of a kernel of geometry, a loss or a graph is named in the first words of its error."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +8,7 @@ import dpmjax
 from dpmjax.geometry import find_consensus, rigid, typical_range
 from dpmjax.geometry.pyramid import PyramidConfig, build_pyramid, build_pyramid_on_host
 from dpmjax.losses import offset_loss
+from dpmjax.pose_graph import Edges, residuals, solve_dense
 
 ONES, NOTHING, CONFIG = np.ones((4, 3), np.float32), np.zeros((0, 3), np.float32), PyramidConfig()
 SHAPES = {
@@ -15,6 +16,8 @@ SHAPES = {
     "target": [((5, 3), (6, 3), (5,)), ((5, 3), (5, 2), (5,))],
     "weights": [((5, 3), (5, 3), (6,))],
 }
+POSES, ROWS = jnp.zeros((8, 3)), jnp.arange(7)
+EDGES = Edges(ROWS + 1, ROWS, jnp.zeros((7, 3)), jnp.tile(jnp.eye(3), (7, 1, 1)))
 CONTRAST = {"queries": ONES, "keys": np.ones((9, 3), np.float32), "positives": np.zeros(4, np.int32)}
 CONTRASTS = [
     ({"keys": np.ones((9, 2), np.float32)}, "keys: expected shape"),
@@ -70,6 +73,10 @@ CONTRASTS = [
         *((lambda given=given: dpmjax.info_nce(**(CONTRAST | given)), message) for given, message in CONTRASTS),
         (lambda: dpmjax.occupancy_loss(ONES[:, :2], ONES, ONES[:, :2]), "labels: expected a shape"),
         (lambda: dpmjax.occupancy_loss(ONES, ONES, jnp.ones((5, 4, 3))), "weights: expected a shape"),
+        (lambda: residuals(POSES[:, :2], EDGES), "poses: expected shape"),
+        (lambda: residuals(POSES, EDGES._replace(information=EDGES.information[1:])), "information: expected shape"),
+        (lambda: solve_dense(POSES, EDGES, is_fixed=jnp.ones(7, bool)), "is_fixed: expected bool"),
+        (lambda: solve_dense(POSES, EDGES, num_steps=0), "num_steps: expected at least 1"),
         (lambda: offset_loss(ONES, np.ones((5, 3))), "true: expected shape"),
         (lambda: offset_loss(ONES, ONES, np.ones(3, bool)), "mask: expected"),
     ],

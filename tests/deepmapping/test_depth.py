@@ -23,7 +23,6 @@ KEY = jax.random.key(0)
 
 
 def small(motion: str) -> dm.DeepMappingConfig:
-    """The fast preset in small."""
     config = dm.preset("fast", "depth", motion=motion)
     phases = [replace(phase, num_steps=4, beams_per_step=64) for phase in config.cold_phases]
     return replace(

@@ -40,7 +40,6 @@ def bare() -> list[Scan]:
 
 
 def confidence(found: VerifiedMotion) -> float:
-    """Returns the confidence by the shipped model."""
     model = dpmjax.load_model("dpm_small").config.calibration.of_weak_scans
     return float(conf.logistic_probability(model, conf.weak_features(found.verification)))
 
@@ -121,7 +120,6 @@ def test_elements_contradict_a_wrong_motion_where_no_direction_is_weak() -> None
 
 
 def evidence_of(elements: Verification | None, num_elements: int = 1024, *, scans=None, num_pairs=100):
-    """Evidence of one hypothesis."""
     one, nothing = np.ones(1), (np.zeros((1, 0), dtype) for dtype in (int, int, float, bool))
     hypotheses = Registration(np.eye(4)[None], one, one, one, num_pairs * one, one, *nothing)
     return conf.gather_evidence(hypotheses, 0, scans, elements, num_elements)

@@ -22,7 +22,6 @@ NUM = 9
 
 @pytest.fixture(scope="module")
 def fitted(model) -> dpmjax.Model:
-    """A model of overlap with any weights."""
     weights = np.random.default_rng(0).normal(size=len(OVERLAP_FEATURES))
     overlap = LogisticModel(OVERLAP_FEATURES, tuple(weights.tolist()), 0.3)
     return model.replace(config=replace(model.config, overlap=overlap))

@@ -66,18 +66,15 @@ def drive(seed: int = 0, num_scans: int = 24, step_m: float = 4.0) -> LidarSeque
 
 
 def store(*drives: LidarSequence) -> dpm.ScanStore:
-    """Prepared drives, in memory."""
     return dpm.ScanStore([dpm.prepare_drive(one, TRAINING) for one in drives or (drive(),)])
 
 
 def assert_trees_equal(found: object, expected: object) -> None:
-    """All leaves are the same, bit for bit."""
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def best_match(source, target, similarity, predict_offsets, *, config: dpm.MatchConfig) -> Registration:
-    """The best of the motions between two clouds."""
     hypotheses = dpm.match_hypotheses(source, target, similarity, predict_offsets, config=config)
     return jax.tree.map(lambda leaf: leaf[0], hypotheses)
 

@@ -12,7 +12,6 @@ SEEDS = pytest.mark.parametrize("seed", [0, 1, 2])
 
 
 def align_in_numpy(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Kabsch in float64, with NumPy's SVD."""
     source, target, weights = (np.asarray(array, np.float64) for array in (source, target, weights))
     dim = source.shape[1]
     mean_source = (weights[:, None] * source).sum(0) / weights.sum()

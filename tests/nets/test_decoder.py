@@ -25,7 +25,6 @@ def model() -> Model:
 
 
 def cloud(seed: int, num_descriptors: int, capacity: int | None = None) -> DescriptorCloud:
-    """Valid descriptors in front, NaN behind."""
     rng = np.random.default_rng(seed)
     capacity = num_descriptors if capacity is None else capacity
     positions, features = np.full((capacity, 3), np.nan), np.full((capacity, 64), np.nan)

@@ -28,7 +28,6 @@ def points(seed: int, num_points: int = 40) -> np.ndarray:
 
 
 def pyramid_of(cloud: np.ndarray, capacity: int | None = None, config: ModelConfig = CONFIG) -> PointPyramid:
-    """Returns the pyramid of a cloud that is padded to `capacity` rows."""
     capacity = len(cloud) if capacity is None else capacity
     front = np.zeros((capacity, 3), np.float32)
     front[: len(cloud)] = cloud

@@ -95,11 +95,3 @@ def test_number_that_no_edge_measures_has_no_gradient_and_the_others_stay_finite
     assert np.isfinite(gradient).all()
     assert gradient[4, 2] == pytest.approx(0.0, abs=1e-8)
     assert np.abs(gradient[3]).max() > 1e-3
-
-
-def test_wrong_arguments_are_named(as_user) -> None:
-    poses, edges = arrays_of(0, 3)
-    with pytest.raises(ValueError, match="^is_fixed: expected bool"):
-        solve_dense(poses, edges, is_fixed=jnp.ones(7, bool))
-    with pytest.raises(ValueError, match="^num_steps: expected at least 1"):
-        solve_dense(poses, edges, num_steps=0)

@@ -82,7 +82,6 @@ def from_matrices(matrices: list[np.ndarray]) -> np.ndarray:
 
 
 def whitened(graph: PoseGraph, poses: list[np.ndarray]) -> np.ndarray:
-    """All residuals times the root of their information."""
     parts = [
         np.linalg.cholesky(information).T @ difference(to_matrix(measured), poses[j], poses[i])
         for i, j, measured, information in zip(*graph.edges, strict=True)

@@ -8,7 +8,6 @@ from dpmjax.registration2d.joint_alignment import solve_step
 
 
 def loop_of(num_poses: int = 40) -> np.ndarray:
-    """One and a half rounds on a circle."""
     angle = np.linspace(0.0, 3 * np.pi, num_poses)
     return np.stack([50 * np.sin(angle), 50 - 50 * np.cos(angle), se2.wrap_angle(angle)], -1)
 

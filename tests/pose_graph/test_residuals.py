@@ -47,14 +47,6 @@ def graph_arrays(graph: PoseGraph) -> tuple[jax.Array, Edges]:
     return jnp.asarray(graph.poses), Edges(*map(jnp.asarray, graph.edges))
 
 
-def test_wrong_shapes_are_named() -> None:
-    poses, edges = graph_arrays(random_graph(0, 3))
-    with pytest.raises(ValueError, match="^poses: expected shape"):
-        residuals(poses[:, :2], edges)
-    with pytest.raises(ValueError, match="^information: expected shape"):
-        residuals(poses, edges._replace(information=edges.information[1:]))
-
-
 def test_graphs_of_the_host_refuse_traced_arrays_and_name_the_functions_that_take_them(as_user) -> None:
     graph = random_graph(0, 3)
     with pytest.raises(ValueError, match=r"^PoseGraph.create: runs on the host and .* call pose_graph.residuals or"):

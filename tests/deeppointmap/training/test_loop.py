@@ -20,7 +20,6 @@ def num_steps(trained) -> int:
 
 @pytest.fixture(scope="module")
 def whole():
-    """An unbroken training, with the numbers of its steps."""
     steps: list[int] = []
     hooks = TrainingHooks(on_report=lambda record, _: steps.append(record.step))
     return dpmjax.train([toy.drive()], TRAINING, hooks=hooks), steps

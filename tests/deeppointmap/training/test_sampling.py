@@ -25,7 +25,6 @@ def placed(T_world_scan: np.ndarray) -> PlacedScans:
 
 
 def drawn_layouts(config: dpm.TrainingConfig, max_group: int, num: int = 4_000) -> list[Layout]:
-    """The layouts of the steps of one stage, as a training draws them."""
     stage = replace(config, curriculum=(dpm.CurriculumStage(max_group, num),))
     return [stage.layout_at(step, seed=7) for step in range(num)]
 
