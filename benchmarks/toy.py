@@ -10,8 +10,7 @@ import jax
 
 from benchmarks import Row, measure
 from dpmjax import cli
-from dpmjax.deepmapping import ToyConfig, solve, toy_problem
-from dpmjax.deepmapping.toy import ScalarNet
+from dpmjax.deepmapping import ScalarNet, ToyConfig, solve, toy_problem
 from experiments.toy_1d import FORMS, share_at_minimum
 
 

@@ -24,7 +24,6 @@ from tyro.conf import arg
 
 from dpmjax import cli, deepmapping, deeppointmap, io, metrics, registration2d, sequences, simulation, slam, weights
 from dpmjax.geometry import rigid, se2
-from dpmjax.simulation.world2d import cast_rays
 
 NUM_SCANS, STEP_M, NOISE_M, SURE, RIGHT_ATE_M, RIGHT_PASSAGE_M = 25, 0.12, 0.006, 0.9, 0.05, 0.5
 FUSED = ("fused", "fused-cut")
@@ -148,7 +147,7 @@ def map_passage(rng: np.random.Generator, *, odometry: str) -> Answer:
     poses = np.column_stack([x, y, np.arctan2(np.gradient(y), np.gradient(x)) + rng.normal(0, 0.02, len(x))])
     angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
     origins = np.repeat(poses[:, :2], len(angles), axis=0) / PX_M
-    ranges = PX_M * cast_rays(grid, origins, (poses[:, 2:] + angles).ravel()).reshape(len(poses), -1)
+    ranges = PX_M * simulation.cast_rays(grid, origins, (poses[:, 2:] + angles).ravel()).reshape(len(poses), -1)
     ranges += rng.normal(0, 0.01, ranges.shape)
     steps = se2.relative(poses[:-1], poses[1:]) + rng.normal(size=(len(x) - 1, 3)) * [0.03 * step, 0.03 * step, 0.01]
     if odometry == "silent":

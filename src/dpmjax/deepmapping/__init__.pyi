@@ -32,6 +32,7 @@ from .relocalization import relocalize as relocalize
 from .relocalization import train_localization as train_localization
 from .toy import GLOBAL_MINIMUM as GLOBAL_MINIMUM
 from .toy import Initialization as Initialization
+from .toy import ScalarNet as ScalarNet
 from .toy import ToyConfig as ToyConfig
 from .toy import network_value as network_value
 from .toy import toy_loss as toy_loss

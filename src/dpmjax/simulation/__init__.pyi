@@ -35,5 +35,6 @@ from .walk2d import simulate_odometry as simulate_odometry
 from .walk2d import simulate_sequence as simulate_sequence
 from .walk2d import simulate_trajectory as simulate_trajectory
 from .world2d import World as World
+from .world2d import cast_rays as cast_rays
 from .world2d import cast_scans as cast_scans
 from .world2d import make_world as make_world
