@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import jax
 import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
@@ -177,7 +178,10 @@ def map_by_agents(folder: Path, drive: LidarSequence, methods: slam.SlamMethods)
         reference = np.concatenate([part.T_world_lidar for part in parts])
         errors = metrics.trajectory_errors(T_world_scan, reference) if num_maps == 1 else {}
         row |= {"ate_m": errors.get("ate_m"), "num_wrong_loops": int((~are_right(loops, reference)).sum())}
-    return row | {"num_maps": num_maps, "sent_mb": sum(sent.keyframe_bytes for sent in found.traffic) / 1e6}
+    maps = [agent.map for agent in found.agents]
+    sent = [([one.compact for one in each.keyframes], each.vectors, each.T_world_keyframe) for each in maps]
+    num_bytes = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(sent))
+    return row | {"num_maps": num_maps, "sent_mb": num_bytes / 1e6}
 
 
 def cut_drive(drive: LidarSequence, num_agents: int, overlap: float) -> list[LidarSequence]:
